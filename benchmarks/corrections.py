@@ -1,12 +1,13 @@
-"""Does `litho-design correct` bring prints closer to reliefs, by judges that took no part in it?
+"""Measure whether `litho-design correct` brings prints closer to reliefs, by independent judges.
 
     python -m benchmarks.corrections --out runs/corrections [--publish]
 
-Five reliefs, printed by three virtual fabs with the effects of the design gap, which no model has, and by a
-model of the zoo. Three models of different form correct: for a fab trained on scans of its prints, for the
-measured prints those of the zoo, which PBL judges. Beside each correction stand the two layouts that need
-none: nominal heights, and the best gain and zero, chosen by the models of the search and, as nobody can
-before the print, by the judge itself. An interrupted run resumes.
+Five reliefs are printed by three virtual fabs, with the effects of benchmarks.gap that no model has, and by
+a model of the zoo. Three models of different form make each correction. For a fab they are trained on scans
+of its prints. For the measured prints they are models of the zoo, and PBL is the judge. Each correction is
+compared with two layouts that are not optimised: nominal heights, and the best affine layout (gain and zero).
+Gain and zero are chosen by the models of the search and also by the judge, which is impossible before a
+print. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
 RESULT = PAGE.parent / "results" / "corrections" / "corrections.json"
 NAME = "corrections"
 RELIEFS = ("cap", "freeform", "blaze", "staircase", "lens")
-# Announced before any of these fabs had printed.
+# Announced before any of these fabs printed anything.
 SEEDS = (75, 76, 77)
 FAB_MODELS = ("physics", "blur-table", "linear")
 ZOO_MODELS, ZOO_JUDGE = tuple(f"zoo:{name}" for name in FAB_MODELS), "zoo:pbl"
@@ -52,7 +53,7 @@ ALLOWED = 1.05
 
 
 def main() -> None:
-    """Make what is missing, print, write."""
+    """Make the missing corrections, print the table, and write the record."""
     given = _arguments()
     torch.set_num_threads(1)
     settings = relief_settings({"layout.size_px": given.size, "search.polish_rounds": POLISH})
@@ -77,7 +78,7 @@ def main() -> None:
 def corrected(
     relief: str, seed: int, models: Sequence[Printer], judge: Printer, out: Path, settings: ReliefSettings
 ) -> dict[str, Any]:
-    """One correction, and what the judge prints of it and of the layouts that need none, rms nm."""
+    """Make one correction; return the rms errors, nm, of its print and of the uncorrected layouts' prints."""
     wanted = wanted_um(relief, seed, settings)
     made = correct(wanted, models[0], out, settings=settings, judges=models[1:], announce=False)
     inputs = {"relief_um": wanted}
@@ -98,7 +99,7 @@ def corrected(
 
 
 def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
-    """Heights (size, size), µm, of a relief; the freeform surface is drawn from the seed."""
+    """Return the heights (size, size), µm, of a relief; the freeform surface is drawn from the seed."""
     layout, high_um = settings.layout, settings.height_um
     if name in ("cap", "blaze", "staircase"):
         return load_relief("lens" if name == "cap" else name, layout, high_um)[0]
@@ -119,7 +120,7 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """What it comes to, and one line for each relief and kind of printer, over its seeds."""
+    """Return the summary, and a table with one line for each relief and kind of printer, over all seeds."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in record["rows"]:
         groups.setdefault((row["relief"], row["judge"]), []).append(row)
@@ -138,7 +139,7 @@ def _span(values: Sequence[float]) -> str:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> str:
-    """How often the correction is no worse than doing nothing, and how often its width holds the print."""
+    """Return how often a correction beats the uncorrected layouts, and how often its error range is right."""
     worse = [row for row in rows if over_idle(row) > ALLOWED]
     inside = [row for row in rows if holds(row)]
     blazes = [over_idle(row, ("best affine",)) for row in rows if row["relief"] == "blaze"]
@@ -147,26 +148,27 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     median = np.median([over_idle(row) for row in rows])
     return (
         f"Of {len(rows)} corrections {len(worse)} print more than 5 % worse than nominal heights or the "
-        f"best affine, whichever is better{named}. In the median a correction has {median:.2f} × the error "
-        f"of the better one, and a blaze {np.median(blazes):.2f} × the error of the best affine. "
+        f"best affine, whichever is better{named}. In the median, the error of a correction is "
+        f"{median:.2f} × that of the better of these two layouts; for a blaze it is "
+        f"{np.median(blazes):.2f} × that of the best affine. "
         f"{len(inside)} of {len(rows)} prints have an error in the stated range."
     )
 
 
 def holds(row: Mapping[str, Any]) -> bool:
-    """Whether the error of the print lies where the design said."""
+    """Return whether the error of the print lies in the range that the design stated."""
     low, high = row["between_nm"]
     return bool(low <= row["printed_nm"]["corrected"] <= high)
 
 
 def over_idle(row: Mapping[str, Any], idle: Sequence[str] = ("uncorrected", "best affine")) -> float:
-    """Error of a correction over that of the better of these layouts that need none, by the judge."""
+    """Return the error of a correction relative to the best of the ``idle`` layouts, by the judge."""
     printed = row["printed_nm"]
     return float(printed["corrected"] / min(printed[name] for name in idle))
 
 
 def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[Printer], Printer]]:
-    """Seed, models of a printer, and who prints; what lies in the folder is not made again."""
+    """Yield seed, models of a printer, and judge; what exists in the folder is not made again."""
     for seed in SEEDS:
         folder = out / f"fab-{seed}"
         store = folder / "prints.zarr"
@@ -186,7 +188,7 @@ def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[P
 
 
 class _Plain(ReliefTask):
-    """Affine layouts of the least rms error, whatever errors the models have of their own."""
+    """Find the affine layouts of least rms error, without the models' errors on their training prints."""
 
     loss_by = Task.loss_by
 

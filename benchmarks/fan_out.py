@@ -1,10 +1,11 @@
-"""A fan-out of 7 x 7 equal spots in the far field, with 13 levels, beside what has none.
+"""Design a fan-out of 7 x 7 equal far-field spots with 13 levels; compare it with continuous phases.
 
     python -m benchmarks.fan_out [--publish]
 
-The element is 12.8 µm wide, a spot two diffraction limits from the next. Power and evenness of the spots are
-those of the printed layout: for nominal heights, and through Physics of the zoo as its printer. Beside it are
-a continuous phase by the same loss, and Gerchberg-Saxton, its phase as it is and on the nearest of 13 levels.
+The element is 12.8 µm wide. Neighbouring spots are two diffraction limits apart. Power and uniformity of the
+spots are those of the printed layout. The printer is Physics of the zoo or prints nominal heights. The
+element is compared with a continuous phase designed with the same loss, and with the phase of
+Gerchberg-Saxton, continuous and rounded to the nearest of 13 levels.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ PRINTER = "zoo:physics"
 
 @register_task
 class FanOut(Task):
-    """49 spots of equal power: what misses them, and how far the weakest and the brightest are apart."""
+    """Design 49 spots of equal power; score their total power and their uniformity."""
 
     name = "fan-out"
     starts = ("random", "gs")
@@ -57,27 +58,27 @@ class FanOut(Task):
     errors = ("uniformity_error",)
 
     def powers(self, seen: Tensor) -> Tensor:
-        """Share of the incident power in each spot (49,), within two thirds of a limit of its middle."""
+        """Return the share of power in each spot (49,), up to two thirds of a diffraction limit away."""
         return torch.einsum("kyx,vyx->k", _spots().to(seen), seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Levels of the Gerchberg-Saxton phase."""
+        """Return the levels nearest to the Gerchberg-Saxton phase."""
         return nearest_levels(_gerchberg_saxton(self), level_phase)
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Light that misses the spots, and the relative standard deviation of their powers."""
+        """Return the share of light outside the spots plus the relative standard deviation of powers."""
         powers = self.powers(seen)
         return 1 - powers.sum() + powers.std(correction=0) / powers.mean()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Efficiency, and (highest - lowest) / (highest + lowest)."""
+        """Return the efficiency, and (highest - lowest) / (highest + lowest) of the powers of the spots."""
         powers = self.powers(seen)
         low, high = float(powers.min()), float(powers.max())
         return {"efficiency": float(powers.sum()), "uniformity_error": (high - low) / (high + low)}
 
 
 def main() -> None:
-    """Design, compare, print, write."""
+    """Design and compare the elements, print the table, and write the record."""
     given = options(
         __doc__, "write record, table and figure into docs", Path("runs/fan_out.json")
     ).parse_args()
@@ -109,7 +110,7 @@ def main() -> None:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """One line for each element."""
+    """Return a table with one line for each element."""
     lines = [
         (name, f"{100 * row['efficiency']:.1f} %", f"{100 * row['uniformity_error']:.1f} %")
         for name, row in record["rows"].items()
@@ -118,7 +119,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def _spots() -> Tensor:
-    """Masks (49, size, size) of the spots."""
+    """Return the masks (49, size, size) of the spots."""
     place = torch.arange(SIZE_PX) - (SIZE_PX - 1) / 2
     apart = LIMITS_APART * 3
     middles = apart * torch.arange(-3, 4)
@@ -127,7 +128,7 @@ def _spots() -> Tensor:
 
 
 def _phases(task: FanOut) -> dict[str, Tensor]:
-    """Phases per cell, radian, of elements without levels."""
+    """Return the phase of each cell, in radians, of the elements with continuous phase."""
     phase = _gerchberg_saxton(task)
     free = phase.clone().requires_grad_()
     optimiser = torch.optim.Adam([free], lr=0.1)
@@ -139,7 +140,7 @@ def _phases(task: FanOut) -> dict[str, Tensor]:
 
 
 def _gerchberg_saxton(task: FanOut) -> Tensor:
-    """Phase per cell, radian, after sixty steps."""
+    """Return the phase of each cell, in radians, after sixty Gerchberg-Saxton steps."""
     target = _spots().sum(0)
     return gerchberg_saxton(
         task.bench.benches[0].propagator, target, task.cells, iterations=60, weighted=False, seed=0
@@ -151,7 +152,7 @@ def _height_um(task: FanOut, phase: Tensor) -> Tensor:
 
 
 def _draw(task: FanOut, seen: Mapping[str, Tensor], path: Path) -> None:
-    """Powers of the spots over their mean, and the image of the designed element."""
+    """Draw the power of each spot relative to their mean, and the image of the designed element."""
     shown = [name for name in seen if "13 levels" in name or name.startswith(("continuous", "designed"))]
     figure = new_figure(10, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))

@@ -1,4 +1,4 @@
-"""Tables in Markdown, and errors with their intervals in a cell."""
+"""Write tables in Markdown, and errors with their intervals for a cell."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: str) -> str:
-    """A table in Markdown, and below it what it rests on, a paragraph each."""
+    """Return a table in Markdown, followed by its notes, one paragraph each."""
 
     def line(cells: Sequence[str]) -> str:
         return "|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|"
@@ -16,5 +16,5 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: 
 
 
 def with_interval(value: float, interval: Sequence[float] | None) -> str:
-    """An error and, where it has one, its interval, nm."""
+    """Return the text of an error and of its interval, if there is one, in nm."""
     return f"{value:.2f} nm" + (f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else "")

@@ -1,9 +1,9 @@
-"""Carry the results of the measured run into the documentation: small files, tables, figures.
+"""Copy the results of the run on measured prints into the documentation: small files, tables, figures.
 
     make demo DATASET=neural-lithography
     python -m benchmarks.measured runs/neural-lithography
 
-What the pages quote is written here from the result files, and a test holds the pages to them.
+Writes all figures that the pages quote from the result files; a test checks that the pages agree with them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PAGES = {
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """The text of each mark, from the result files in a folder."""
+    """Return the text to publish at each mark of the pages, from the result files in a folder."""
     benchmark, noise = in_table(folder), _found(folder, "noise.json")
     return {
         "headline": headline_table(benchmark, noise),
@@ -55,7 +55,7 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def in_table(folder: Path) -> dict[str, Any]:
-    """The benchmark that the table shows: each model as it was made last."""
+    """Return the benchmark that the table shows: the newest result of each model."""
     networks = in_one(_found(folder, "benchmark.json"), _found(folder, "benchmark_pbl.json"))
     return in_one(networks, _found(folder, "benchmark_least_squares.json"))
 
@@ -65,7 +65,7 @@ def _found(folder: Path, file: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Copy, draw, publish."""
+    """Copy the results, draw the figure, and publish the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""What the measured prints lack: the loop's record, its tables and its picture on the page about it.
+"""Publish the closed loop on the measured prints: its record, and the tables and picture of its page.
 
 litho-models close-loop runs/neural-lithography/store.zarr --nested prints --out runs/causes
 python -m benchmarks.measured_causes runs/causes
@@ -42,12 +42,12 @@ _HELD_OUT = {
 
 
 def texts(result: CloseLoop) -> dict[str, str]:
-    """The text of each mark on the page."""
+    """Return the text to publish at each mark of the page."""
     return {"errors": errors_table(result), "causes": causes_table(result)}
 
 
 def errors_table(result: CloseLoop) -> str:
-    """Errors side by side, each row with its terms."""
+    """Return the table of errors: a row per model, measurement model and choice of held-out scans."""
     keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
     rows = []
     for model, measurement, held_out in keys:
@@ -75,7 +75,7 @@ def errors_table(result: CloseLoop) -> str:
 
 
 def causes_table(result: CloseLoop) -> str:
-    """What was added, with sizes."""
+    """Return the table of the effects that the loop added, with their strengths."""
     return markdown_table(
         ["added", "by", "size (95 % over prints)", "error without it", "scans better", "or", "also on"],
         [
@@ -106,7 +106,7 @@ def _sizes(one: FoundEffect) -> list[str]:
 
 
 def picture(result: CloseLoop) -> Figure:
-    """Error of each scan, before and after."""
+    """Draw the error of each scan before and after the loop."""
     rows: list[tuple[str, ErrorRow | None]] = [
         ("base, published protocol", result.error("base", "offset", "published")),
         ("base with the measurement model", result.error("base")),
@@ -130,7 +130,7 @@ def picture(result: CloseLoop) -> Figure:
 
 
 def main() -> None:
-    """Copy the record, draw, publish."""
+    """Copy the record, draw the picture, and publish the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,4 +1,4 @@
-"""The figure of a held-out prediction, for the documentation."""
+"""Draw the figure of a held-out prediction for the documentation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from litho_data.store import open_store
 
 
 def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl") -> None:
-    """Layout, measured print, held-out prediction and difference of the median scan of one model."""
+    """Draw layout, print, held-out prediction and difference, for the scan with the model's median error."""
     result = json.loads((benchmark / "benchmark.json").read_text(encoding="utf-8"))
     rows = next(s for s in result["scores"] if s["model"] == model)["scans"]
     errors = [row["mae_datum_free_nm"] for row in rows]
@@ -22,7 +22,7 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
     difference = 1e3 * np.where(scan.valid, scan.height_um - prediction, np.nan)
     difference -= np.nanmedian(difference)
     measured = np.where(scan.valid, scan.height_um, np.nan)
-    # Layout and print on scales of their own: a print is lower than its layout and has a zero of its own.
+    # Layout and print have different scales: a print is lower than its layout and has another zero.
     low, high = np.nanpercentile(measured, (0.1, 99.9))
     printed = float(low), float(high)
     panels: list[tuple[str, np.ndarray, str, tuple[float, float]]] = [
@@ -39,7 +39,7 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
         axes.set_xlabel("x (µm)")
         figure.colorbar(shown, ax=axes, shrink=0.8)
     figure.suptitle(f"{scan.id}, the median held-out scan: {chosen['mae_datum_free_nm']:.1f} nm", fontsize=11)
-    # Roughness does not compress without loss.
+    # Lossless formats compress roughness badly.
     figure.savefig(path, dpi=75, pil_kwargs={"quality": 80})
 
 

@@ -1,4 +1,4 @@
-"""Tables of the measured run: models on held-out scans, and the noise beside them."""
+"""Write the tables of the run on measured prints: errors of models on held-out scans, and the noise."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _FREE = {
 
 
 def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
-    """One benchmark of two runs on the same scans: the models of the second, and what only the first has.
+    """Merge two benchmarks on the same scans: models of the newer one, and those that only the older one has.
 
-    Networks take long, so that what changes is made anew without the others.
+    Networks take long to train, so a changed model is benchmarked again without the others.
 
     Raises:
-        ValueError: other data, other scans, folds or terms.
+        ValueError: the benchmarks differ in data, scans, folds or scan terms.
     """
     for key, parts in (
         ("dataset", ("sha256",)),
@@ -43,7 +43,7 @@ def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
 
 
 def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
-    """Held-out errors of every model, one row each, above what is known of the noise floor."""
+    """Return the table of held-out errors, one row per model, with the noise floor in the last row."""
     heads = (
         "model",
         "datum-free error (zero of each scan free, k = 1)",
@@ -79,7 +79,7 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
 
 
 def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
-    """The errors of a few models, the noise and the paper's figure, for the project's page."""
+    """Return the table of a few models' errors, the noise and the paper's error, for the README."""
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
     rows: list[tuple[str, ...]] = []
@@ -104,7 +104,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
 
 
 def noise_table(noise: dict[str, Any]) -> str:
-    """The noise of the measured prints by the terms that are set free, then by level where they are flat."""
+    """Return the noise of the measured prints by fitted scan terms, then by level where they are flat."""
     budget = noise["budget"]
     by_terms = markdown_table(
         ("free in each scan", "terms k", "noise, MAE", "noise, σ"),
@@ -138,14 +138,14 @@ def noise_table(noise: dict[str, Any]) -> str:
 
 
 def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
-    """The noise under columns of errors, each with the scan terms of its column; None: nothing to compare."""
+    """Return a row with the noise for the scan terms of each column of errors; None leaves a cell empty."""
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
     return (f"noise ({floor['kind'].replace('-', ' ')})", *cells)
 
 
 def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
-    """How far each model is above the noise of its own scan terms."""
+    """Return how far the error of each model is above the noise with the same scan terms."""
     least = {row["policy"]: row["mae_nm"] for row in floor["by_policy"]}
     parts = []
     for score in benchmark["scores"]:
@@ -156,6 +156,6 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
 
 
 def _steps_text(benchmark: dict[str, Any]) -> str:
-    """Optimiser steps of the networks."""
+    """Return the numbers of optimiser steps of the networks as text."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())

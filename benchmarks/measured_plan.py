@@ -1,10 +1,10 @@
-"""Carry the plan for the measured prints into the documentation: what a lab needs, tables and pictures.
+"""Copy the plan for the measured prints into the documentation: files for a lab, tables and pictures.
 
     litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
         --steps 20
     python -m benchmarks.measured_plan runs/neural-lithography/next-print
 
-Everything of the plan but its report goes to the page's results; the tables of the page are written anew.
+The results of the page receive the whole plan except its report; the tables of the page are rewritten.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LEFT_OUT = ("report.html", "*.csv")
 
 
 def main() -> None:
-    """Copy, draw, write."""
+    """Copy the plan, draw its layouts, and write the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def draw(plan: NextPrint) -> None:
-    """The layouts of the prints, side by side."""
+    """Draw the layouts of the prints side by side."""
     first = {scan.print: scan.id for scan in reversed(plan.scans) if scan.use == "dataset"}
     levels = {
         f"print {name}": read_layout(RESULTS / "layouts" / f"{first[name]}.tif") for name in sorted(first)
@@ -59,7 +59,7 @@ def draw(plan: NextPrint) -> None:
 
 
 def texts(plan: NextPrint) -> dict[str, str]:
-    """The text of each mark of the page."""
+    """Return the text to publish at each mark of the page."""
     count = plan.prints
 
     def number(value: float | None, digits: int = 1) -> str:

@@ -1,11 +1,11 @@
-"""How often the loop finds something where the model lacks nothing: small stores of a model plus noise.
+"""Measure how often the loop finds a cause although the model is complete: prints of the model plus noise.
 
     python -m benchmarks.null_calibration [--stores 40] [--workers 2] [--publish]
 
-Each store has 12 scans of random layouts, printed by a Physics model away from its starting values. The
-noise is stationary and Gaussian, 16 nm with the spectrum of the virtual fab's flat print (lines along x
-included), with a datum and a tilt per scan. Right is to find nothing: every cause or law is a false positive.
-An interrupted run resumes.
+Each store has 12 scans of random layouts, printed by a Physics model with other values than its starting
+values. The noise is stationary and Gaussian, 16 nm with the spectrum of the virtual fab's flat print (lines
+along x included). Each scan also has a datum and a tilt. The right result is to find nothing: every cause or
+law is a false positive. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ RESULT = PAGE.parent / "results" / "null-calibration" / "null_calibration.json"
 NAME = "null_calibration.json"
 SCANS, SIZE_PX, PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 12, 192, 0.1, 13, 0.1
 ROUGHNESS_UM, DATUM_SD_UM, TILT_SD_UM = 0.016, 0.03, 0.005
-# The rate that the loop claims, and how unlikely a count of false positives has to be to speak against it.
+# The rate that the loop claims, and the probability below which a count of false positives contradicts it.
 RATE, UNLIKELY = 0.05, 0.025
 FOLDS, FIRST_SEED = 5, 7000
 
 
 def main() -> None:
-    """Run what is missing, print, write."""
+    """Run the missing stores, print the outcome, and write the record."""
     parser = options(__doc__, "write the figures into the page")
     parser.add_argument("--stores", type=int, default=40)
     parser.add_argument("--workers", type=int, default=2)
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def calibrate_one(seed: int) -> dict[str, Any]:
-    """What the loop takes on one store, and its error before and after, nm."""
+    """Return the causes that the loop finds in one store, and its error before and after, nm."""
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     closed = close(Study.dealt(null_scans(seed), FOLDS), {"physics": base})
     return {
@@ -80,7 +80,7 @@ def calibrate_one(seed: int) -> dict[str, Any]:
 
 
 def null_scans(seed: int) -> list[PrintedScan]:
-    """Scans of a Physics model and noise, nothing else."""
+    """Return scans of a Physics model plus noise, without any other effect."""
     rng = np.random.default_rng(seed)
     model = build_model(
         "physics",
@@ -119,7 +119,7 @@ def null_scans(seed: int) -> list[PrintedScan]:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The outcome in words, each false positive named."""
+    """Return the outcome as a sentence that names each false positive."""
     stores: Sequence[Mapping[str, Any]] = record["stores"]
     false = [store for store in stores if store["found"]]
     named = "; ".join(f"seed {s['seed']}: {', '.join(s['found'])}" for s in false)
@@ -131,7 +131,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def most_at_the_rate(stores: int) -> int:
-    """The largest number of false positives in so many stores that is not unlikely at a true rate of 5 %."""
+    """Return the largest number of false positives that is still likely in ``stores`` at a rate of 5 %."""
     from scipy.stats import binom
 
     return max(count for count in range(stores + 1) if binom.sf(count - 1, stores, RATE) > UNLIKELY)

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the machine, a result file, and its place in a page of the documentation."""
+"""Functions shared by the benchmarks: facts of the run, result files, and text in pages of the docs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_MEASURED = "Not measured yet."
 
 
 def options(doc: str | None, publishing: str, out: Path | None = None) -> argparse.ArgumentParser:
-    """A benchmark's options: ``--publish``, whose help is given, and ``--out`` where it has a default."""
+    """Return a parser with ``--publish`` (help: ``publishing``), and with ``--out`` if ``out`` is given."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if out is not None:
         parser.add_argument("--out", type=Path, default=out, help="JSON file to write")
@@ -27,12 +27,12 @@ def options(doc: str | None, publishing: str, out: Path | None = None) -> argpar
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores on which this process may run."""
     return len(os.sched_getaffinity(0))
 
 
 def origin() -> dict[str, Any]:
-    """Command line, commit and versions behind a result."""
+    """Return the command line, commit and versions that made a result."""
     return {**run_facts(), "command": command_line()}
 
 
@@ -45,10 +45,10 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 def conclude(
     record: Mapping[str, Any], text: str, out: Path, page: Path, name: str, *, published: bool
 ) -> None:
-    """End a benchmark: write its record to ``out``, print its text, and put that into its page if wanted.
+    """End a benchmark: write its record to ``out``, print its text, and publish the text if ``published``.
 
     Raises:
-        InputError: as ``publish``.
+        InputError: see ``publish``.
     """
     write_record(out, record)
     print(text)
@@ -57,10 +57,10 @@ def conclude(
 
 
 def publish(page: Path, name: str, text: str) -> None:
-    """Put a text between the two marks of that name in a Markdown page.
+    """Replace the text between the two marks ``name`` in a Markdown page.
 
     Raises:
-        InputError: a page without the two marks in this order.
+        InputError: the page does not have the two marks in this order.
     """
     before, _, after = _parts(page, name)
     with atomic_file(page) as temporary:
@@ -68,12 +68,12 @@ def publish(page: Path, name: str, text: str) -> None:
 
 
 def published(page: Path, name: str) -> str:
-    """What stands between the marks; InputError for a page without them."""
+    """Return the text between the marks; raise InputError for a page without them."""
     return _parts(page, name)[1].strip("\n")
 
 
 def _parts(page: Path, name: str) -> tuple[str, str, str]:
-    """The page up to the first mark, between the marks, and from the second one on; marks belong outside."""
+    """Split a page into the text up to the first mark (included), between the marks, and from the second."""
     start, end = f"<!-- {name}: written by the benchmark -->", f"<!-- end of {name} -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(start)
     inside, found_end, after = rest.partition(end)

@@ -1,8 +1,8 @@
-"""Time and memory of prediction and design with each model of the zoo.
+"""Measure time and memory of prediction and design with each model of the zoo.
 
     python -m benchmarks.speed [--size-px 256] [--threads 1] [--device cuda] [--publish]
 
-Each model runs in a process of its own. --publish also writes the table into docs/speed.md.
+Each model runs in a separate process. --publish also writes the table into docs/speed.md.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ REPEATS = 3
 
 
 def main() -> None:
-    """Measure, print, write."""
+    """Measure every model, print the table, and write the record."""
     parser = options(__doc__, "write the table into docs/speed.md", OUT)
-    parser.add_argument("--models", default=",".join(MODELS), help="of the zoo, separated by commas")
+    parser.add_argument("--models", default=",".join(MODELS), help="models of the zoo, separated by commas")
     parser.add_argument("--size-px", type=int, default=256)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu", help="cpu, or a GPU: cuda")
-    parser.add_argument("--here", action="store_true", help="one model, in this process")
+    parser.add_argument("--here", action="store_true", help="measure one model in this process")
     given = parser.parse_args()
     if given.here:
         print(json.dumps(measured(given.models, given.size_px, given.threads, given.device)))
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, Any]:
-    """Seconds of a prediction with the gradient to its layout, and of an iteration of a hologram."""
+    """Measure a prediction with the gradient of its layout, and an iteration of a hologram, in seconds."""
     torch.set_num_threads(threads)
     settings = hologram_settings(changes={"layout.size_px": size_px})
     printer = load_printer(f"{zoo.PREFIX}{name}", settings.layout, device=device)
@@ -102,7 +102,7 @@ def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, An
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a table."""
+    """Return the record as a table in Markdown."""
     size_px = record["size_px"]
     rows = [
         (
@@ -131,7 +131,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def _seconds(work: Callable[[], None], device: str) -> float:
-    """Of the processor, so that other work on the machine counts little; beside a GPU, of the clock."""
+    """Return the median seconds: processor time, which other work hardly affects, or clock time on a GPU."""
     clock = time.process_time if device == "cpu" else time.perf_counter
 
     def once() -> float:

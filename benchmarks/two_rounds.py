@@ -1,13 +1,13 @@
-"""Two rounds on the virtual fab: a loop, the prints that it asks for, and what they decide.
+"""Run two rounds on the virtual fab: a loop, the prints that it plans, and the decisions from them.
 
     python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
-Each trial plants one knob, of a size between 12 and 30 nm rms, in a fab of its own; what is planted is drawn
-from the seed before anything is run. The first round is a loop on 14 scans of random layouts. Its open
-questions are planned for and printed in the same fab, four prints, and as many prints with random layouts
-are scanned in the same ways as a control. An answer is right if only the planted cause is left, and as the
-one whose it is. A trial whose first round leaves no question that scans can decide is counted apart. Every
-seed has a result file and a table of its own. An interrupted run resumes.
+Each trial has its own fab and plants one knob in it, with an effect of 12 to 30 nm rms. Knobs and sizes are
+drawn from the seed before anything is run. The first round is a loop on 14 scans of random layouts. For
+its open questions, four prints are planned and printed in the same fab. As a control, as many prints of
+random layouts are scanned in the same ways. An answer is right if only the planted cause is left, attributed
+to the right machine (printer or microscope). A trial whose first round leaves no question that scans can
+decide is counted separately. Every seed has its own result file and table. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ DEALT = (
     "diffusion-blur",
     "slope-thinning",
 )
-# The board tests what new prints decide, so the base has the form of the fab's own printer.
+# The board tests what new prints decide. Therefore the base model has the form of the fab's printer.
 BASE = "physics"
 SCANS, PRINTS = 14, 4
 RMS_NM = (12.0, 30.0)
@@ -63,15 +63,15 @@ ARMS: tuple[Arm, ...] = get_args(Arm)
 
 
 def main() -> None:
-    """Run what is missing, print, write."""
+    """Run the missing trials, print the summary, and write the record."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
-    parser.add_argument("--seed", type=int, default=20271, help="of everything that is drawn")
-    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="what is planted, in turn")
-    parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest size")
+    parser.add_argument("--seed", type=int, default=20271, help="seed of all random draws")
+    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="knobs to plant, in turn")
+    parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest effect")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="layouts of the second round")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
@@ -100,7 +100,7 @@ def main() -> None:
 def draws(
     count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
 ) -> list[dict[str, Any]]:
-    """What is planted in each trial: knobs dealt in turn, sizes log-uniform, a seed of its own."""
+    """Draw what each trial plants: knobs in turn, log-uniform sizes, and a seed per trial."""
     random = np.random.default_rng([seed, 17])
     return [
         {
@@ -120,7 +120,7 @@ def run_trial(
     arms: Sequence[Arm],
     report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Both rounds of one trial, with optimised and with random layouts, or with one of these."""
+    """Run both rounds of one trial, with each kind of layouts in ``arms`` (optimised, random)."""
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
@@ -163,7 +163,7 @@ def run_trial(
 
 
 def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str, Any]:
-    """One answer beside the truth and the predicted power."""
+    """Return one answer with the truth and the predicted power."""
     truth = KNOBS[knob]
     owner = MICROSCOPE if truth.role == "measurement" else PRINTER
     asked = {truth.effect, f"{truth.effect} as {owner}'s", owner} & set(decision.declared)
@@ -176,7 +176,7 @@ def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str,
         "evidence": decision.evidence,
         "power": planned.power[PRINTS - 1],
         "status": planned.status,
-        # Terms of single scans are drawn by the fab's default noise, whatever is planted.
+        # The fab's default noise contains terms of single scans in every trial, whatever is planted.
         "counts": bool(asked) and decision.kind != "per-scan",
         "right": decision.verdict == "decided" and set(decision.left) == asked,
         "wrong": decision.verdict == "decided"
@@ -186,7 +186,7 @@ def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str,
 
 
 def line_of(trial: dict[str, Any]) -> str:
-    """One trial in one line."""
+    """Return one trial as one line of text."""
     told = [
         f"{arm}: {one['question']} [{', '.join(one['declared'])}] -> {one['verdict']} {one['left']}, "
         f"power {one['power']:.2f}"
@@ -200,7 +200,7 @@ def line_of(trial: dict[str, Any]) -> str:
 
 
 def summary(trials: list[dict[str, Any]]) -> str:
-    """How many questions were decided rightly, by arm and by predicted power."""
+    """Return a table of the number of questions decided rightly, by arm and predicted power."""
     rows = []
     for arm in (one for one in ARMS if any(one in trial["answers"] for trial in trials)):
         every = [one for trial in trials for one in trial["answers"].get(arm, [])]

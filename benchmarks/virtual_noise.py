@@ -1,4 +1,4 @@
-"""The noise analysis of virtual prints, whose roughness is known, in the documentation.
+"""Publish the noise analysis of virtual prints, whose roughness is known, in the documentation.
 
     litho-data masks --out doses --pattern dose-matrix --count 7 --size-px 512
     litho-data simulate --out doses-printed --layouts doses/card.toml
@@ -10,7 +10,7 @@
     litho-models noise fab.zarr --out fab-noise --residuals fab-benchmark
     python -m benchmarks.virtual_noise doses-noise fab-noise
 
-What the page quotes is written here from the result files, and a test holds the page to them.
+Writes all figures that the page quotes from the result files; a test checks that the page agrees with them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DOSES, REFERENCES = "dose-matrix", "references"
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """The text of each mark of the page, from the two results in a folder."""
+    """Return the text to publish at each mark of the page, from the two results in a folder."""
     doses, references = (NoiseAnalysis.read(folder / name) for name in (DOSES, REFERENCES))
     return {
         "dose matrix": dose_table(doses),
@@ -40,7 +40,7 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def dose_table(found: NoiseAnalysis) -> str:
-    """Height, roughness, lost steps and readability of every dose, and the recommended one."""
+    """Return a table of height, roughness, lost steps and readability of every dose, and the best dose."""
     assert found.dose is not None
     rows = [
         (
@@ -62,7 +62,7 @@ def dose_table(found: NoiseAnalysis) -> str:
 
 
 def planted_text(found: NoiseAnalysis) -> str:
-    """The flat print and the budget beside the roughness that was planted."""
+    """Return a sentence that compares the flat print and the noise budget with the planted roughness."""
     flat = next(one for one in found.references.flats if one.background == "offset")
     assert found.budget is not None
     noise = found.budget.floor.at("full")
@@ -75,7 +75,7 @@ def planted_text(found: NoiseAnalysis) -> str:
 
 
 def main() -> None:
-    """Copy and publish."""
+    """Copy the results and publish the texts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

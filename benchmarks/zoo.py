@@ -1,10 +1,10 @@
-"""Make the models that ship with the package: those of the benchmark's table, by its settings.
+"""Make the models that ship with the package: those of the benchmark's table, with the same settings.
 
     make zoo
     python -m benchmarks.zoo runs/zoo --models pbl,fno
 
-Training sees all scans but the locked ones. A finished run is taken as it is, a killed one continues.
-The cards lead with the errors of the table, which are those of five fits to fewer scans each.
+Training uses all scans except the locked ones. A finished run is reused; an interrupted one continues.
+Each card first lists the errors of the table, which come from five fits to fewer scans each.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from litho_models.scoring.scores import score_model
 
 CARD = ROOT / "datasets" / "neural-lithography.toml"
 LARGEST_ZOO_BYTES = 10_000_000
-# The model that was scored has it; whose it is the prints cannot tell.
+# The scored PBL includes the scan axis. The prints cannot show whether printer or microscope causes it.
 WHOLE: dict[str, dict[str, Attribution]] = {"pbl": {SCAN_AXIS: "printer"}}
 LIMITATIONS = [
     "Trained on prints of one machine, resist and protocol: retrain for any other.",
@@ -55,10 +55,10 @@ def make_zoo(
         runs: folder of the run folders.
         table: benchmark of that store with split ``grouped``.
         root: the zoo to write into, a folder per model.
-        models: some of the table's; all by default.
+        models: names of models in the table; all by default.
 
     Raises:
-        InputError: a table of other data, models trained by other settings, or a zoo that is too large.
+        InputError: the table is of other data, a model had other training settings, or the zoo is too large.
     """
     dataset = open_store(store)
     if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
@@ -92,7 +92,7 @@ def make_zoo(
 
 
 def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
-    """The figures of a row of the table, in its order."""
+    """Return the errors in a row of the table, in the order of its columns."""
     bare = {row.policy: row for row in scores.without_background}
     used: BackgroundUse = "training" if bare else "none"
     free = {row.policy: row for row in scores.by_policy}
@@ -116,12 +116,12 @@ def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
 
 
 def size_bytes(root: str | Path) -> int:
-    """What the zoo adds to the package."""
+    """Return the size of all files of the zoo, in bytes."""
     return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())
 
 
 def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtocol, ModelScores]:
-    """The errors of a frozen model on scans, with the background of its card."""
+    """Score a frozen model on scans, with the background of its card; return the protocol and the scores."""
     model = load_frozen(folder)
     learned = card_background(model, scans)
     predictions = [Prediction.beside(learned, predict_frozen(model, scan)) for scan in scans]
@@ -130,20 +130,20 @@ def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtoco
 
 
 def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Refuse a model that was trained in another way than the table's."""
+    """Raise InputError if a model was trained with other settings than the table's."""
     for key, value in wanted.items():
-        # A fit by least squares takes no optimiser of the recipe.
+        # A fit by least squares ignores the optimiser of the recipe.
         if key != "optimiser" and trained[key] != value:
             raise InputError(f"{key} of {name}", got=trained[key], wanted=f"{value}, as in the table")
 
 
 def main() -> None:
-    """Build the store, make the models, print their errors."""
+    """Build the store, make the models, and print their errors."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", type=Path, help="folder of the store and of the training runs")
-    parser.add_argument("--models", help="names, separated by commas; all of the table by default")
+    parser.add_argument("--models", help="names, separated by commas; by default all models of the table")
     given = parser.parse_args()
     store = given.runs / "neural-lithography.zarr"
     if not store.exists():

@@ -1,8 +1,8 @@
 """The whole path in one run: prints and scans → dataset → models → closed loop → design → score.
 
-Without a dataset the prints come from the virtual fab, where effects are hidden that no model declares;
-with ``--dataset neural-lithography`` they are the measured prints. Every step is one of the project's own
-commands, printed as it runs. A step whose result exists is skipped, so an interrupted demo resumes.
+Without ``--dataset`` the virtual fab makes the prints and adds effects that no model contains.
+``--dataset neural-lithography`` uses the measured prints. Every step runs one command of the project and
+prints this command. A step whose result exists is skipped, so an interrupted demo resumes.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from litho_models.loop.report import said
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
-# Draws of the paper's split.
+# Seeds of the draws of the paper's split.
 PAPER_SEEDS = (0, 1, 2, 3)
-# On whole prints the networks would take as long again as all the rest.
+# The networks are not trained with whole prints left out: that would double the time of the demo.
 BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random-features"
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is trained and designed: enough to see every part, or what is quoted in the docs.
+    """How much is trained and designed: enough to try every step, or as much as the figures in the docs need.
 
-    ``training_steps``: None for each model's own.
+    ``training_steps``: None uses the default of each model.
     """
 
     models: str
@@ -46,8 +46,8 @@ class Effort:
     seeds: int
 
 
-# Light from 256 px draws detail of wavelength x distance / side: 0.6 µm at 25 µm, where the letters of the
-# target have strokes of 0.8 µm.
+# An element of 256 px resolves wavelength x distance / side: 0.6 µm at a distance of 25 µm. The target's
+# letters have strokes of 0.8 µm.
 QUICK = Effort(
     models="identity,affine,blur-table,physics,pbl",
     arms=("physics", "pbl"),
@@ -58,7 +58,7 @@ QUICK = Effort(
     iterations=50,
     seeds=1,
 )
-# As published in docs/results: at 75 µm the letters are blurred (1.9 µm).
+# The settings of docs/results. At 75 µm the resolution is 1.9 µm, so the letters are blurred.
 MEASURED = Effort(
     models=f"{BY_PRINT},pbl,fno",
     arms=("affine", "physics", "pbl"),
@@ -73,7 +73,7 @@ MEASURED = Effort(
 
 @dataclass(frozen=True)
 class Step:
-    """One command, the file or folder that shows it is done, and its page for people."""
+    """One command, the file or folder that exists once it has finished, and its report."""
 
     title: str
     command: tuple[str, ...]
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def plan(out: Path, dataset: str) -> list[Step]:
-    """The steps in order; later ones read what earlier ones wrote."""
+    """Return the steps in order. Later steps read the results of earlier ones."""
     effort = MEASURED if dataset else QUICK
     store, loop = out / "store.zarr", out / "close-loop"
     if dataset:
@@ -112,7 +112,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
             _data("simulate", "--preset", "demo", "--out", card.parents[1]),
             card,
         )
-        # The fab contains Physics, and one base keeps the demo below five minutes.
+        # Physics contains the process of the fab, and a single base model keeps the demo below five minutes.
         anew = ["--base", "physics"]
     training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
@@ -177,7 +177,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
         "--iterations", effort.iterations,
     )  # fmt: skip
-    # The printer itself, where it is a virtual one; then designs can be made through the corrected model too.
+    # A virtual printer is itself the judge; the corrected model can then be one of the arms.
     judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")
     arms = effort.arms if dataset else (*effort.arms, CORRECTED)
     models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in arms)])
@@ -209,7 +209,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
 
 
 def run(step: Step, number: str) -> float:
-    """Run one step unless its result is there; returns the seconds it took and stops the demo if it fails."""
+    """Run one step unless its result exists, and return its seconds; a failed step ends the demo."""
     print(f"\n{number} {step.title}\n$ {_spell(step.command)}", flush=True)
     if step.result.exists():
         print("  already done")
@@ -223,7 +223,7 @@ def run(step: Step, number: str) -> float:
 
 
 def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
-    """The answer of the demo, and one page that says it and leads to all the reports."""
+    """Write one page with the answer of the demo and links to all reports; return the answer and the page."""
     import pandas as pd
 
     page = Page(

@@ -1,4 +1,4 @@
-"""The cards of the demo: what was planted in the virtual fab, what was found, what a hologram gains."""
+"""Write the page of the demo: the planted effects, the effects found, and the gain of a hologram."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from litho_models.loop.record import CloseLoop, FoundEffect
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# What compare calls the printer that printed the scans.
+# Name that ``compare`` uses for the printer of the scans.
 FAB = "fab"
-# The base model with what the loop added to it.
+# Name of the base model with the effects that the loop added.
 CORRECTED = "corrected"
-# Found in all scans: the fab gives each its own zero, as an AFM does, without being asked to.
+# Found in every scan, because the fab, like an AFM, always gives each scan another zero.
 ZERO = "datum-offset"
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
-# Images behind every element on one scale, so that a dim one looks dim.
+# All images have the same scale, so that dim images look dim.
 IMAGE = {"cmap": "inferno", "vmin": 0.0, "vmax": BRIGHTEST}
 
 
 def tell(page: Page, out: Path) -> str:
-    """Add verdict and cards to the index of a demo in ``out``; returns the verdict."""
+    """Add the verdict and the sections to the index page of the demo in ``out``; return the verdict."""
     truth = Truth.read(out / "fab" / "truth")
     loop = CloseLoop.read(out / "close-loop")
     gap = GapResult.read(out / "compare")
@@ -113,12 +113,12 @@ def tell(page: Page, out: Path) -> str:
 
 
 def _causes(loop: CloseLoop) -> list[FoundEffect]:
-    """What the corrected model has; a description has no place in it."""
+    """Return the effects of the corrected model, which contains no mere descriptions."""
     return [effect for effect in loop.effects if effect.knowledge != "description"]
 
 
 def _width(loop: CloseLoop) -> str:
-    """How much wider the loop finds the spot along one direction, in the unit of the knob."""
+    """Return a sentence with the loop's estimate of how much wider the spot is along one direction, µm."""
     spot = next((effect for effect in loop.effects if effect.name == "elliptical-psf"), None)
     if spot is None:
         return ""
@@ -157,7 +157,7 @@ def _bars(values: dict[str, float], label: str, colours: list[str]) -> Figure:
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
-    # On a telephone the numbers beside the bars take a fifth of the width.
+    # On the screen of a telephone the numbers beside the bars take a fifth of the width.
     axis.margins(x=0.22)
     axis.invert_yaxis()
     axis.set_xlabel(label)
@@ -174,7 +174,7 @@ def _hologram(folder: Path, fab: Path) -> Figure:
 
 
 def _row(maps: dict[str, np.ndarray], scales: dict[str, dict[str, Any]]) -> Figure:
-    """Maps side by side; those without a scale of their own from least to most."""
+    """Draw maps side by side; a map without an entry in ``scales`` spans its own range of values."""
     figure = new_figure(10.5, 3.6)
     for axis, (title, picture) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         figure.colorbar(axis.imshow(picture, **scales.get(title, {})), ax=axis, shrink=0.75)

@@ -1,8 +1,9 @@
-"""A lens with an extended depth of focus: its spot has to stay bright over a range of distances.
+"""Design a lens with an extended depth of focus, whose spot stays bright over a range of distances.
 
     python examples/extended_focus.py zoo:pbl
 
-Rings as free cells; the loss is the brightness of the axis, worst plane first. A plain lens is the start.
+The free cells are rings. The loss is the brightness on the axis, mainly in the dimmest planes. The search
+starts from a plain lens.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ WAVELENGTH_UM, PLANES = 0.6328, 9
 
 
 class Axis:
-    """Brightness of the central 0.5 µm in several planes, over that of a perfect lens at its focus."""
+    """Brightness of the central spot in several planes, relative to a perfect lens at its focus."""
 
     def __init__(self, element: litho_design.Element, focal_um: float, range_um: float):
         size, pitch = element.layout.size_px, element.layout.pitch_um
@@ -37,7 +38,7 @@ class Axis:
         self.peak = self._light(self.propagators[PLANES // 2], focused)
 
     def brightness(self, element: litho_design.Element) -> torch.Tensor:
-        """One number per plane (planes,)."""
+        """Return the relative brightness in each plane (planes,)."""
         behind = element(self.wave, WAVELENGTH_UM)
         return torch.stack([self._light(go, behind) for go in self.propagators]) / self.peak
 
@@ -46,7 +47,7 @@ class Axis:
 
 
 def main() -> None:
-    """A plain lens, and lenses trained for a perfect printer and through a model, all as printed."""
+    """Compare, as printed, a plain lens with lenses designed for a perfect printer and through a model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=320)

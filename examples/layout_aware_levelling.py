@@ -1,9 +1,9 @@
-"""How much of a print's own slope and bow goes away with the background, scan by scan.
+"""Measure how much slope and bow of the print a plain background removes, scan by scan.
 
     python examples/layout_aware_levelling.py STORE.zarr
 
-Compares the background that knows the layout with the plain polynomial, on the raw heights of a
-store, in the scan's own frame. Prints one table, nm.
+Compares the layout-aware background with a plain polynomial, on the raw heights of a store, in the
+frame of the scan. Prints one table, in nm.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from litho_data.store import Store, open_store
 
 
 def main() -> None:
-    """Open the store, compare every scan, print."""
+    """Compare both backgrounds on every scan of the store, and print the table."""
     parser = argparse.ArgumentParser(description="Layout-aware against plain background, per scan.")
     parser.add_argument("store", help="dataset store built from raw scans")
     store = open_store(parser.parse_args().store)
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def compare(store: Store, scan_id: str) -> dict[str, float]:
-    """Range of both planes over the field, and rms difference of both second-degree backgrounds, nm."""
+    """Return the range of each plane over the field, and the rms difference of the second-degree fits, nm."""
     print_ = store.scan(scan_id)
     height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
     own = store.quality["scan"] == scan_id

@@ -1,9 +1,9 @@
-"""A phase mask for a microscope: the spot of a single emitter shall tell its place in three dimensions.
+"""Design a phase mask for a microscope, so that the spot of one emitter shows its position in 3D.
 
     python examples/microscope_phase_mask.py zoo:pbl
 
-The element stands in the pupil. The loss is the Cramer-Rao bound of x, y and z from the photons of one spot,
-averaged over depth: the smallest error that any localisation can have (Shechtman et al. 2014,
+The element is in the pupil. The loss is the Cramer-Rao bound of x, y and z for the photons of one spot,
+averaged over depth. This bound is the smallest error that any localisation can have (Shechtman et al. 2014,
 doi:10.1103/PhysRevLett.113.133902).
 """
 
@@ -22,14 +22,14 @@ PHOTONS, BACKGROUND, STEP_UM = 3000.0, 5.0, 0.02
 
 
 class Microscope:
-    """From a mask in the pupil to the precision of a localisation at several depths."""
+    """Compute how precisely a mask in the pupil allows an emitter to be localised, at several depths."""
 
     def __init__(self, size_px: int, depth_um: float):
         y, x = torch.meshgrid(*(torch.linspace(-1, 1, size_px),) * 2, indexing="ij")
         self.pupil = (torch.hypot(y, x) <= 1).to(torch.complex64)
         axial = (IMMERSION**2 - (APERTURE * torch.hypot(y, x).clamp(max=1)) ** 2).sqrt()
         depths = depth_um * torch.linspace(-0.5, 0.5, 7)
-        # Each depth with small steps along z, y and x: their differences are the derivatives of the image.
+        # At each depth the emitter takes small steps along z, y and x; image differences are the derivatives.
         axes = torch.eye(3)
         steps = STEP_UM * torch.stack([torch.zeros(3), *(sign * axis for axis in axes for sign in (1, -1))])
         path = torch.stack([axial, APERTURE * y, APERTURE * x])
@@ -39,9 +39,9 @@ class Microscope:
         self.size_px = size_px
 
     def errors_nm(self, element: litho_design.Element) -> torch.Tensor:
-        """Smallest standard error along z, y and x at each depth (depths, 3), nm."""
+        """Return the smallest possible standard error along z, y and x at each depth (depths, 3), nm."""
         behind = element(self.waves, WAVELENGTH_UM)
-        # Padded to twice the pupil: pixels of wavelength / (4 aperture).
+        # Padded to twice the width of the pupil: the image has pixels of wavelength / (4 aperture).
         image = torch.fft.fft2(behind, s=(2 * self.size_px,) * 2, norm="ortho").abs().square()
         image = torch.fft.fftshift(image / self.pupil.abs().sum(), dim=(-2, -1)) * PHOTONS
         middle = slice(self.size_px - 24, self.size_px + 24)
@@ -53,7 +53,7 @@ class Microscope:
 
 
 def main() -> None:
-    """No mask, and masks trained for a perfect printer and through a model, both printed by the model."""
+    """Compare no mask with masks designed for a perfect printer and through a model, printed by the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)

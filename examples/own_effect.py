@@ -1,10 +1,10 @@
-"""Effects of your own in the closed loop: one of the printer, and one of single scans.
+"""Add two effects of your own to the closed loop: one of the printer, and one of single scans.
 
     python examples/own_effect.py STORE.zarr --out loop
 
 Registers a process effect (the first layers sink into the adhesion promoter) and a term of single scans
 (a scanner whose bow has a cubic part), then closes the loop as `litho-models close-loop` does. Nothing else
-has to change: `close_loop.json` and `report.html` have a verdict on both.
+needs to change: `close_loop.json` and `report.html` contain a verdict on both effects.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SINKING_DEPTH_UM = 0.2
 
 
 def sinking_layers(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - d exp(-M / 0.2 µm): what is printed of the lowest levels M stands d lower."""
+    """Return H - d exp(-M / 0.2 µm): the lowest levels M of a layout are printed lower by d."""
     return height - values["depth_um"] * torch.exp(-context.layout_um / SINKING_DEPTH_UM)
 
 
 def cubic_bow_map(pixels: TermPixels) -> FloatMap:
-    """x³ at the pixels, x from -1 to 1 over the scan, (1, n): of zero mean."""
+    """Return x³ at the pixels, (1, n), with x from -1 to 1 over the scan; its mean is zero."""
     x = pixels.smooth[0]
     return (x**3)[None]
 
 
 def register() -> None:
-    """Enter both effects, and the scan term that stands for the second."""
+    """Register both effects, and the scan term that implements the second one."""
     register_effect(
         Effect(
             name="sinking-layers",
@@ -66,7 +66,7 @@ def register() -> None:
 
 
 def main() -> None:
-    """Register the effects, close the loop, print what became of them."""
+    """Register the effects, close the loop, and print the verdict on each."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,9 +1,9 @@
-"""A metric of your own in the results, the report and the tables of an evaluation.
+"""Add a metric of your own to the results, the report and the tables of an evaluation.
 
     python examples/own_metric.py zoo:pbl STORE.zarr --out evaluation
 
 Registers the share of pixels that are wrong by more than half a level, then evaluates as `litho-models
-evaluate` does. Nothing else has to change: the metric is in the JSON, `report.html`, `metrics.csv` and
+evaluate` does. Nothing else needs to change: the metric appears in the JSON, `report.html`, `metrics.csv` and
 `scans.csv`.
 """
 
@@ -21,13 +21,13 @@ from litho_models import evaluate, register_metric
 def share_off_by_half_a_level(
     scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray
 ) -> float | None:
-    """Share of the scored pixels whose error would move them to the neighbouring level, %."""
+    """Return the share of scored pixels whose error exceeds half a level, %; None without such pixels."""
     scored = residual_um[np.isfinite(residual_um)]
     return 100 * float(np.mean(np.abs(scored) > scan.level_height_um / 2)) if scored.size else None
 
 
 def main() -> None:
-    """Register the metric, evaluate, print what came out."""
+    """Register the metric, evaluate the model, and print the metric."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

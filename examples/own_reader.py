@@ -1,7 +1,7 @@
-"""A reader of one's own: files that begin with TOYAFM are read, by Python, by cards and by the commands.
+"""Add a reader of your own: Python, cards and commands can then read files that begin with TOYAFM.
 
-In a project of one's own this file is all there is to write. In this package the reader is a module of
-`litho_data/readers/` with `READER = Reader(...)` at its end, and one entry in `registry.py`.
+In your own project a file like this one is all you need. In this package a reader is a module of
+`litho_data/readers/` that ends in `READER = Reader(...)`, with an entry in `registry.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ MAGIC = b"TOYAFM"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel: a line `TOYAFM ny nx y_um x_um`, then float32 heights in nm, row 0 on top."""
+    """Read one channel: a line `TOYAFM ny nx y_um x_um`, then float32 heights in nm, top row first."""
     head, _, data = path.read_bytes().partition(b"\n")
-    # Any exception of a reader becomes one line about the file.
+    # Any exception of a reader is reported as one line about the file.
     ny, nx, y_um, x_um = (float(text) for text in head.split()[1:])
     height_nm = np.frombuffer(data, "<f4").reshape(int(ny), int(nx))
     return [
@@ -34,7 +34,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def write_toy(path: Path, height_nm: np.ndarray, size_um: tuple[float, float]) -> None:
-    """Write such a file."""
+    """Write a file in the TOYAFM format."""
     ny, nx = height_nm.shape
     head = f"TOYAFM {ny} {nx} {size_um[0]} {size_um[1]}\n".encode()
     path.write_bytes(head + height_nm.astype("<f4").tobytes())

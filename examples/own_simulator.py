@@ -1,10 +1,10 @@
-"""A model of the printer of your own, trained, frozen and loaded by its name like those of the package.
+"""Add your own model of the printer, and train, freeze and load it by name, like those of the package.
 
     python examples/own_simulator.py STORE.zarr --out FOLDER
 
-Registers a printer whose line is two Gaussians, then trains it as `litho-models train` does. Nothing else has
-to change: benchmark, loop and design take it by its name. In a plug-in (docs/extending.md) the class is
-registered where it stands, by `@register_simulator`; then all commands know it.
+Registers a printer whose spot is the sum of two Gaussians, then trains it as `litho-models train` does.
+Nothing else needs to change: benchmark, loop and design accept the name of the model. In a plug-in
+(docs/extending.md), `@register_simulator` above the class registers it, and all commands accept it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class TwoSpots(Simulator):
 
 
 def main() -> None:
-    """Register the model, train it, freeze it, print what it is."""
+    """Register the model, train it, freeze it, and print the name of the frozen model."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,9 +1,9 @@
-"""A task of your own: three colours in three planes, designed, compared, exported and scored.
+"""Add a task of your own (three colours in three planes): design, compare, export and score it.
 
     python examples/own_task.py zoo:pbl --out rgb-planes
 
-A class states what is seen (``views``), what is wanted (``loss``) and how it is scored (``figures``). Search,
-checkpoints, polish, process window, report, comparison, scores and export are those of holograms and lenses.
+A class defines the images (``views``), what the search minimises (``loss``) and the scores (``figures``).
+Search, checkpoints, polish, process window, report, comparison and export are those of holograms and lenses.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NANOMETRES, PLANES_UM = (640, 532, 473), (-4.0, 0.0, 4.0)
 
 @litho_design.register_task
 class ColoursInPlanes(litho_design.Task):
-    """Every colour draws its own spot, sharp in three planes: extended depth of focus in three colours."""
+    """Draw one spot per colour, sharp in three planes: extended depth of focus in three colours."""
 
     name = "colours-in-planes"
 
@@ -40,14 +40,14 @@ class ColoursInPlanes(litho_design.Task):
 
 
 def spots(size_px: int) -> np.ndarray:
-    """One round spot per colour, float32 (3, size, size)."""
+    """Return one round spot per colour, float32 (3, size, size)."""
     y, x = np.mgrid[0:size_px, 0:size_px] / size_px
     places = ((0.3, 0.3), (0.3, 0.7), (0.7, 0.5))
     return np.stack([np.hypot(y - v, x - u) < 0.06 for v, u in places]).astype(np.float32)
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, print both with the model, export one."""
+    """Design for a perfect printer and through a model, print both with the model, export the second."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

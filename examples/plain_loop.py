@@ -1,9 +1,10 @@
-"""A loop of fifty lines for a blind board: a ridge on the layout, and the covariate that helps it most.
+"""Run a loop of fifty lines on a blind board: a ridge regression on the layout plus the best covariates.
 
     litho-models board judge BOARD --loop "python examples/plain_loop.py" --out judged
 
-A ridge that has not seen a scan predicts it. A covariate is named, as the effect that would make it,
-if with it the squared error falls in all scans but one at most, and by a hundredth in all.
+Each scan is predicted by a ridge regression fitted to the other scans. Each covariate has the name of the
+effect that causes it. This effect is named if the covariate reduces the squared error in all scans but at
+most one, and by at least 1 % in total.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ STEP_PX, BLURS_PX, RIDGE, LEAST_GAIN = 4, (0, 2, 5, 12, 30), 1e-6, 0.01
 
 
 def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """What a scan is predicted from, (pixels, columns), and the covariates by the effect that makes them."""
+    """Return the predictors of a scan, (pixels, columns), and the covariates by the name of their effect."""
     level = scan.mask_level / scan.levels
     blurred = [gaussian_filter(level, px) for px in BLURS_PX]
     y, x = (np.linspace(-1, 1, n) for n in level.shape)
@@ -43,7 +44,7 @@ def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.n
 
 
 def errors_nm(maps: list[np.ndarray], heights: list[np.ndarray]) -> list[np.ndarray]:
-    """Residuals (pixels,) of each scan, nm: predicted by the others, one offset per scan free."""
+    """Return the residuals (pixels,) of each scan after a fit to the others, one offset per scan free, nm."""
     maps, heights = ([one - one.mean(axis=0) for one in own] for own in (maps, heights))
     grams, rights = ([a.T @ b for a, b in zip(maps, own, strict=True)] for own in (maps, heights))
     gram, right, found = sum(grams), sum(rights), []
@@ -54,7 +55,7 @@ def errors_nm(maps: list[np.ndarray], heights: list[np.ndarray]) -> list[np.ndar
 
 
 def plain_loop(store: Path, folder: Path) -> Answer:
-    """Name the covariates that help, one by one, the best first."""
+    """Name the covariates that reduce the error, one by one, the best one first."""
     opened = open_store(store)
     scans = [scan for scan in opened.scans() if scan.id not in opened.locked_ids]
     made = [columns(scan, at / len(scans) - 0.5) for at, scan in enumerate(scans)]
@@ -81,12 +82,12 @@ def plain_loop(store: Path, folder: Path) -> Answer:
 
 
 def mean_absolute(residuals: list[np.ndarray]) -> float:
-    """Of each scan, then over scans."""
+    """Return the mean absolute residual of each scan, averaged over scans."""
     return float(np.mean([np.abs(one).mean() for one in residuals]))
 
 
 def squares(residuals: list[np.ndarray]) -> np.ndarray:
-    """Mean square of each scan."""
+    """Return the mean squared residual of each scan."""
     return np.array([np.mean(one**2) for one in residuals])
 
 

@@ -1,8 +1,8 @@
-"""A hologram in three colours: one printed relief draws a red, a green and a blue disc that overlap.
+"""Design a hologram in three colours: one printed relief draws overlapping red, green and blue discs.
 
     python examples/rgb_hologram.py zoo:pbl
 
-``litho_design.Element`` is a plain module: a wave and a wavelength in, the wave behind the print out.
+``litho_design.Element`` is a torch module: it maps a wave and its wavelength to the wave behind the print.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COLOURS_UM = (0.640, 0.532, 0.473)
 
 
 def discs(size_px: int) -> torch.Tensor:
-    """Three overlapping discs in [0, 1], (3, size, size)."""
+    """Return three overlapping discs, values in [0, 1], (3, size, size)."""
     y, x = np.mgrid[0:size_px, 0:size_px] / size_px - 0.5
     angles = 2 * np.pi * np.arange(3) / 3
     return torch.tensor(
@@ -29,7 +29,7 @@ def discs(size_px: int) -> torch.Tensor:
 
 
 class Scene:
-    """The element lit in three colours, seen at a distance."""
+    """The images at a distance behind the element, illuminated in three colours."""
 
     def __init__(self, size_px: int, distance_um: float, element: litho_design.Element):
         grid = centred_grid((size_px, size_px), element.layout.pitch_um)
@@ -38,7 +38,7 @@ class Scene:
         self.wave = torch.full((size_px, size_px), 1 / size_px, dtype=torch.complex64)
 
     def images(self, element: litho_design.Element) -> torch.Tensor:
-        """Shares of the incident light on each pixel (3, size, size)."""
+        """Return the share of the incident light on each pixel (3, size, size)."""
         height = element.height_um()  # printed once for all colours
         waves = [element(self.wave, um, height) for um in COLOURS_UM]
         return torch.stack(
@@ -47,14 +47,14 @@ class Scene:
 
 
 def loss(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-    """Root mean square error at the best scale, worst colour, and the light that misses."""
+    """Return the rms error of the worst colour at its best scale, plus 0.1 of the light outside the discs."""
     scale = (images * targets).sum((1, 2)) / images.square().sum((1, 2))
     error = (scale[:, None, None] * images - targets).square().mean((1, 2)).sqrt()
     return error.max() + 0.1 * (1 - (images * targets).sum((1, 2))).mean()
 
 
 def main() -> None:
-    """Train for a perfect printer and through a model; print both with the model."""
+    """Design for a perfect printer and through a model, and print both elements with the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)

@@ -1,9 +1,9 @@
-"""Structured light in a 4f system: a printed element turns a vortex beam into a Gaussian one.
+"""Shape light in a 4f system: a printed element turns a vortex beam into a Gaussian beam.
 
     python examples/structured_light_4f.py zoo:pbl
 
-Two lenses and the element between them, in torchoptics (extra ``torchoptics``), lengths in metres. A vortex
-has no share of a Gaussian beam; the element in the Fourier plane has to unwind it.
+The system is two lenses with the element between them, in torchoptics (extra ``torchoptics``), in metres.
+A vortex beam has zero overlap with a Gaussian beam; the element in the Fourier plane must unwind its phase.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ WAVELENGTH, PITCH = 632.8e-9, 0.1e-6
 def overlap(
     element: litho_design.Element, f: float, vortex: torchoptics.Field, wanted: torchoptics.Field
 ) -> torch.Tensor:
-    """Share of the light that leaves the 4f system of focal length ``f`` in the wanted beam."""
+    """Return the share of the light behind the 4f system of focal length ``f`` that is in the wanted beam."""
     shape = vortex.shape
     between = element.as_torchoptics(z=2 * f, unit_um=1e6)
     system = torchoptics.System(Lens(shape, f, f), between, Lens(shape, f, 3 * f))
@@ -32,7 +32,7 @@ def overlap(
 
 
 def main() -> None:
-    """Train for a perfect printer and through a model; print both with the model."""
+    """Design for a perfect printer and through a model, and print both elements with the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)

@@ -24,16 +24,16 @@ _SPOT_PX = 2.0
 def spot_um(pitch_um: float) -> float:
     """Return the spot (standard deviation, µm) that sets the default lengths for layouts of a pitch.
 
-    This is the spot of the first printer if that is between half a pixel and ten pixels wide. If not, the
-    printer must be another one, and its spot is assumed to be two pixels wide.
+    This is the spot of the first printer if that is between half a pixel and ten pixels wide. Otherwise the
+    layouts belong to another printer, whose spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
     return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """Return the lengths of a config, from ``set_`` or the defaults, scaled to a pitch; at scale 1, return
-    none.
+    """Take the lengths of a config from ``set_`` or the defaults and scale them to a pitch; return an empty
+    dict if the scale is 1.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -126,22 +126,22 @@ class Simulator(nn.Module, ABC):
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r),
-        µm.
+        """Return the height of the pixels that are farther than ``reach_px`` from the edge, (b, 1, y - 2r, x
+        - 2r), µm.
 
         A model without a receptive radius receives a whole image or one tile, and returns the same size.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field, whose outermost pixels are continued beyond the edge."""
+        """Return the height of the whole field; its outermost pixels are repeated beyond the edge."""
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Return the height of the whole field without a border of ``border_px``, µm.
+        """Return the height that ``forward`` gives, without a border of ``border_px``, µm.
 
-        A model without a receptive radius overrides this method if it can save the cost of the border. For
-        other models ``predict_inside`` computes only what is needed.
+        A model without a receptive radius overrides this method if it need not compute the border. For other
+        models ``predict_inside`` computes only the pixels that are needed.
         """
         return crop_border(self(layout_um), border_px)
 
@@ -153,14 +153,14 @@ class Simulator(nn.Module, ABC):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Return the ranges of fitted values by the name of their parameter (one raw number); other
+        """Return the range of each limited value, by the name of its parameter (one raw number). The other
         parameters are not limited.
         """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Return the values that are on a bound of their range, with that bound."""
+        """Return the names of the values that lie on a bound of their range, each with this bound."""
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
         return {name: bound for name, bound in bounds.items() if bound is not None}
@@ -184,8 +184,8 @@ class Simulator(nn.Module, ABC):
 def is_small(model: nn.Module) -> bool:
     """Return whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
 
-    Small models are fitted by least squares (except by the paper's recipe), and in the loop together with the
-    effects. Other models are trained by stochastic gradient, and the loop does not refit them.
+    Small models are fitted by least squares, except with the paper's recipe. The loop fits them together with
+    the effects. Other models are trained by stochastic gradient descent, and the loop does not refit them.
     """
     return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 

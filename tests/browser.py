@@ -1,4 +1,4 @@
-"""Pages in a real browser: Chromium without a window, spoken to over a pipe (DevTools protocol)."""
+"""Show pages in a real browser: headless Chromium, controlled over a pipe by the DevTools protocol."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-# Of everything that is asked of the browser; one answer takes milliseconds, the start seconds.
+# The limit for every request to the browser. One answer takes milliseconds, the start takes seconds.
 TIMEOUT_S = 60.0
 OPTIONS = (
     "--headless=new",
@@ -28,8 +28,8 @@ OPTIONS = (
 )
 
 PHONE_PX, DESK_PX = 390, 1280
-# What is wrong with the page as it is shown: WCAG 2 contrast (AA: 4.5, large letters 3), and pictures without
-# content, which are drawn small and have their colours counted.
+# Lists what is wrong with the page as shown: low contrast (WCAG 2 AA: 4.5, large letters 3), a page that is
+# wider than the screen, and pictures without content. A picture is drawn small and its colours are counted.
 FAULTS = """(async () => {
   const found = [], channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
   const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
@@ -64,12 +64,12 @@ FAULTS = """(async () => {
 
 
 def browser_path() -> str | None:
-    """The browser of this machine, or None."""
+    """Return the path of this machine's browser, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
 class Browser:
-    """One Chromium with one page."""
+    """Control one Chromium with one page."""
 
     def __enter__(self) -> Self:
         path = browser_path()
@@ -106,18 +106,18 @@ class Browser:
         self._profile.cleanup()
 
     def show(self, page: Path | str, width_px: int, dark: bool) -> None:
-        """Load a file or an address and wait for it; what it complains about is in ``errors``."""
+        """Load a file or an address and wait for it. ``errors`` then lists the errors that it reports."""
         self.errors = []
         self.screen(width_px, dark)
         self._loaded = False
         self.ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._take(self._receive())
-        # Pictures far down are decoded when they are needed: ask for all, and for the layout with them.
+        # The browser decodes pictures far down only when they are needed. This decodes all and lays them out.
         self.run("Promise.all([...document.images].map(i => i.decode().catch(() => 0))).then(() => 1)")
 
     def screen(self, width_px: int, dark: bool) -> None:
-        """The size and the colours that the page is shown in."""
+        """Set the screen size and the light or dark colours that the page is shown in."""
         self.ask(
             "Emulation.setDeviceMetricsOverride", width=width_px, height=844 if width_px < 600 else 800,
             deviceScaleFactor=1, mobile=False,
@@ -126,13 +126,13 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
 
     def run(self, script: str) -> Any:
-        """The value of a JavaScript expression in the page."""
+        """Return the value of a JavaScript expression in the page."""
         answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def picture(self, file: Path) -> None:
-        """The whole page as PNG."""
+        """Write a picture of the whole page to a PNG file."""
         height = self.run("document.documentElement.scrollHeight")
         width = self.run("innerWidth")
         clip = {"x": 0, "y": 0, "width": width, "height": min(height, 16000), "scale": 1}
@@ -140,7 +140,7 @@ class Browser:
         file.write_bytes(base64.b64decode(answer["data"]))
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The answer to one command of the protocol."""
+        """Send one command of the protocol and return its answer."""
         self._number += 1
         message: dict[str, Any] = {"id": self._number, "method": method, "params": parameters}
         if self._session:

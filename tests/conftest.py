@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests: where the measured prints and the reference fields are."""
+"""Fixtures shared by all tests: the folders of the measured prints and of the reference fields."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from tests.figures import require_legible
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Before any test loads torch.
+# This must run before any test loads torch.
 let_waiting_threads_sleep()
 
-# In place of a figure: half a second each, some hundreds of them.
+# Stands in for a figure. Drawing one takes half a second, and the tests make some hundreds of them.
 BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
 
 
@@ -34,7 +34,7 @@ def _legible(page: report.Page, figure: Figure, caption: str) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Figures are made and looked at, but drawn only for tests marked ``pictures``."""
+    """Check every figure that a test makes, but draw it only in tests marked ``pictures``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report.Page, "figure", _legible)
         if item.get_closest_marker("pictures") is None:
@@ -43,20 +43,20 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def pytest_collection_finish() -> None:
-    """Modules that were loaded to collect stay: no search for garbage has to pass through them again."""
+    """Exclude the modules that collection has loaded from all later searches for garbage."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session")
 def measured_prints() -> Path:
-    """The folder `neural-lithography` with `mask_ug/`, `afm_ug/`, `mask/`, `afm/`."""
+    """Return the folder `neural-lithography` with `mask_ug/`, `afm_ug/`, `mask/`, `afm/`."""
     return _folder_or_skip("LITHO_DATA_DIR", "neural-lithography")
 
 
 @pytest.fixture(scope="session")
 def oracles() -> Path:
-    """The folder with `gwyddion/` and `formats/`."""
+    """Return the folder with `gwyddion/` and `formats/`."""
     return _folder_or_skip("LITHO_ORACLE_DIR", "")
 
 

@@ -1,8 +1,8 @@
-"""Small faults, put into a copy of the project one at a time: each has to be caught by the law beside it.
+"""Put small faults into a copy of the project, one at a time: the tests named beside each have to catch it.
 
-``python -m tests.faults [WORDS]`` tries those whose name holds one of the words, all by default, and ends
-with 1 if one is not caught. It takes minutes, so it is no test itself. Each is tried in a fork of a process
-that has loaded what the project stands on.
+``python -m tests.faults [WORDS]`` tries the faults whose name contains one of the words, all by default. It
+exits with 1 if a fault is not caught. It takes minutes, so the test suite does not run it. Each fault is
+tried in a fork of a process that has already loaded the libraries the project uses.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PRELOADED = ["torch", "scipy.optimize", "scipy.stats", "xarray", "zarr", "pandas
 
 
 class Fault(NamedTuple):
-    """What is changed where, and the tests that have to notice."""
+    """State which text of which file is changed, and which tests have to notice."""
 
     name: str
     file: str
@@ -55,7 +55,7 @@ FAULTS = [
     # Axes and half pixels.
     Fault("a canvas half a pixel off", "litho_data/virtual_fab/canvas.py",
           "shape[1]) - GUARD_PX + 0.5)", "shape[1]) - GUARD_PX)", AXES),
-    Fault("a canvas of another width", "litho_data/virtual_fab/canvas.py",
+    Fault("a canvas with its height as width", "litho_data/virtual_fab/canvas.py",
           "self.x_um - width_um / 2", "self.x_um - height_um / 2", AXES),
     Fault("pitch of a bent scan transposed", "litho_data/register/scan.py",
           "nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]",
@@ -71,51 +71,51 @@ FAULTS = [
           "torch.where(index < there, index, index - length)",
           "torch.where(index < here, index, index - length)", f"{OPTICS} -k separation"),
     Fault("a decimetre", "litho_data/foundation/units.py", '"dm": 1e5', '"dm": 1e4', AXES),
-    # Keys.
-    Fault("own layouts by their shape", "litho_data/virtual_fab/simulate.py",
+    # Cache keys.
+    Fault("the key of a layout is its shape", "litho_data/virtual_fab/simulate.py",
           'array_sha256(job.level, "level", ("y", "x"))', "list(job.level.shape)",
           "tests/litho_data/test_scan_key.py"),
-    Fault("pairs of any pitch", "litho_data/exchange/pairs.py",
+    Fault("a key of pairs without the card", "litho_data/exchange/pairs.py",
           "self.order, card, operation", "self.order, operation", "tests/litho_data/test_pairs.py -k begun"),
-    Fault("a scan by its arrays alone", "litho_data/store/printed_scan.py",
+    Fault("a key of a scan by its arrays only", "litho_data/store/printed_scan.py",
           "return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}",
           "return [_hashed(value.mask_level), _hashed(value.height_um), _hashed(value.valid)]",
           "tests/litho_data/test_scan_key.py"),
-    # Gates.
+    # Checks that refuse or leave out.
     Fault("an error that the fit has made small is judged", "litho_models/monitoring/check.py",
           'if figure.name != "error" or not optimistic]', "if figure.name]", CHECK),
-    Fault("a path that leaves by a/../../b", "litho_data/cards/card.py",
+    Fault("a path that leaves its folder by a/../../b", "litho_data/cards/card.py",
           '".." in parts', 'parts[0] == ".."', "tests/litho_data/test_card.py"),
-    Fault("a scan without its order", "litho_data/cards/listing.py",
+    Fault("a scan without its order is accepted", "litho_data/cards/listing.py",
           'any("order" in row for row in table.values()):\n        return', "False:\n        return",
           "tests/litho_data/test_listing.py"),
-    Fault("a store's name is a path", "litho_data/store/contract.py",
+    Fault("a store's name may be a path", "litho_data/store/contract.py",
           'require_plain_name(f"name of {path}", name)', "name", "tests/litho_data/test_release.py"),
-    Fault("a level above the highest", "litho_data/store/contract.py",
+    Fault("a level above the highest is accepted", "litho_data/store/contract.py",
           "if highest >= levels", "if highest > levels", WHOLE),
-    Fault("the hash that is written in the store", "litho_data/store/read.py",
+    Fault("the stated hash in place of the computed one", "litho_data/store/read.py",
           "return self.computed_sha256()\n\n    @property",
           'return str(self.root.attrs["dataset_sha256"])\n\n    @property', f"{WHOLE} -k hash"),
     Fault("chunks of zeros without a file", "litho_data/store/write.py",
           '"write_empty_chunks": True', '"write_empty_chunks": False', f"{WHOLE} -k every_chunk"),
-    Fault("a gain by the upper end of its interval", "litho_models/loop/judging.py",
+    Fault("a gain is judged by the upper end of its interval", "litho_models/loop/judging.py",
           "low, _ = bootstrap_interval", "_, low = bootstrap_interval",
           "tests/litho_models/test_loop_search.py -k reason"),
-    Fault("what the prints know, upside down", "litho_models/planning/open_questions.py",
+    Fault("the inverse of the prints' information", "litho_models/planning/open_questions.py",
           "information = stands_for * ", "information = 1 / stands_for * ", f"{NEXT} -k know"),
-    # What is begun.
-    Fault("begun is not said first", "litho_data/foundation/begun.py",
+    # Folders that were begun and not finished.
+    Fault("no mark of a begun folder", "litho_data/foundation/begun.py",
           "mark = Path(out), Path(out) / BEGUN", 'mark = Path(out), Path(out) / "other"', BEGUN),
     Fault("an older folder is not put back", "litho_data/foundation/files.py",
           "        old.replace(target)\n    shutil", "        pass\n    shutil",
           f"{BEGUN} tests/litho_data/test_files.py"),
-    Fault("leftovers stay", "litho_data/foundation/begun.py", "clear_leftovers(folder)", "pass", BEGUN),
-    Fault("settings of a loop without the further prints", "litho_models/loop/run.py",
+    Fault("leftovers remain", "litho_data/foundation/begun.py", "clear_leftovers(folder)", "pass", BEGUN),
+    Fault("a loop's settings lack the further prints", "litho_models/loop/run.py",
           '"new_prints": list(decided_by)', '"new_prints": []', f"{RUN} -k other_settings"),
-    Fault("tiles of another seed", "litho_models/planning/run.py",
+    Fault("kept tiles of another seed are used", "litho_models/planning/run.py",
           "**asked})[:16]", "**(asked | {'seed': 0})})[:16]", f"{NEXT} -k resumes"),
-    # Leaks.
-    Fault("lines of the scan's own fold", "litho_models/loop/single_scans.py",
+    # Leaks of held-out data.
+    Fault("lines from the scan's own fold", "litho_models/loop/single_scans.py",
           "for others, own in self.study.folds:", "for own, others in [(range(len(found)),) * 2]:",
           "tests/litho_models/test_single_scans.py -k other_folds"),
     Fault("a rival judged on scans that it was fitted on", "litho_models/loop/fits.py",
@@ -125,22 +125,22 @@ FAULTS = [
           "learn_background(fold.training, own)",
           "learn_background([*fold.training, *fold.held_out], [*own, *held_out])",
           "tests/litho_models/test_benchmark.py -k moves_what"),
-    Fault("a scan freed by what it says itself", "litho_models/loop/measured.py",
+    Fault("shared terms learned from the scan itself", "litho_models/loop/measured.py",
           "for own, held_out in study.folds:", "for own, held_out in [(list(range(len(scans))),) * 2]:",
           f"{RUN} -k others_say"),
-    Fault("chosen with the print that is judged", "litho_models/loop/run.py",
+    Fault("a choice made with the print that is judged", "litho_models/loop/run.py",
           "close_again([scan for scan in scans if scan.id not in out])", "close_again(scans)",
           f"{RUN} -k judged_on"),
     # Reports.
-    Fault("a coverage under another level", "litho_models/noise/report.py",
+    Fault("a coverage stands under another level", "litho_models/noise/report.py",
           "zip(one.levels, row.coverage, strict=True)", "zip(one.levels, row.coverage[::-1], strict=True)",
           "tests/litho_models/test_noise_results.py -k coverage"),
     Fault("two columns swapped", "litho_models/evaluation/tables.py",
           '"mae_abs_nm": s.mae_abs_nm', '"mae_abs_nm": s.mae_datum_free_nm',
           "tests/litho_models/test_benchmark.py -k complete_on_disk"),
-    Fault("waves without the zero", "litho_design/reports/tables.py",
+    Fault("waves not counted from level 0", "litho_design/reports/tables.py",
           "(height - printed[0]) / wave_um", "height / wave_um", "tests/test_tables.py -k waves"),
-    Fault("another interval at a bar", "litho_models/evaluation/plots.py",
+    Fault("the wrong interval at a bar", "litho_models/evaluation/plots.py",
           'getattr(s, f"{error}_ci95_nm")', 's.mae_abs_ci95_nm',
           "tests/test_tables.py -k bar"),
     Fault("the interval of another figure", "litho_models/loop/results.py",
@@ -148,35 +148,35 @@ FAULTS = [
           "over_scans=over_units(list(after.by_scan_nm.values()), seed=", f"{RUN} -k errors_are_means"),
     Fault("a dead worker takes all jobs with it", "litho_data/sharing/workers.py",
           "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
-    # Of sixty drawn at random, those that no test of their room saw.
-    Fault("no interval where there is one", "litho_models/scoring/statistics.py",
+    # Of sixty faults drawn at random, those that no test of their room noticed.
+    Fault("an interval only for too few units", "litho_models/scoring/statistics.py",
           "seed=seed) if enough else None", "seed=seed) if not enough else None",
           "tests/litho_models/test_metrics.py -k enough"),
-    Fault("the mean height of a grating twice", "litho_data/roughness/grating.py",
+    Fault("a grating's mean added, not subtracted", "litho_data/roughness/grating.py",
           "height_um - np.nanmean(height_um)", "height_um + np.nanmean(height_um)",
           "tests/litho_data/test_gratings.py -k zero"),
-    Fault("light beside the target is of it", "litho_design/holograms/bench.py",
+    Fault("light beside the target counts as in it", "litho_design/holograms/bench.py",
           "share[wanted > 0]", "share[wanted >= 0]", "tests/litho_design/test_hologram.py -k speckle"),
-    Fault("a contrast of a sample", "litho_design/images/similarity.py",
+    Fault("a contrast by the sample's deviation", "litho_design/images/similarity.py",
           "lit.std(correction=0)", "lit.std(correction=1)",
           "tests/litho_design/test_hologram.py -k four_pixels"),
     Fault("a column without a name", "litho_data/reports/page.py",
           "frame.to_csv(temporary, index=False)", "frame.to_csv(temporary, index=True)",
           "tests/litho_models/test_noise_results.py -k column"),
-    Fault("pairs are read where the store is to be", "litho_data/cli/app.py",
+    Fault("folder and target of pairs exchanged", "litho_data/cli/app.py",
           "        folder,\n        target,\n        pitch",
           "        target,\n        folder,\n        pitch",
           "tests/litho_data/test_data_cli.py -k commands_on"),
     Fault("all that scans may share is taken", "litho_models/scan_terms/measurement_fit.py",
           "gain = left - tried[best]", "gain = left + tried[best]",
           "tests/litho_models/test_measurement_model.py -k nothing"),
-    Fault("four cells are too few", "litho_data/level/plane.py",
+    Fault("four cells are refused as too few", "litho_data/level/plane.py",
           "slopes.shape[1] < _FEWEST_CELLS", "slopes.shape[1] <= _FEWEST_CELLS",
           "tests/litho_data/test_level_laws.py -k four_cells"),
-    Fault("scars as wide as asked stay", "litho_data/level/scars.py",
+    Fault("scars of exactly the given width stay", "litho_data/level/scars.py",
           "min(max_width_px, ny - 2) + 1", "min(max_width_px, ny - 2)",
           "tests/litho_data/test_level_beyond.py -k stay"),
-    Fault("files that others may run", "litho_data/foundation/files.py",
+    Fault("files that others may execute", "litho_data/foundation/files.py",
           "chmod(0o666", "chmod(0o667", "tests/litho_data/test_files.py -k umask"),
     Fault("the smallest difference of tiles", "litho_design/printers/printer.py",
           "max_nm=float(nm.abs().max())", "max_nm=float(nm.abs().min())",
@@ -191,10 +191,10 @@ FAULTS = [
     Fault("an unknown distance of layouts without levels", "litho_design/reports/advice.py",
           "LEVELS_FILE not in design.files", "LEVELS_FILE in design.files",
           "tests/litho_design/test_fabrication.py -k unknown_distance"),
-    Fault("every process with the same crops", "litho_models/fitting/stochastic.py",
+    Fault("every process takes the same crops", "litho_models/fitting/stochastic.py",
           "batch[rank::count]", "batch[::count]",
           "tests/litho_models/test_training.py -k any_number_of_processes"),
-    Fault("a spread calibrated by its errors", "litho_models/noise/calibration.py",
+    Fault("errors and spread exchanged", "litho_models/noise/calibration.py",
           "ence=normalised_calibration_error(residual[mine], sigma[mine])",
           "ence=normalised_calibration_error(sigma[mine], residual[mine])",
           "tests/litho_models/test_noise.py -k half_as_large"),
@@ -209,16 +209,16 @@ FAULTS = [
     Fault("lines along the other axis", "litho_models/loop/prepared.py",
           'write.get("slow_axis", "y")', 'write.get("y", "slow_axis")',
           "tests/litho_models/test_loop_model.py -k record_says"),
-    Fault("a full wave that is not known", "litho_design/reports/advice.py",
+    Fault("advice on a full wave only where it is unknown", "litho_design/reports/advice.py",
           "level_height_for_one_wave_um is None:", "level_height_for_one_wave_um is not None:",
           "tests/litho_design/test_fabrication.py -k full_wave"),
-    Fault("dirt without what lies around it", "litho_data/making/contour.py",
+    Fault("dirt without its surroundings", "litho_data/making/contour.py",
           "return binary_dilation(wrong, iterations=depth_px) if wrong.any() else wrong", "return wrong",
           "tests/litho_data/test_micrographs.py -k dirt"),
-    Fault("one error beside none", "litho_models/boards/judging.py",
+    Fault("one error compared with a missing one", "litho_models/boards/judging.py",
           "before_nm is not None and answer", "before_nm is not None or answer",
           "tests/litho_models/test_boards.py -k compares_names"),
-    Fault("treads narrower than the narrowest", "litho_models/noise/staircase.py",
+    Fault("treads narrower than the limit", "litho_models/noise/staircase.py",
           "stop - narrowest + 1)", "stop - narrowest + 2)",
           "tests/litho_models/test_noise.py -k narrower"),
     Fault("a recipe suggested for a folder", "litho_data/cli/app.py",
@@ -245,22 +245,22 @@ FAULTS = [
     Fault("a model's name taken for a loaded one", "litho_design/printers/source.py",
           "if isinstance(item, str):\n            first", "if isinstance(str, item):\n            first",
           "tests/litho_design/test_frozen_printer.py -k as_words"),
-    Fault("one flat scan among others", "litho_models/loop/search.py",
+    Fault("one flat scan counts as all flat", "litho_models/loop/search.py",
           "one_level = all(", "one_level = any(", "tests/litho_models/test_loop_search.py -k cannot_test"),
     Fault("outcomes of the rivals in another order", "litho_models/planning/answers.py",
           "it is {name}\" for name in names),\n            \"two fit",
           "it is {name}\" for name in names[::-1]),\n            \"two fit", f"{NEXT} -k waiting"),
-    Fault("a meaning before its name", "litho_data/reports/page.py",
+    Fault("a meaning stands before its name", "litho_data/reports/page.py",
           '[(column["name"], column["meaning"])', '[(column["meaning"], column["name"])',
           "tests/test_tables.py -k meaning"),
-    Fault("frequency against power", "litho_data/layouts/statistics_report.py",
+    Fault("the axes of frequency and power exchanged", "litho_data/layouts/statistics_report.py",
           "step(statistics.frequency_per_um, statistics.power_share,",
           "step(statistics.power_share, statistics.frequency_per_um,", "tests/test_tables.py -k graphs"),
 ]  # fmt: skip
 
 
 def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
-    """The test that fails with a fault, or mypy if it is asked first; empty if none does."""
+    """Return the test that fails with a fault, or "mypy" if that runs first and fails; "" if none fails."""
     with _put_in(fault, copy):
         if typed and subprocess.run([*_MYPY], cwd=copy, capture_output=True).returncode:
             return "mypy"
@@ -273,7 +273,7 @@ def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
             code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
             said.seek(0)
             failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said.read(), re.MULTILINE)
-    # 0 and 1: tests passed and failed; 2: what they import does not even load.
+    # 0: the tests passed; 1: a test failed; 2: a module that they import does not load.
     assert code in (0, 1, 2), f"{fault.name}: no answer of {fault.tests}"
     return failed[1] if failed else ""
 
@@ -291,7 +291,7 @@ def _put_in(fault: Fault, copy: Path) -> Iterator[None]:
 
 
 def _run(copy: Path, arguments: list[str], said: int) -> None:
-    """Run tests of the copy in this process, which has loaded nothing of the project but this module."""
+    """Run tests of the copy in this process, after unloading every module of the project."""
     os.chdir(copy)
     os.dup2(said, 1)
     os.dup2(said, 2)
@@ -308,10 +308,10 @@ def _run(copy: Path, arguments: list[str], said: int) -> None:
 
 
 def try_all(faults: list[Fault], typed: bool = False) -> int:
-    """Put in one fault after the other; returns how many were not caught.
+    """Put in one fault after the other; return how many were not caught.
 
     Args:
-        typed: mypy is asked before the tests, as in CI.
+        typed: whether to run mypy before the tests, as CI does.
     """
     missed = 0
     for name in PRELOADED:

@@ -1,6 +1,6 @@
-"""The law of figures: all that is drawn can be seen, on axes that say what they show.
+"""Check that everything drawn in a figure can be seen, and that its axes say what they show.
 
-``tests/conftest.py`` asks it of every figure of every report that a test makes.
+``tests/conftest.py`` checks every figure of every report that a test makes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def require_legible(figure: Figure) -> None:
 
 
 def _require_names(axes: Axes) -> None:
-    """Both axes have a name, which those beside it may share, or the names of what stands there."""
+    """Fail unless each axis has tick labels or a name, which axes that share it may carry instead."""
     for axis, others in ((axes.xaxis, axes.get_shared_x_axes()), (axes.yaxis, axes.get_shared_y_axes())):
         which = f"{axis.axis_name}axis"
         alike = [getattr(one, which) for one in others.get_siblings(axes)]

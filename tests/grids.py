@@ -1,8 +1,8 @@
-"""Grids on which no two axes can be taken for one another; all rooms test their axes on them.
+"""Grids on which a mistaken axis always changes the result; all rooms test their axes on them.
 
-Fields are higher than wide and wider than high, even and odd along either axis, with pixels that are longer
-along one, and corners off the origin: a transposed pair, a size in the place of the other and half a pixel
-all show.
+Some fields are higher than wide, others wider than high. Their sizes are even and odd, their pixels are
+longer along one axis, and their corners are off the origin. So a transposed pair, the size of the wrong axis
+and a shift by half a pixel all show.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Jobs for the tests of workers; processes that run them import nothing but this."""
+"""Jobs for the tests of workers; the processes that run them import no other test module."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Job = tuple[int, list[int]]
 
 
 def large(count: int) -> dict[str, list[int]]:
-    """What jobs may know."""
+    """Return the large object that all jobs may read."""
     return {"all": list(range(count))}
 
 
 def told(job: Job) -> tuple[list[int], int, tuple[str, str, str | None]]:
-    """The known list, its entry of this number, and what a result would record."""
+    """Return the list that all jobs know, its entry with this job's number, and the facts of the run."""
     number, known = job
     return known, known[number], (run_facts()["command"], os.getcwd(), os.environ.get("OMP_NUM_THREADS"))
 
@@ -28,7 +28,7 @@ def refuse(number: int) -> None:
 
 
 def die_once(job: tuple[int, Path]) -> int:
-    """Job 2 kills its process the first time, and leaves a mark."""
+    """Kill the process at the first try of job 2, after leaving a mark; else return the number."""
     number, mark = job
     if number == 2 and not mark.exists():
         mark.touch()
@@ -37,7 +37,7 @@ def die_once(job: tuple[int, Path]) -> int:
 
 
 def die_at_first(job: tuple[int, int, Path]) -> int:
-    """Kills its process so many times, then answers; one mark for each time."""
+    """Kill the process ``deaths`` times, leaving a mark each time, and then return the number."""
     number, deaths, marks = job
     for death in range(deaths):
         if not (mark := marks / f"{number}.{death}").exists():
@@ -51,7 +51,7 @@ def die(_: int) -> None:
 
 
 def new_pages(mib: int) -> int:
-    """Pages that this process is given while it makes and frees an array of so many MiB twenty times."""
+    """Count the new memory pages of this process as it makes and frees a ``mib`` MiB array 20 times."""
     import resource
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -1,4 +1,4 @@
-"""Typical mistakes with the three commands and the packages, made in a small world."""
+"""Make typical mistakes with the three commands and the packages, in a folder of small inputs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-# Asked where there is no torch, which `pip install litholoop` alone does not bring.
+# Run as if torch were missing, as after `pip install litholoop` alone.
 NO_TORCH = "litho-models zoo list"
-# By theme, what was done: a command line, or a statement of Python.
+# The mistakes by theme: each is a command line or a Python statement.
 MISTAKES: dict[str, dict[str, str]] = {
     "Words of the command line": {
         "a command misspelt": "litho-models trian prints.zarr --model pbl --out new",
@@ -161,7 +161,7 @@ MISTAKES: dict[str, dict[str, str]] = {
 
 
 def build_world() -> None:
-    """Files that the mistakes are made with, in the current folder: raw prints, stores, models, results."""
+    """Write the files that the mistakes use to the current folder: raw prints, stores, models, results."""
     from litho_data import open_store, simulate
     from litho_data.foundation.begun import BEGUN
     from litho_data.layouts import write_layout_set
@@ -185,7 +185,7 @@ def build_world() -> None:
         Path(name, "card.toml").write_text(text.replace(old, new), "utf-8")
     shutil.copy("raw/scans/P11.txt", "lost/scans/P12.txt")
     with warnings.catch_warnings():
-        # xarray's, on strings in a store that no build of ours has written.
+        # xarray warns of strings in this store, which our build command has not written.
         warnings.simplefilter("ignore")
         scans = make_scans(3, 32)
         write_store(here / "prints.zarr", scans)
@@ -218,7 +218,7 @@ def build_world() -> None:
 
 @contextlib.contextmanager
 def world() -> Iterator[Path]:
-    """A folder with everything that the mistakes need, which is the current one meanwhile."""
+    """Make a folder with everything that the mistakes need, and work in it meanwhile."""
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         os.chdir(folder)
@@ -230,7 +230,7 @@ def world() -> Iterator[Path]:
 
 
 def answer(mistake: str) -> tuple[int | str, str]:
-    """Exit code and stderr of a command; of a statement the name of the exception and its message."""
+    """Return exit code and stderr of a command, or the exception's name and message of a statement."""
     if not mistake.startswith("litho-"):
         import litho_data
         import litho_design

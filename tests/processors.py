@@ -1,9 +1,10 @@
-"""The tests of numerics on this processor, and once more as if it were an older one.
+"""Run the numerical tests on this processor, and again as if it were an older one.
 
     python tests/processors.py [--all] [--after-native] [native] [avx2] [avx512]
 
-Without names as all of them; with --all every test, not only those of numerics that are quick. What this
-processor is anyway is not played where the tests run as it is, or, with --after-native, have just passed so.
+Without names the tests run as each of the three. With --all every test runs, not only the quick numerical
+ones. An older processor is left out if this processor has the same instructions and the tests also run as
+"native". With --after-native the native tests have just passed, so it is left out then too.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ _QUICK = ["-m", "numerics and not slow and not long"]
 
 
 class Processor(NamedTuple):
-    """What a processor must be able to do to play another, and what makes the libraries play it.
+    """A processor that this one can imitate.
 
-    ``beyond``: what it lacks. A processor that lacks it too is the other one, as far as the numbers go.
+    ``capability`` is the capability that imitating it needs, and ``environment`` makes the libraries imitate
+    it. ``beyond`` lists capabilities that it lacks: a processor that lacks them too gives the same numbers.
     """
 
     capability: str
@@ -58,13 +60,13 @@ PROCESSORS = {
 
 
 def can_play(name: str) -> bool:
-    """Whether this processor knows the instructions of the other."""
+    """Return whether this processor has the instructions of the named one."""
     capability = PROCESSORS[name].capability
     return not capability or bool(torch.cpu.get_capabilities().get(capability))
 
 
 def why_left_out(name: str, beside: Collection[str]) -> str:
-    """Why the tests do not run as this processor, beside those; empty where they do."""
+    """Return why the tests do not run as the named processor too, beside the others; "" if they do."""
     if not can_play(name):
         return "this processor has other instructions"
     known = torch.cpu.get_capabilities()

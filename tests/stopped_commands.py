@@ -1,8 +1,9 @@
-"""Commands that are stopped after their writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
+"""Stop commands after their writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
 
-A process of its own, with one thread: a stopped command is a fork of it. Every command is a function of the
-folder that it works in; what it needs is made there beforehand. Prints how many stops ended like the whole:
-six of them as a test, with ``every`` all.
+This runs in a separate process with one thread, because a stopped command is a fork of it. Every command is a
+function of the folder that it works in, where its input is made beforehand. The module gives each stopped
+command again, and prints how many stops ended with the result of an uninterrupted run. A test tries six
+stops, ``every`` tries all.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import make_scans, write_store
 from tests.stops import stopped_after, writes_of
 
-# What differs between two runs of one command.
+# Fields that differ between two runs of one command.
 _VOLATILE = {
     "seconds",
     "seconds_per_iteration",
@@ -169,7 +170,7 @@ def judge(folder: Path) -> None:
 
 
 def _planted(folder: Path) -> None:
-    """Prints of a small base that remember the lines before, and a loop that seeks little else."""
+    """Write prints of a small base with write-order memory, and make the loop try few other causes."""
     strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
     write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
     causes = [get_effect(one) for one in ("write-order-memory", "slope-thinning")]
@@ -181,7 +182,7 @@ def _planted(folder: Path) -> None:
 
 
 def _once(close: Callable[..., Any]) -> Callable[..., Any]:
-    """Keep what a search found for the forks of this process, which repeat the rest and every write."""
+    """Cache what a search finds for the forks of this process, which repeat only the rest and all writes."""
     kept: dict[tuple[str, ...], Any] = {}
 
     def found(study: Any, models: Any) -> Any:
@@ -253,7 +254,7 @@ def export_design(folder: Path) -> None:
 
 
 def score_design(folder: Path) -> None:
-    # The record names the folder of the design as it was given.
+    # The record keeps the design's folder as it was given, so use a relative path.
     os.chdir(folder)
     score("design", "out", judges=["zoo:physics"])
 
@@ -268,7 +269,7 @@ def nothing(folder: Path) -> None:
     pass
 
 
-# Per command: what it needs, and itself.
+# Per command: the function that makes its input, and the function that runs it.
 COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "simulate": (nothing, simulate_prints),
     "simulate-films": (nothing, films),
@@ -302,7 +303,7 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
 
 
 def content(folder: Path) -> dict[str, Any]:
-    """All that a command left, hidden files too, without what differs between two runs."""
+    """Return all that a command left, hidden files too, without the fields that differ between two runs."""
     if (folder / "out" / "zarr.json").exists():
         assert not verify(folder / "out").findings
         found: dict[str, Any] = {"dataset": open_store(folder / "out").sha256}
@@ -327,18 +328,18 @@ def _steady(value: Any) -> Any:
 
 
 def chosen(count: int, most: int) -> list[int]:
-    """Stops that are spread over all writes, and the last ones, where results are put in place."""
+    """Return stops that are spread over all writes, and the last three, where results are put in place."""
     spread = range(0, count, max(1, -(-count // most)))
     return sorted({*spread, *range(max(0, count - 3), count)})
 
 
 def stop_everywhere(name: str, place: Path, most: int) -> int:
-    """Stop a command after its writes and give it again; returns how often that was done."""
+    """Stop a command after some of its writes and give it again each time; return the number of stops."""
     need, command = COMMANDS[name]
     prepared = place / "prepared"
     prepared.mkdir(parents=True)
     need(prepared)
-    # In this process too, so that its forks need not import anything.
+    # Run it once in this process, so that its forks need not import anything.
     command(Path(shutil.copytree(prepared, place / "first")))
     whole = Path(shutil.copytree(prepared, place / "whole"))
     count = writes_of(lambda: command(whole), whole)

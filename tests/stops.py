@@ -1,7 +1,7 @@
-"""Stop a process after each of its writes, and compare what a second start makes of what is left.
+"""Stop a process after each of its writes, so that a second start can be compared with a whole run.
 
-A write is what changes a file system by Python's hands: a file opened to write, a folder made, a rename, a
-removal. A stopped process ends at once, as if killed: no clean-up runs.
+A write is a call of Python that changes the file system: it opens a file to write, makes a folder, renames or
+removes. A stopped process ends at once, as if killed: no clean-up runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _STOPPED = 77
 
 
 def writes_of(work: Callable[[], object], below: Path) -> int:
-    """How many writes below a folder the work makes, in a process of its own."""
+    """Run the work in a child process and return how many writes it makes below a folder."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -32,7 +32,7 @@ def writes_of(work: Callable[[], object], below: Path) -> int:
 
 
 def stopped_after(count: int, work: Callable[[], object], below: Path) -> bool:
-    """Whether the work, in a process of its own, was stopped after ``count`` writes below a folder."""
+    """Run the work in a child process; return whether it was stopped after ``count`` writes in ``below``."""
     child = os.fork()
     if child == 0:
         _watch(below, stop_before=count)
@@ -55,7 +55,7 @@ def _end(work: Callable[[], object], last: Callable[[], object]) -> None:
 
 
 def _watch(below: Path, stop_before: int | None) -> list[int]:
-    """Count writes from now on; before the one with this number the process ends."""
+    """Count writes from now on, and end the process before the write with this number."""
     count, root = [0], str(below.resolve())
 
     def seen(event: str, arguments: tuple[Any, ...]) -> None:

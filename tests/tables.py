@@ -1,4 +1,4 @@
-"""The law of tables: a row is one object of the record, and each of its columns the field that it names."""
+"""Check tables: each row is one object of the record, and each column the field that it names."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def require_tables_equal_record(
     pivoted: Collection[str] = (),
     besides: str = "noise floor",
 ) -> None:
-    """Fail where a row of a CSV beside a record is no object of it.
+    """Fail where a row of a CSV file in the folder is no object of the record.
 
     Args:
-        names: of a table, the columns with another name than their field; "" for one that is made from
-            several.
-        pivoted: tables that have no object to a row; other tests hold them.
-        besides: with what a row begins that is of the whole record.
+        names: by table, the columns whose name differs from that of their field, and the name of the field;
+            "" for a column that is made from several fields.
+        pivoted: tables whose rows are not objects; other tests check them.
+        besides: the first word of rows that belong to the whole record; they are not checked.
     """
     objects = list(_objects(json.loads((folder / record).read_text(encoding="utf-8")), {}))
     fields = {name for one in objects for name in one}
@@ -46,10 +46,10 @@ def require_tables_equal_record(
 
 
 def require_figures_by_column(file: Path, columns: Mapping[str, Mapping[str, float]]) -> None:
-    """Fail where a cell is not the figure that its row names, of the print that its column names.
+    """Fail where a cell is not the figure named by its row, for the print named by its column.
 
     Args:
-        columns: by their titles the figures of each print.
+        columns: the figures of each print, by the title of its column.
     """
     with file.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
@@ -63,7 +63,7 @@ def require_figures_by_column(file: Path, columns: Mapping[str, Mapping[str, flo
 
 
 def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Each object of a record with the plain fields of those that it is part of."""
+    """Yield each object of a record, together with the plain fields of the objects that contain it."""
     if isinstance(value, list):
         for one in value:
             yield from _objects(one, above)
@@ -74,13 +74,13 @@ def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
         parts = {name: one for name, one in value.items() if isinstance(one, dict | list)}
         for part in parts.values():
             yield from _objects(part, own)
-            # A mapping of names to objects, and the objects of two parts side by side.
+            # An object without inner objects also comes with the plain fields of the object around it.
             if isinstance(part, dict) and all(not isinstance(one, dict | list) for one in part.values()):
                 yield {**own, **part}
 
 
 def _flat(value: Mapping[str, Any], of: str = "") -> Iterator[tuple[str, Any]]:
-    """Fields with those of inner objects, whose names begin with their own."""
+    """Yield the fields, those of inner objects too, whose names get the name of the object as a prefix."""
     for name, one in value.items():
         if isinstance(one, dict):
             yield from _flat(one, f"{of}{name}_")
@@ -100,7 +100,7 @@ def _same(value: Any, text: str) -> bool:
     if isinstance(value, list):
         ends = text.split(" … ")
         if len(ends) == len(value) == 2:
-            # An interval for people, rounded.
+            # An interval written for readers, so rounded.
             pairs = zip(value, ends, strict=True)
             return all(
                 abs(one - _number(end)) <= 0.51 * 0.1 ** len(end.partition(".")[2]) for one, end in pairs

@@ -1,4 +1,4 @@
-"""The shape of the project as laws: imports go one way, and importing is cheap."""
+"""Laws on the structure of the project: imports go one way, and importing is cheap."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ALLOWED = {
     "litho_models": {"litho_data", "litho_models"},
     "litho_design": {"litho_data", "litho_models", "litho_design"},
 }
-# What design may use of the models: what finds and loads a frozen one. A sheet that comes back from a lab is
-# learned from as well, by the public functions.
+# litho_design may only use the parts of litho_models that find and load a frozen model. Its room ``sheets``
+# also learns from a sheet that comes back from a lab, so it may call these public functions.
 FROZEN_ONLY = {"load_frozen", "zoo"}
 LEARNING = {"sheets": {"close_loop", "evaluate", "freeze"}}
-# Rooms from the ground up: a room imports from those before it only. `simulator` is a module.
+# Rooms from the lowest up: a room imports only from those before it. `simulator` is a module.
 ROOMS = {
     "litho_data": (
         "foundation", "sharing", "commands", "reports", "scan", "readers", "register", "level",
@@ -49,7 +49,7 @@ def _sources(package: str, root: Path = ROOT) -> list[Path]:
 
 
 def _imports(file: Path) -> set[str]:
-    """Dotted names of everything that a file imports, at any level of nesting."""
+    """Return the dotted names of everything that a file imports, at any level of nesting."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -100,7 +100,7 @@ def test_rooms_import_only_from_those_before_them(package: str) -> None:
 
 
 def test_a_circle_and_an_import_upwards_are_found(tmp_path: Path) -> None:
-    """Both laws on a package that breaks them, with an import that only a function makes."""
+    """Check that both laws find their breach in a package where only a function makes the import."""
     for name, text in {
         "pack/__init__.py": "from pack.low.a import f",
         "pack/low/__init__.py": "",
@@ -117,7 +117,7 @@ def test_a_circle_and_an_import_upwards_are_found(tmp_path: Path) -> None:
 
 
 def _circles(graph: Mapping[str, set[str]]) -> list[set[str]]:
-    """Sets of modules each of which imports every other one, directly or through others."""
+    """Return sets of modules in which each imports every other one, directly or through others."""
     reached = {name: _reached(graph, name) for name in graph}
     circles = [{other for other in reached[name] if name in reached[other]} for name in graph]
     return [circle for place, circle in enumerate(circles) if circle and circle not in circles[:place]]
@@ -133,7 +133,7 @@ def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
 
 
 def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
-    """Imports of a room from one that stands after it in the list."""
+    """Return the imports of a room from a room that stands after it in the list."""
     place = {room: number for number, room in enumerate(rooms)}
     pairs = [(name, other) for name, imported in graph.items() for other in imported]
     steps = [(name, other, name.split(".")[1], other.split(".")[1]) for name, other in pairs]
@@ -145,9 +145,9 @@ def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
 
 
 def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
-    """Per module of a package the modules of the package that it imports, anywhere in the file.
+    """Return, for each module of a package, the modules of that package that it imports anywhere in its file.
 
-    The package's own face is left out: it names everything, and nothing inside imports it.
+    The package's ``__init__.py`` is left out: it names everything, and no module inside imports it.
     """
     modules = {}
     for file in _sources(package, root):
@@ -184,13 +184,13 @@ def test_the_main_path_of_the_loop_takes_six_files() -> None:
     assert importlib.import_module("litho_models").close_loop.__module__ == modules[0]
     for place, module in enumerate(modules[1:], start=1):
         used = set().union(*(graph[before] for before in modules[:place]))
-        # A name may come through the face of its folder.
+        # A name may be imported through the ``__init__.py`` of its folder.
         faces = [graph[name] for name in used if (ROOT / name.replace(".", "/")).is_dir()]
         assert module in used.union(*faces), f"{module}: nothing before it uses it"
 
 
 def _between(page: str, name: str) -> str:
-    """What stands between the two comments of a page."""
+    """Return the text between the two comments of a page."""
     return page.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
 
 
@@ -207,7 +207,7 @@ def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
 
 
 def test_importing_litho_data_takes_less_than_half_a_second() -> None:
-    # The best of three, because another process may hold the core; the promise is about our own work.
+    # The best of three, because another process may use the core. The limit is for our own work only.
     code = "import time; t = time.perf_counter(); import litho_data; print(time.perf_counter() - t)"
     assert min(float(_python(code)) for _ in range(3)) < 0.5
 
@@ -236,5 +236,5 @@ def test_type_checkers_see_the_names_of_a_public_face(package: str) -> None:
 
 
 def _python(code: str) -> str:
-    """What a fresh interpreter prints."""
+    """Run code in a fresh interpreter and return what it prints."""
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

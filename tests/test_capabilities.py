@@ -1,4 +1,4 @@
-"""The list of what a user can do: nothing is missing, and every entry has its tests or says why not."""
+"""Check the list of what a user can do: it is complete, and each entry names tests or says why not."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from typer.main import get_command
 ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "capabilities.toml"
 PACKAGES = ("litho_data", "litho_models", "litho_design")
-# Rooms whose `__all__` is for other rooms and on no page.
+# Rooms whose `__all__` is meant for other rooms and is on no page.
 INNER = {"litho_data.foundation", "litho_models.fitting"}
-# Of every command by itself, and of torchrun.
+# Options that every command has, and one of torchrun.
 ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python", "--plugin"}
 
 
@@ -30,7 +30,7 @@ def entries() -> list[dict[str, Any]]:
 
 @cache
 def names_in_file(file: str) -> frozenset[str]:
-    """Names of the tests in a file, `Class::test_name` within a class; nothing is imported."""
+    """Return the names of a file's tests, `Class::test_name` in a class, without importing the file."""
 
     def names(nodes: list[ast.stmt], place: str) -> Iterator[str]:
         for node in nodes:
@@ -44,7 +44,7 @@ def names_in_file(file: str) -> frozenset[str]:
 
 
 def faults(entry: dict[str, Any]) -> list[str]:
-    """What is wrong with an entry, in words."""
+    """Return in words what is wrong with an entry."""
     kinds = entry.keys() & {"test", "gone", "untested"}
     found = []
     if len(kinds) != 1 or entry.keys() - kinds != {"what", "how"}:
@@ -62,7 +62,7 @@ def faults(entry: dict[str, Any]) -> list[str]:
 
 
 def commands() -> dict[str, set[str]]:
-    """Every command of the three command lines with its options."""
+    """Return every command of the three command lines with its options."""
     found: dict[str, set[str]] = {}
 
     def walk(command: Any, name: str) -> None:
@@ -78,7 +78,7 @@ def commands() -> dict[str, set[str]]:
 
 
 def public_names() -> set[str]:
-    """`room.name` for all that the `__init__.py` of packages and rooms show, read from their source."""
+    """Return `room.name` for every name that the source of a package's or room's `__init__.py` exports."""
     names = set()
     for file in (one for package in PACKAGES for one in (ROOT / package).rglob("__init__.py")):
         room = ".".join(file.parent.relative_to(ROOT).parts)
@@ -91,7 +91,7 @@ def public_names() -> set[str]:
 
 
 def names_in(how: str) -> set[str]:
-    """Public names in a `how`: `room.name`, or `room: name, name`."""
+    """Return the public names in a `how` text, written `room.name` or `room: name, name`."""
     named = set(re.findall(r"litho_\w+(?:\.\w+)+(?=[\s,;()]|$)", how))
     for room, listed in re.findall(r"(litho_[\w.]+): ([^;]+)", how):
         named |= {f"{room}.{name}" for name in re.findall(r"\w+", listed)}
@@ -117,8 +117,11 @@ def test_a_fault_in_an_entry_is_found():
     for spoiled, said in (
         ({**good, "test": f"{here}_not"}, "no test"),
         ({**good, "test": [here, "tests/test_nowhere.py::test_nothing"]}, "no test"),
-        # The test of a class is not one of the file.
-        ({**good, "test": "tests/litho_data/test_layouts.py::test_it_is_the_equation"}, "no test"),
+        # A test within a class is not named by the file alone.
+        (
+            {**good, "test": "tests/litho_data/test_layouts.py::test_a_random_layout_follows_the_equation"},
+            "no test",
+        ),
         ({**good, "test": ""}, "empty"),
         ({**good, "test": []}, "empty"),
         ({**good, "gone": "nobody misses it"}, "keys"),
@@ -142,8 +145,8 @@ def test_every_public_name_is_listed(hows):
     assert not public_names() - listed
 
 
-def test_what_the_list_names_is_there():
-    """A command, option or public name that has gone leaves an entry that says why nobody misses it."""
+def test_every_command_option_and_name_in_the_list_exists():
+    """Check that all listed names exist, except in entries for what has gone, which say why."""
     known, public = commands(), public_names()
     options = ANYWHERE | {option for own in known.values() for option in own}
     for how in (entry["how"] for entry in entries() if "gone" not in entry):

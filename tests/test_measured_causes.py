@@ -1,4 +1,4 @@
-"""The page on what the measured prints lack quotes the committed record, figure by figure."""
+"""The page on the causes found in the measured prints quotes each figure of the committed record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_the_record_is_of_the_measured_prints_and_its_rows_are_made_alike():
     scans = {frozenset(row.by_scan_nm) for row in result.errors if row.held_out != "locked"}
     (development,) = scans
     assert not development & set(result.split.lock_box)
-    # One with nothing free has no terms, one with its zero free has one: the same for every model.
+    # Policy "none" leaves no term of a scan free, policy "offset" one: equally for every model.
     assert {row.k for row in result.errors if row.policy == "none"} == {0.0}
     assert {row.k for row in result.errors if row.policy == "offset"} == {1.0}
 

@@ -1,4 +1,4 @@
-"""The pages quote the committed results of the measured run, figure by figure."""
+"""The pages quote each figure of the committed results for the measured prints."""
 
 from __future__ import annotations
 

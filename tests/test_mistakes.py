@@ -1,4 +1,4 @@
-"""Typical mistakes are answered in one line with the way out."""
+"""A typical mistake is answered in one line that says what to do."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def test_a_mistake_is_answered_in_one_line(did, mistake, files):
     code, said = answer(mistake)
     *skipped, last = said.strip().splitlines()
     assert code == (2 if mistake.startswith("litho-") else "InputError"), said
-    # What has begun says so, and a build names the scans that it skips as it goes.
+    # Lines about progress, and those of a build about the scans that it skips, are no answers.
     assert [
         line
         for line in skipped
         if not (line.startswith(("skipped ", "building ", "training ", "checking ")) or "is at work" in line)
     ] == []
-    # What was found and wanted, or what to do: never Python's own words.
+    # The answer says what was found and wanted, or what to do. It is never Python's own message.
     assert any(word in last for word in ("wanted", ";", ": no ")), last
     assert not any(word in last for word in ("Errno", "PosixPath", "Traceback", "codec")), last
     assert sorted(path.name for path in files.iterdir()) == before

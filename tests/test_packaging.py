@@ -1,4 +1,4 @@
-"""What is installed: litho_data without torch, the wheel in an empty folder; the project's own files."""
+"""Check installation (litho_data without torch, the wheel in an empty folder) and the project's files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ sys.meta_path.insert(0, Absent())
 
 
 def run(code: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """A Python of its own in an empty folder."""
+    """Run code in a new Python process in an empty folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(folder), **variables}
     return subprocess.run(
         [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
@@ -51,9 +51,11 @@ print(len(litho_data.open_store("prints.zarr").ids))
 
 
 @pytest.mark.parametrize("name", ["models", "design"])
-def test_the_others_say_in_one_line_which_extra_they_need(tmp_path: Path, name: str) -> None:
+def test_litho_models_and_litho_design_say_in_one_line_which_extra_they_need(
+    tmp_path: Path, name: str
+) -> None:
     hint = f"pip install 'litholoop[{name}]'"
-    # A blocked find_spec raises, a missing package returns None: what an environment without torch does.
+    # In an environment without torch find_spec returns None. The blocked one above raises instead.
     hidden = "import importlib.util; importlib.util.find_spec = lambda name: None\n"
     done = run(f"{hidden}from litho_{name}.cli import main; main()", tmp_path)
     assert done.returncode == 2
@@ -66,11 +68,11 @@ def test_the_others_say_in_one_line_which_extra_they_need(tmp_path: Path, name: 
 
 @pytest.mark.long
 def test_the_wheel_designs_a_hologram_from_an_empty_folder(tmp_path: Path) -> None:
-    """Built as pip does it; its zoo, templates and cards are in it."""
+    """Check that a wheel built by pip contains the zoo, templates and cards that this needs."""
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     wheels, target, home = tmp_path / "wheels", tmp_path / "site", tmp_path / "home"
     home.mkdir()
-    # Of a copy: setuptools leaves its own folders beside the sources.
+    # Build from a copy, because setuptools leaves its own folders beside the sources.
     source = tmp_path / "source"
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "NOTICE"):
@@ -108,7 +110,7 @@ def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_pat
 
 
 TODAY = datetime.date.today().isoformat()
-# What stands in for the project's Python, which builds, and for those that try the wheel.
+# Scripts in place of the Python that builds the wheel (BUILDS) and of the Pythons that try it (TRIES).
 BUILDS = """#!/bin/sh
 case "$1" in -c) echo 9.8.7;; *) mkdir -p dist; touch dist/litholoop-9.8.7-py3-none-any.whl;; esac
 """
@@ -142,7 +144,7 @@ def released(
     checks: int = 0,
     **of_312: object,
 ) -> tuple[int, str]:
-    """Exit code and last line of the release of a small project in ``folder``."""
+    """Release a small project in ``folder``; return the exit code and the last line."""
     files = {
         ".venv/bin/python": BUILDS,
         ".gitignore": ".venv/\nbin/\ndist/\nlog\ntmp/\n",
@@ -213,6 +215,6 @@ def test_a_release_that_is_not_ready_is_not_tagged(tmp_path: Path, fault: dict, 
     assert code != 0
     assert said in line
     assert tags(tmp_path) == ([fault["tag"]] if "tag" in fault else [])
-    # What can be refused is refused before the tests, which take minutes; no trial is left behind.
+    # A release is refused before the tests, which take minutes, where possible. No trial folder is left.
     assert (tmp_path / "log").exists() == (not said)
     assert list((tmp_path / "tmp").iterdir()) == []

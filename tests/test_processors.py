@@ -1,4 +1,4 @@
-"""The processors that this one plays are those that they are called."""
+"""A processor that this one imitates has the instructions that its name says."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_an_unknown_processor_is_refused(capsys):
     assert "wanted native, avx2, avx512" in capsys.readouterr().err
 
 
-def test_what_this_processor_is_anyway_is_played_only_where_the_tests_do_not_run_as_it_is(monkeypatch):
+def test_an_equal_processor_is_played_only_where_the_native_tests_do_not_run(monkeypatch):
     monkeypatch.setattr("torch.cpu.get_capabilities", lambda: {"avx2": True, "avx512_f": False})
     played = processors.why_left_out("avx2", ["native", "avx2"])
     assert played == "this processor is one, and they pass on it as it is"

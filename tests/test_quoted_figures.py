@@ -1,4 +1,4 @@
-"""Figures that pages quote in their text are those of the committed records."""
+"""Figures that pages quote in their text equal those of the committed records."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def alarms(record: dict[str, Any]) -> list[str]:
     boards = [one for board in record["virtual"].values() for one in board["references"].items()]
     false = [one["false_alarms"] for _, one in boards]
     noticed = {n: [one["noticed"] / 10 for count, one in boards if count == n] for n in ("12", "24", "48")}
-    # Of 100 unchanged sets one may alarm.
+    # At most one of 100 unchanged sets may raise an alarm: 10 of the 1,000 sets of a board.
     assert max(false) <= 10
     return [
         f"raised {min(false)} to {max(false)} false alarms",

@@ -1,4 +1,4 @@
-"""The project's page: short, its Python runs as it stands (smaller), its links lead somewhere."""
+"""Check the README: it is short, its Python code runs (made smaller), and its links exist."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tests.test_capabilities import names_in_file
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text("utf-8")
-# What is made small for the test; each must be there, so that the page cannot drift away from it.
+# Replacements that make the code small for the test. Each text must occur on the page.
 SMALLER = {
     "count=12, size_px=256": "count=3, size_px=128",
     '"layout.size_px": 256': '"search.iterations": 2, "search.polish_rounds": 0, '
     '"window.yield_draws": 5, "layout.size_px": 64',
 }
-# Commands of the page, of the site's first page and of the tutorials, and what runs each.
+# Commands of the README, of the site's first page and of the tutorials, with the test that runs each.
 WHEEL = "tests/test_packaging.py::test_the_wheel_designs_a_hologram_from_an_empty_folder"
 RUN_BY = {
     "make demo": "tests/test_demo.py::test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page",

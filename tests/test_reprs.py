@@ -1,4 +1,4 @@
-"""What Python shows of scans, stores, models and results fits into a line or a small table."""
+"""The ``repr`` of scans, stores, models and results is one line, in a notebook a small table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.litho_models.prints import make_scan, make_scans, write_store
 PUBLISHED = "docs/results/neural-lithography/benchmark.json"
 
 
-def test_objects_are_shown_in_a_line(tmp_path):
+def test_the_repr_of_an_object_is_one_line(tmp_path):
     scan = litho_data.Scan(np.arange(6.0).reshape(2, 3), (0.1, 0.2), name="P11")
     assert repr(scan) == "<Scan P11: 2 x 3 px of 0.1 x 0.2 µm, heights 0 to 5 µm, 0 px missing>"
     assert "P0F1: 96 x 96 px of 0.1 µm, print 0, 13 levels of 0.1 µm, 100.0% valid" in repr(make_scan(1))
@@ -48,11 +48,11 @@ def test_a_notebook_shows_maps_and_the_card_of_a_model(tmp_path):
     assert design._repr_html_().count("data:image/png") == 2
 
 
-def test_a_result_is_shown_by_what_it_is_of_and_how_much_it_holds():
+def test_the_repr_of_a_result_names_its_dataset_and_counts_its_entries():
     result = Benchmark.read(PUBLISHED)
     shown = repr(result)
     assert f"scores: {len(result.scores)}" in shown
     assert "dataset: neural-lithography" in shown
-    # A hash of 64 digits says nothing to people.
+    # The 64 digits of the hash are of no use to readers, and would not fit.
     assert len(shown) < 400
     assert f"<td>{len(result.scores)}</td>" in result._repr_html_()

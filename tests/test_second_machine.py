@@ -1,4 +1,4 @@
-"""The second machine: how printers are compared, and that the page shows what was measured."""
+"""Check how printers are compared on the second machine, and that the page shows what was measured."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.litho_models.prints import make_scan
 GEOMETRY: dict[str, Any] = {"pitch_um": 0.004, "levels": 17, "level_height_um": 0.01375}
 
 
-def test_a_gain_in_every_pattern_is_no_chance_and_none_is() -> None:
+def test_a_gain_in_every_pattern_is_significant_and_equal_errors_have_no_gain() -> None:
     scatter = np.random.default_rng(0).normal(0, 0.05, 12)
     before = [{"edge_mean_nm": 3 + one} for one in scatter]
     better = compared(before, [{"edge_mean_nm": 2.8 + one / 2} for one in scatter])
@@ -39,16 +39,16 @@ def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
     assert spots == pytest.approx([0.017, 0.017])
     assert models[0].values["etch.threshold"].item() == pytest.approx(0.42)
     assert models[1].values["hill.threshold"].item() == pytest.approx(0.42)
-    # A bias is no number of the bare one.
+    # The bare printer has no fitted bias.
     assert not models[0].raw_etch__bias_px.requires_grad
 
 
-def test_a_print_is_off_by_what_its_edges_are_displaced() -> None:
+def test_the_error_of_a_print_is_the_displacement_of_its_edges() -> None:
     scan = replace(make_scan(0, 128), seen_by="sem")
     level = np.zeros((128, 128), np.uint8)
     level[40:90, 40:90] = scan.levels - 1
     film = film_design.wanted_film(replace(scan, mask_level=level), 112)
-    # All four edges of a square are a pixel off, less at its rounded corners.
+    # All four edges of the square are off by one pixel, and by less at its rounded corners.
     smaller = binary_erosion(film.mask_level) * film.height_um.max()
     for printed, pixels in ((film.height_um, 0.0), (smaller, 1.0)):
         found = judged(film, printed)

@@ -1,4 +1,4 @@
-"""The site of the documentation in a real browser: every page at two widths, light and dark."""
+"""Check every page of the documentation site in a real browser, at two widths, light and dark."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 
 ROOT = Path(__file__).parents[1]
-# The site changes its colours by a script, and gradually.
+# A script of the site changes its colours, with a transition.
 COLOURED = "new Promise(done => setTimeout(() => done(document.body.dataset.mdColorScheme), 300))"
 
 
@@ -33,7 +33,7 @@ def test_every_page_of_the_site_is_sound_on_every_screen(tmp_path):
         pytest.skip("needs mkdocs; make docs installs it")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
-    # Read from a server, as by a visitor: pictures opened as files may not be looked at, and search fails.
+    # Serve the pages as to a visitor. From files, scripts may not read pictures, and the search fails.
     serve = functools.partial(Quiet, directory=str(tmp_path))
     found = {}
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), serve) as server, Browser() as browser:

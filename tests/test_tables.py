@@ -1,4 +1,4 @@
-"""Tables and bars show the figures of the record, and the law that says so sees a swapped column."""
+"""Tables and bars show the figures of the record, and the check of this notices a swapped column."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.tables import require_tables_equal_record
 
 ROOT = Path(__file__).parents[1]
 PUBLISHED = ROOT / "docs" / "results" / "neural-lithography"
-# The tables of the product by the test that holds their columns: one that is in none of these has no law.
+# All tables that the product writes, by the test file that checks their columns.
 HELD = {
     "test_tables.py": "gratings left_out findings warnings recipes holograms errors levels",
     "litho_data/test_height_sigma.py": "quality summary uncertainty",
@@ -166,10 +166,10 @@ def test_graphs_of_layouts_show_shares_by_level_jump_and_frequency(
 
 
 @pytest.mark.parametrize("made", [of_gratings, of_a_build, of_recipes, of_a_sheet, of_layouts])
-def test_each_column_of_a_table_that_is_put_together_is_the_field_that_it_names(
+def test_each_column_of_a_composed_table_is_the_field_that_it_names(
     made: Callable[[Path], list[dict[str, Any]]], tmp_path: Path
 ) -> None:
-    """Each number and name of what is shown is another one."""
+    """Every number and name in these tables is different, so an exchange of two columns shows."""
     (tmp_path / "record.json").write_text(json.dumps({"rows": made(tmp_path)}))
     require_tables_equal_record(tmp_path, "record.json", {})
 
@@ -182,7 +182,7 @@ class Row(Record):
 
 
 class LongerRow(Row):
-    """The same with one figure more."""
+    """The same row with one more figure."""
 
     tallest_um: float
 
@@ -200,7 +200,7 @@ def test_a_further_field_of_a_record_is_a_further_column_of_its_table(tmp_path: 
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_a_figure_in_another_row_or_column_is_seen(table: str, tmp_path: Path) -> None:
+def test_a_figure_in_the_wrong_row_or_column_is_noticed(table: str, tmp_path: Path) -> None:
     (tmp_path / "record.json").write_text(json.dumps(RECORD))
     (tmp_path / "table.csv").write_text(table)
     if not TABLES[table]:
@@ -224,7 +224,7 @@ def test_waves_of_a_level_count_from_the_printed_level_0() -> None:
     assert table["printed_waves"] == pytest.approx([0, 0.2, 0.6])
 
 
-def test_the_best_model_is_that_of_the_smallest_error_in_whatever_order_they_are_given() -> None:
+def test_the_best_model_has_the_smallest_error_whatever_the_order_of_the_scores() -> None:
     record = Benchmark.read(PUBLISHED / "benchmark.json")
     best, second, *_ = ordered = sorted(record.scores, key=lambda one: one.mae_datum_free_nm)
     for scores in (ordered, ordered[::-1]):

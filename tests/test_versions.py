@@ -1,4 +1,4 @@
-"""What every command says: its version, an example, its options in one style, and at its end what to open."""
+"""Every command states its version, an example, its options in one style, and at its end what to open."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def commands_in(command):
 
 @pytest.mark.parametrize("package", ["litho_data", "litho_models", "litho_design"])
 def test_every_option_is_described_in_one_style(package):
-    """A few words that start small and have no full stop; nothing that rich takes for markup and swallows."""
+    """Help starts in lower case, has no full stop, and no brackets, which rich would drop as markup."""
     for command in commands_in(get_command(importlib.import_module(f"{package}.cli.app").app)):
         for parameter in command.params:
             if parameter.name == "help" or getattr(parameter, "hidden", False):
@@ -49,7 +49,7 @@ def test_every_option_is_described_in_one_style(package):
             said = parameter.help
             name = f"{command.name} {parameter.name}"
             assert said, name
-            # A capital is an abbreviation's or a metavar's: two in a row.
+            # Only an abbreviation or a metavar may start with a capital: it has two in a row.
             assert not re.match(r"[A-Z][^A-Z]", said), f"{name}: {said}"
             assert not said.endswith("."), f"{name}: {said}"
             assert not re.search(r"\[[a-z]", said), f"{name}: {said}"
@@ -57,7 +57,7 @@ def test_every_option_is_described_in_one_style(package):
 
 
 def silent_about_its_result(source: str) -> list[str]:
-    """Functions of a command line that take ``out`` and print neither it nor a file in it."""
+    """Return the commands that take ``out`` but print neither that path nor a file in it."""
     made = {one.name: one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef)}
 
     def printed(function: ast.FunctionDef) -> str:

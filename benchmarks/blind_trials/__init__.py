@@ -1,1 +1,1 @@
-"""Blind trials: the closed loop on data of the virtual fab whose hidden effects it is not told."""
+"""Blind trials: the closed loop searches for hidden effects in data of the virtual fab."""

@@ -1,10 +1,10 @@
-"""Blind trials of the closed loop on the virtual fab.
+"""Run blind trials of the closed loop on the virtual fab.
 
     python -m benchmarks.blind_trials --out runs/singles
     python -m benchmarks.blind_trials --out runs/mixtures --board mixtures --measured runs/measured.zarr
     python -m benchmarks.blind_trials --out runs/development --board mixtures --seed 1 --only 0,1,2
 
-Draws what the fab hides, gives the loop scans and layouts only, and judges its answers by the rules in
+Draws the hidden effects, gives the loop only scans and layouts, and judges its answers by the rules in
 docs/blind_trials.md. An interrupted run resumes. Writes scoreboard.json and scoreboard.csv;
 --publish also puts the figures into the documentation.
 """
@@ -32,12 +32,12 @@ PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
 
 def results_of(board: Board, seed: int) -> Path:
-    """Where the published results of a board lie."""
+    """Return the folder of the published results of a board."""
     return RESULTS / f"{board}-{seed}"
 
 
 def main() -> None:
-    """Run what is not finished, then write the scoreboard; bad input ends with exit code 2."""
+    """Run the unfinished trials, then write the scoreboard; invalid input ends with exit code 2."""
     arguments = _arguments()
     try:
         if arguments.run_one is not None:
@@ -97,16 +97,16 @@ def _arguments() -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--out", type=Path, required=True, help="folder of the board's trials")
-    add("--board", choices=get_args(Board), default="singles", help="one cause a trial, or two to four")
-    add("--seed", type=int, help="draws (default: the announced one of the board)")
+    add("--board", choices=get_args(Board), default="singles", help="one cause per trial, or two to four")
+    add("--seed", type=int, help="seed of the draws (default: the announced seed of the board)")
     add("--base", help="base of the loop (default: physics for singles, auto for mixtures)")
     add("--measured", type=Path, help="store of measured prints, into which four mixtures are injected")
     add("--scans", type=int, default=12, help="scans per trial (default 12)")
     add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
-    add("--workers", type=int, default=1, help="trials side by side, one thread each")
+    add("--workers", type=int, default=1, help="parallel trials, one thread each")
     add("--dask", help="address of a Dask scheduler; its workers replace --workers")
     add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
-    add("--timeout-s", type=float, default=3600.0, help="longest time of a trial, seconds")
+    add("--timeout-s", type=float, default=3600.0, help="time limit of a trial, seconds")
     add("--keep-data", action="store_true", help="keep raw files and stores")
     add("--publish", action="store_true", help="write the figures into docs/")
     add("--run-one", type=int, help=argparse.SUPPRESS)

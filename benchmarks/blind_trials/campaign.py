@@ -1,4 +1,4 @@
-"""A campaign: all drawn trials, side by side as separate processes, resumable, none stopping the others."""
+"""Run all drawn trials as parallel processes; a campaign resumes, and a failed trial stops no other."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def open_campaign(out: Path, draws: Draws) -> None:
     """Write the draws to ``out/draws.json``, before anything is run.
 
     Raises:
-        InputError: ``out`` holds the campaign of other settings.
+        InputError: ``out`` contains a campaign with other settings.
     """
     if not (out / Draws.FILE_NAME).exists():
         draws.write(out)
@@ -38,7 +38,7 @@ def open_campaign(out: Path, draws: Draws) -> None:
 
 
 def finished(out: Path, draws: Draws) -> list[Trial]:
-    """The trials that have come to an end, failed ones included, in the order drawn."""
+    """Return the finished trials, including failed ones, in the order in which they were drawn."""
     folders = (trial_folder(out, draw) for draw in draws.trials)
     return [Trial.read(folder) for folder in folders if (folder / Trial.FILE_NAME).exists()]
 
@@ -52,13 +52,13 @@ def run_campaign(
     timeout_s: float,
     options: Sequence[str] = (),
 ) -> None:
-    """Run the trials of these numbers that are not finished; a line per trial as it ends.
+    """Run the unfinished trials among ``numbers``, and print a line when a trial ends.
 
-    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed. ``options``: for the
-    process of each trial, see `run_one`.
+    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed. The process of each
+    trial receives ``options``, see `run_one`.
 
     Raises:
-        InputError: a number that was not drawn, or workers that cannot be had.
+        InputError: a number was not drawn, or the workers are not available.
     """
     unknown = set(numbers) - {draw.number for draw in draws.trials}
     if unknown:
@@ -92,7 +92,7 @@ class _Job(NamedTuple):
 
 
 def _run_apart(job: _Job) -> tuple[Trial, float]:
-    """Run a trial in a process of its own; what it prints goes to a log beside its result."""
+    """Run a trial in a separate process, whose output goes to a log file."""
     out, draw, timeout_s, options = job
     folder, clock = trial_folder(out, draw), time.monotonic()
     command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
@@ -104,7 +104,7 @@ def _run_apart(job: _Job) -> tuple[Trial, float]:
             code = subprocess.run(
                 command,
                 cwd=_ROOT,
-                # Trials side by side use the cores better than threads within one.
+                # Parallel trials use the cores better than threads within one trial.
                 env=os.environ | ONE_THREAD,
                 stdout=stream,
                 stderr=subprocess.STDOUT,

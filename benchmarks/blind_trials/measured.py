@@ -1,4 +1,4 @@
-"""Causes in measured prints: what the virtual fab makes of the layouts with them, minus without, is added."""
+"""Inject causes into measured prints: add the virtual fab's print with the causes minus that without."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from litho_models.boards.records import Draw, Planted
 
 
 def measured_jobs(store: Store) -> tuple[Job, ...]:
-    """The layouts of a store, as the fab would print them.
+    """Return the layouts of a store as jobs for the fab.
 
     Raises:
-        InputError: layouts of another pitch, level height or number of levels than the fab's.
+        InputError: the layouts differ from the fab's in pitch, level height or number of levels.
     """
     got = (store.pitch_um, store.level_height_um, store.levels)
     wanted = (Printer.pitch_um, Printer.level_height_um, Printer.levels)
@@ -35,7 +35,7 @@ def measured_jobs(store: Store) -> tuple[Job, ...]:
 
 
 def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
-    """The fields' middle parts: sizes are measured on them, for speed."""
+    """Crop the fields to their centres, on which the sizes of effects are measured, to save time."""
     corners = [[(side - size_px) // 2 for side in job.level.shape] for job in jobs]
     return [
         replace(job, level=job.level[max(y, 0) : size_px + max(y, 0), max(x, 0) : size_px + max(x, 0)])
@@ -44,10 +44,10 @@ def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
 
 
 def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
-    """Copy a store and change its heights by what was planted; everything else stays.
+    """Copy a store and add the planted effects to its heights, without any other change.
 
     Raises:
-        InputError: a store in a single file.
+        InputError: the store is a single file.
     """
     import zarr
 

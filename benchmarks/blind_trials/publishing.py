@@ -1,4 +1,4 @@
-"""A scoreboard in the page of the documentation."""
+"""Publish a scoreboard in its page of the documentation."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from litho_models.boards.records import Scoreboard
 
 
 def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
-    """Put the figures into the page, in place of what stood between the marks of the board.
+    """Replace the text between the marks of the board in the page by its figures.
 
     Raises:
-        InputError: trials that have not been run, or a page without the marks.
+        InputError: some trials have not been run, or the page does not have the marks.
     """
     if scoreboard.pending:
         raise InputError("scoreboard to publish", got=f"pending trials {scoreboard.pending}", wanted="none")
@@ -23,11 +23,11 @@ def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
 
 
 def mark_of(scoreboard: Scoreboard) -> str:
-    """What the marks of a board in the page are called."""
+    """Return the name of the marks of a board in the page."""
     return f"board of {scoreboard.board} {scoreboard.seed}"
 
 
 def as_markdown(scoreboard: Scoreboard) -> str:
-    """Command and figures."""
+    """Return the command and the table of figures in Markdown."""
     rows = [tuple(figure) for figure in figures_of(scoreboard)]
     return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'wanted'), rows)}"

@@ -1,4 +1,4 @@
-"""One trial: the fab makes raw files, `build` makes a store, the loop sees the store, the judge the truth."""
+"""Run a trial: the fab writes raw files, `build` makes a store, the loop reads it, a judge has the truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from litho_models.loop.run import close_loop
 
 
 def trial_folder(out: Path, draw: Draw) -> Path:
-    """Where the loop works on a trial and its result goes."""
+    """Return the folder in which the loop works on a trial and writes its result."""
     return out / TRIALS / name_of(draw)
 
 
@@ -32,16 +32,17 @@ def run_trial(
     keep_data: bool = False,
     report: Callable[[str], None] = lambda message: None,
 ) -> Trial:
-    """Run and judge one trial; writes ``trials/NN/trial.json`` and the loop's own results beside it.
+    """Run and judge one trial; write ``trials/NN/trial.json`` and the results of the loop beside it.
 
-    The loop is given the store alone. An error becomes the trial's result and is not raised.
+    The loop receives only the store. An error is recorded as the result of the trial and not raised.
 
     Args:
-        draw: what to plant; ``draws``: the board that it belongs to.
+        draw: the effects to plant.
+        draws: the board of this trial.
         out: folder of the board.
-        measured: store of measured prints, for trials on those.
-        keep_data: keep raw files and store, which the draw makes again.
-        report: told what happens, a sentence at a time.
+        measured: store of measured prints, for trials on measured prints.
+        keep_data: keep raw files and store; otherwise they are deleted (the draw can make them again).
+        report: called with a message at each stage.
     """
     folder = trial_folder(out, draw)
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,13 +1,13 @@
-"""The design-to-manufacturing gap at the paper's size, with the virtual fab as judge.
+"""Measure the design-to-manufacturing gap at the paper's size, with the virtual fab as judge.
 
     python -m benchmarks.gap --out runs/gap --workers 2
     python -m benchmarks.gap --out runs/gap-small --small 128
 
-Prints fields in a fab whose effects no model was told of, trains six arms on the scans, designs one
-hologram and two lenses through each of them with equal budgets, and lets the fab print the designs; then
-the same hologram through the models of measured prints that come with the package. It takes hours;
-``--tasks`` does some of the tasks. Every step is skipped where its result exists, and an interrupted design
-resumes from its checkpoint.
+Prints fields in a fab whose effects no model knows, and trains six arms on the scans. Designs one hologram
+and two lenses through each arm with equal budgets, and lets the fab print the designs. Then designs the same
+hologram through the models of measured prints that come with the package. The run takes hours; ``--tasks``
+runs some of the tasks. A step is skipped if its result exists, and an interrupted design resumes from its
+checkpoint.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from litho_models.frozen import zoo
 
 
 def main() -> None:
-    """Run what is not finished; bad input or a failed step ends with exit code 2."""
+    """Run the unfinished steps; invalid input or a failed step ends with exit code 2."""
     try:
         _run(_arguments())
     except InputError as error:
@@ -66,13 +66,13 @@ def _arguments() -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
-    parser.add_argument("--workers", type=int, default=1, help="processes side by side, one thread each")
+    parser.add_argument("--workers", type=int, default=1, help="parallel processes, one thread each")
     parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
-    parser.add_argument("--small", type=int, metavar="PX", help="tiny elements, to try the machinery")
+    parser.add_argument("--small", type=int, metavar="PX", help="tiny elements, to try the benchmark")
     parser.add_argument(
-        "--corrected", type=Path, help="model of a closed loop on the measured prints: one arm more"
+        "--corrected", type=Path, help="model of a closed loop on the measured prints; adds an arm"
     )
-    parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
+    parser.add_argument("--tasks", metavar="NAMES", help="tasks to run, separated by commas; all by default")
     parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/gap.md")
     return parser.parse_args()
 

@@ -1,4 +1,4 @@
-"""Figures of the comparison for the documentation: images in design and printed, PSFs and their spectra."""
+"""Draw the figures of the comparison: images and PSFs with spectra, in design and after printing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DETAIL_PX = 160
 
 
 def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """One column per arm: image in design, image after printing, print in the middle of the element."""
+    """Draw a column per arm: image in design, image after printing, and the centre of the print."""
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.4 * len(judged) + 0.4, 7.4)
     axes = figure.subplots(3, len(judged), squeeze=False)
@@ -36,12 +36,12 @@ def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, pat
     axes[0, 0].set_ylabel("in design")
     axes[1, 0].set_ylabel("after printing")
     axes[2, 0].set_ylabel("print")
-    # Speckle does not compress without loss.
+    # Lossless formats compress speckle badly.
     figure.savefig(path, dpi=90, pil_kwargs={"quality": 80})
 
 
 def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """PSF through its peak and its spectrum, in design and after printing, one column per arm."""
+    """Draw a column per arm: a line through the centre of the PSF, and its spectrum, designed and printed."""
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.5 * len(judged) + 0.4, 4.8)
     axes = figure.subplots(2, len(judged), squeeze=False, sharey="row")
@@ -66,7 +66,7 @@ def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path:
 def _judged(
     folder: Path, gap: GapResult, judge: tuple[str, str] | None
 ) -> dict[str, tuple[LoadedDesign, Printer]]:
-    """Every arm's first design with the printer that judges it; without a judge, the last other arm."""
+    """Return each arm's first design and the printer that judges it: the judge, or the last other arm."""
     names = list(gap.arms)
     judged = {}
     for arm in names:

@@ -1,4 +1,4 @@
-"""Commands as processes: side by side, one thread each, skipped where their result exists."""
+"""Run commands as parallel processes with one thread each; a command whose result exists is skipped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BIN = Path(sys.executable).parent
 
 @dataclass(frozen=True)
 class Job:
-    """One command, the file or folder that shows it is done, and what it is called in the log."""
+    """One command, the file or folder that exists once it has finished, and its name in the log."""
 
     name: str
     command: tuple[str, ...]
@@ -27,15 +27,15 @@ class Job:
 
     @property
     def done(self) -> bool:
-        """Whether the result is there; commands write theirs last and as a whole."""
+        """Return whether the result exists; commands write their result last, in one step."""
         return self.result.exists()
 
 
 def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> None:
-    """Run the jobs that are not done; a line per job as it ends.
+    """Run the unfinished jobs, and print a line when a job ends.
 
     Raises:
-        InputError: a job failed; the others that had started come to their end first.
+        InputError: a job failed. Jobs that had already started are finished first.
     """
     todo = [job for job in jobs if not job.done]
     if len(todo) < len(jobs):
@@ -50,22 +50,22 @@ def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> No
 
 
 def command(program: str, *words: object) -> tuple[str, ...]:
-    """A program of this environment as a command."""
+    """Return the command that runs a program of this environment."""
     return (str(_BIN / program), *map(str, words))
 
 
 def design_command(*words: object) -> tuple[str, ...]:
-    """A command of ``litho-design``."""
+    """Return a command of ``litho-design``."""
     return command("litho-design", *words)
 
 
 def _run(step: tuple[Job, Path]) -> float | None:
-    """Seconds that the command took; None where it failed."""
+    """Run one command and return its seconds; None if it failed."""
     (job, log), started = step, time.monotonic()
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as stream:
         print(f"$ {shlex.join(job.command)}", file=stream, flush=True)
-        # Processes side by side use the cores better than threads within one.
+        # Parallel processes use the cores better than threads within one process.
         code = subprocess.run(
             job.command, stdout=stream, stderr=stream, env={**os.environ, **ONE_THREAD}
         ).returncode

@@ -1,4 +1,4 @@
-"""What a comparison is: the fab and its hidden effects, the arms, the effort, and the folder it lies in."""
+"""Define a comparison: the fab with its hidden effects, the arms, the effort, and the folder."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 
 ARMS = ("none", "affine", "affine-mtf", "physics", "fno", "pbl", "pbl-scan-axis")
-# Arms that are another part of a trained model, and what `freeze` is told. Only PBL tells apart what lies
-# along the scan lines, and leaves it out of its printer: scans of one orientation cannot say whose it is.
-# The other models have it in them. This fab has it in the printer, so that PBL needs it to know as much.
+# Arms that freeze another part of a trained model, with the options of `freeze`. Only PBL separates effects
+# along the scan lines and leaves them out of its printer, because scans of one orientation cannot show
+# whether printer or microscope causes them. The other models include them. In this fab the printer causes
+# them, so PBL must include them to know as much as the others.
 FROZEN_WITH = {"pbl-scan-axis": ("pbl", ("--attribute", "scan-axis=printer"))}
-# Stated before any design was made, by one rule: each effect of the print changes the training prints by
-# 10 nm rms after offset, gain, plane and bow of single scans. The physics model has none of them; two are
-# in no catalogue. Those of the microscope are as large as on the measured prints and never reach a design.
+# The strengths were fixed before any design was made, by one rule: each effect of the print changes the
+# training prints by 10 nm rms after offset, gain, plane and bow of each scan are removed. The physics model
+# has none of these effects; two are in no catalogue. The effects of the microscope are as large as on the
+# measured prints and do not act on designs.
 PRINT_KNOBS = {
     "write-order-memory": 0.167,
     "slope-thinning-x": 0.346,
@@ -27,13 +29,13 @@ _FULL_HOE_PX, _FULL_LENS_PX = 1024, 1200
 
 
 class Effort(Record):
-    """How much is printed, trained and designed; every arm of a task gets the same iterations."""
+    """How much is printed, trained and designed; all arms of a task have the same number of iterations."""
 
     hoe_px: int = _FULL_HOE_PX
     lens_px: int = _FULL_LENS_PX
     hoe_iterations: int = 80
     lens_iterations: int = 100
-    # Of the networks during the search; prints, judges and scores are float32 for every arm.
+    # Precision of the networks during the search; prints, judges and scores use float32 for every arm.
     search_precision: str = "float32"
     seeds: int = 3
     zoo_seeds: int = 1
@@ -45,17 +47,17 @@ class Effort(Record):
 
     @property
     def hoe_distance_um(self) -> float:
-        """Distance of the image, µm: 300 at full size."""
+        """Return the distance of the image, µm: 300 at full size."""
         return round(300 * self.hoe_px / _FULL_HOE_PX, 3)
 
     @property
     def lens_distance_um(self) -> float:
-        """Focal length, µm: 400 at full size."""
+        """Return the focal length, µm: 400 at full size."""
         return round(400 * self.lens_px / _FULL_LENS_PX, 3)
 
     @classmethod
     def small(cls, size_px: int) -> Effort:
-        """All sizes scaled down to elements of ``size_px``, to try the machinery."""
+        """Return an effort scaled down to elements of ``size_px``, to try the benchmark."""
         return cls(
             hoe_px=size_px,
             lens_px=size_px,
@@ -71,7 +73,7 @@ class Effort(Record):
 
 
 class Plan(Result):
-    """``plan.json``: what a folder is the comparison of; a folder holds one only."""
+    """``plan.json``: the settings of the only comparison in a folder."""
 
     SCHEMA: ClassVar[str] = "litho-design/benchmark-gap-plan/1"
     FILE_NAME: ClassVar[str] = "plan.json"
@@ -86,7 +88,7 @@ def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
     """Write the plan, or check that the folder holds the same one.
 
     Raises:
-        InputError: the folder holds a comparison of other settings.
+        InputError: the folder contains a comparison with other settings.
     """
     plan = Plan(effort=effort, corrected=corrected)
     if not (out / Plan.FILE_NAME).exists():
@@ -102,15 +104,15 @@ def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
 
 
 def store(out: Path, name: str) -> Path:
-    """The dataset store of a fab."""
+    """Return the path of the dataset store of a fab."""
     return out / f"{name}.zarr"
 
 
 def trained_as(arm: str) -> tuple[str, tuple[str, ...]]:
-    """The model that an arm is a part of, and what ``freeze`` is told."""
+    """Return the trained model from which an arm is frozen, and the options of ``freeze``."""
     return FROZEN_WITH.get(arm, (arm, ()))
 
 
 def model(out: Path, name: str) -> Path:
-    """The frozen model of an arm."""
+    """Return the folder of the frozen model of an arm."""
     return out / "models" / name

@@ -1,11 +1,11 @@
-"""The comparison as tables of a page, from its result file."""
+"""Write the comparison as tables in Markdown, from its result file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-# Two or three figures per table, with their sign: +1 where more is better.
+# Two or three scores per table, each with a sign: +1 if higher is better, -1 if lower is better.
 SHOWN = {
     "hoe": {"si_psnr_db": +1, "ssim": +1, "eff_signal": +1},
     "lens-direct": {"cbr": +1, "strehl": +1, "focusing_efficiency": +1},
@@ -35,7 +35,7 @@ TITLES = {
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Every table of the result file, with the conditions that it was made under."""
+    """Return all tables of the result file, with the conditions of each."""
     effort = record["plan"]["effort"]
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
@@ -70,10 +70,10 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     if not independent:
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
         shown = dict(list(shown.items())[:1])
-    # Judged by one printer, the expectation stands beside it; by several, each is a column.
+    # With one judge, a table has several scores; with several judges, each has a column of one score.
     heads = [f"{LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
-    # A perfect lens has a Strehl ratio of 1: what is missing is the gap to the ceiling. A hologram's is a
-    # continuous phase, and what is left of its image is measured as rms error, which SI-PSNR is in dB.
+    # The ceiling of a lens is a perfect lens, whose Strehl ratio is 1. The ceiling of a hologram is a
+    # continuous phase; the gap to it is given as rms error, which follows from SI-PSNR in dB.
     ceiling = task.get("ceiling") if independent else None
     heads += ["Strehl ratio lost against a perfect lens"] if "strehl" in shown else []
     heads += [f"rms error of the image above a continuous phase's, by {judge}" for judge in judges if ceiling]
@@ -98,7 +98,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         head += f" A continuous phase on the same grid, without printer or levels: {reached}."
     head += "\n\n"
     verdict = ""
-    # Among printers that are arms themselves each prefers its own design: nobody wins.
+    # If the judges are arms themselves, each prefers the design made through it, so there is no best arm.
     if seeds > 1 and independent:
         figure, sign = next(iter(shown.items()))
         means = {arm: values[arm, judges[0], figure]["judged"] for arm in arms}
@@ -108,12 +108,12 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
 
 
 def figure_file(name: str) -> str:
-    """Name of a task's figure."""
+    """Return the file name of the figure of a task."""
     return f"{name}.{'jpg' if name.startswith('hoe') else 'png'}"
 
 
 def figure_digits(figure: str) -> int:
-    """Decimals: an error of an image is a few hundredths, and arms differ by a hundredth of that."""
+    """Return the decimals of a score: image errors are a few hundredths, and arms differ by 1 % of that."""
     if figure == "cbr":  # a ratio of hundreds and thousands
         return 0
     return 5 if figure.startswith("mae") else 3
@@ -129,7 +129,7 @@ def _cell(row: Mapping[str, Any], digits: int) -> str:
 def lead_text(
     paired: Sequence[Mapping[str, Any]], means: Mapping[str, float], figure: str, sign: int, judge: str
 ) -> str:
-    """Which arm of ``means`` has the best of a figure, and its lead over each other one, paired by seed."""
+    """Return a sentence with the best arm of a score and its lead over each other arm, paired by seed."""
     digits = figure_digits(figure)
     best = max(means, key=lambda arm: sign * means[arm])
     against = []
@@ -137,7 +137,7 @@ def lead_text(
         pair = (item["arm"], item["against"])
         if (item["judge"], item["figure"]) != (judge, figure) or best not in pair or not {*pair} <= {*means}:
             continue
-        # Better counts upwards, also where less of a figure is better.
+        # A positive lead means better, also for scores where lower is better.
         other, turn = (pair[1], sign) if best == pair[0] else (pair[0], -sign)
         low, high = sorted(turn * end for end in item["ci95"])
         open_ = "" if low * high > 0 else ", which includes 0"

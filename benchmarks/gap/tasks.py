@@ -1,4 +1,4 @@
-"""What is designed: the tasks, the commands that make their designs, and the one that judges them."""
+"""Define the tasks, the commands that make their designs, and the command that judges the designs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ZOO_ARMS = ("none", "physics", "fno", "pbl")
 
 @dataclass(frozen=True)
 class Task:
-    """One comparison: the command that makes one design of it, its options, and who takes part."""
+    """One comparison: the command for its designs, the options, the models and the judges."""
 
     name: str
     kind: str
@@ -26,11 +26,11 @@ class Task:
 
     @property
     def iterations(self) -> int:
-        """Iterations of every design."""
+        """Return the number of iterations of every design."""
         return int(self.options[self.options.index("--iterations") + 1])
 
     def design(self, out: Path, arm: str, seed: int) -> Job:
-        """One design, at the place where ``compare`` looks for it."""
+        """Return the job of one design, which writes to the folder that ``compare`` reads."""
         folder = out / self.name / "designs" / arm / f"seed{seed}"
         words = ["hoe"] if self.kind == "hoe" else ["lens", "--task", self.kind]
         return Job(
@@ -42,11 +42,11 @@ class Task:
         )
 
     def designs(self, out: Path) -> list[Job]:
-        """All designs; whoever stops early has all arms of the first seeds."""
+        """Return the jobs of all designs, seed by seed: an early stop leaves all arms of the first seeds."""
         return [self.design(out, arm, seed) for seed in range(self.seeds) for arm in self.models]
 
     def compare(self, out: Path) -> Job:
-        """Judge the finished designs."""
+        """Return the job that judges the finished designs."""
         kind = "hoe" if self.kind == "hoe" else f"lens-{self.kind}"
         models = ",".join(arm if arm == source else f"{arm}={source}" for arm, source in self.models.items())
         judges = [word for name, source in self.judges.items() for word in ("--judge", f"{name}={source}")]
@@ -60,16 +60,16 @@ class Task:
         )  # fmt: skip
 
 
-# The comparison shows no yield, which would take longer than the search of most arms.
+# Few draws: the comparison shows no yield, and computing it would take longer than most searches.
 _FEW_DRAWS = ("--yield-draws", 10)
 
 
 def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
-    """The three tasks on the fab, and the hologram through models of measured prints.
+    """Return the three tasks on the fab, and the hologram through models of measured prints.
 
     Args:
-        zoo: name to folder of the frozen models that come with the package.
-        corrected: the model that a closed loop on the measured prints ended with; None for none.
+        zoo: folders of the frozen models that come with the package, by name.
+        corrected: the final model of a closed loop on the measured prints; None omits this arm.
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
@@ -83,7 +83,7 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
         "--iterations", effort.lens_iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
     camera = task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
-    # No fab knows the measured printer: every arm's model judges the others' designs.
+    # No virtual fab simulates the measured printer, so each arm's model judges the designs of the other arms.
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
     measured |= {} if corrected is None else {"closed-loop": corrected}
     return [
@@ -95,10 +95,10 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
 
 
 def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
-    """The tasks of these names, separated by commas; all if None.
+    """Return the tasks with these names, separated by commas; all if None.
 
     Raises:
-        InputError: a name that no task has.
+        InputError: no task has one of these names.
     """
     if names is None:
         return list(every)
@@ -109,5 +109,5 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
 
 
 def task_options(*words: object) -> tuple[str, ...]:
-    """Options of a command, in words."""
+    """Return the options of a command as strings."""
     return tuple(map(str, words))

@@ -2,8 +2,8 @@
 # # From scans to a dataset
 #
 # You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset. In it
-# every scan lies on its layout, pixel by pixel, and the origin of every number is recorded. Here the scans come from
-# the built-in virtual fab; for [your own scans](../own_data.md) only the first step differs.
+# every scan is aligned to its layout pixel by pixel, and the origin of every number is recorded. Here the scans
+# come from the built-in virtual fab. For [your own scans](../own_data.md) only the first step differs.
 
 # %%
 import litho_data
@@ -13,8 +13,7 @@ print(card)
 
 # %% [markdown]
 # `card.toml` says which files are scans, which layout belongs to each, and what the files do not state: pitch, height
-# of a level, units. The scans are what an instrument writes: tilted, bowed, slightly rotated, with an unknown zero.
-# Read one:
+# of a level, units. The scans are raw: tilted, bowed, slightly rotated, with an unknown zero. Read one:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -66,7 +65,7 @@ figure
 
 # %% [markdown]
 # The print is flatter and rounder than its layout. A model of the printer has to learn this difference. Before you
-# pass the dataset on, make sure that nothing has changed since it was built:
+# pass the dataset on, check that nothing has changed since it was built:
 
 # %%
 checked = litho_data.verify("prints.zarr")

@@ -2,7 +2,7 @@
 # # Which model predicts best?
 #
 # You want to know which model of the printer predicts best, and by how much. On this page you compare three models on
-# scans that none of them was trained on. You get intervals, and learn how much of the error is noise.
+# scans that none of them was trained on. You get intervals, and see how much of the error is noise.
 
 # %%
 import litho_data
@@ -12,7 +12,7 @@ card = litho_data.simulate("campaign", count=8, size_px=128, seed=0)
 built = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
-# `benchmark` deals the scans into folds. Each fold is predicted by models trained on the other folds; no fold
+# `benchmark` divides the scans into folds. Each fold is predicted by models trained on the others. No fold
 # contains locked scans. The error is the mean absolute difference of measured and predicted height after the unknown
 # zero of each scan is removed ([why](../evaluation.md#two-errors)).
 
@@ -23,7 +23,7 @@ for scores in result.scores:
     print(f"{scores.model:8} {scores.mae_datum_free_nm:6.2f} nm   95 % over scans {low:.2f} … {high:.2f}")
 
 # %% [markdown]
-# Two models may differ even if their intervals overlap, because they are compared scan by scan.
+# Models may differ even if their intervals overlap, because they are compared scan by scan.
 
 # %%
 for pair in result.paired:

@@ -28,7 +28,7 @@ for name, figures in judged.items():
     print(f"{name:8} {figures['si_psnr_db']:.1f} dB, SSIM {figures['ssim']:.3f}")
 
 # %% [markdown]
-# The images, as the independent model prints both elements:
+# Show both images as the independent model predicts them:
 
 # %%
 from litho_data.reports.pictures import new_figure

@@ -1,8 +1,8 @@
 """Run the tutorials and write their pages: `python docs/tutorials/render.py [NAME …]`.
 
-A tutorial is a script in cells (`# %%` code, `# %% [markdown]` words in comments). Its page shows the words, the
-code, and what the code printed and drew when it ran, in an empty folder, in one go. Its notebook has the same
-cells, after one that installs the packages.
+A tutorial is a script of cells (`# %%`: code, `# %% [markdown]`: text in comments). The script runs once, in
+an empty folder. Its page shows the text, the code, and what the code printed and drew. Its notebook has the
+same cells after a first cell that installs the packages.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ NAMES = ("datasets", "models", "optics", "gallery")
 _INSTALL = (
     '# Where litholoop is installed already, this changes nothing.\n%pip install --quiet "litholoop[design]"'
 )
-# Progress and paths of the run, which say nothing to the reader.
+# Progress lines and paths of the run, which are of no use to the reader.
 _NOISE = re.compile(r"^\s*(for comparison:|.*it/s)")
 
 
 def cells(script: str) -> list[tuple[str, str]]:
-    """The cells of a script in order: ("markdown" or "code", text)."""
+    """Return the cells of a script in order: ("markdown" or "code", text)."""
     found = []
     for part in re.split(r"^# %%", script, flags=re.MULTILINE)[1:]:
         head, _, body = part.partition("\n")
@@ -40,7 +40,7 @@ def cells(script: str) -> list[tuple[str, str]]:
 
 
 def notebook(script: str) -> dict[str, Any]:
-    """The script as a notebook (format 4.5) without outputs, its first cell the installation."""
+    """Return the script as a notebook (format 4.5) without outputs, with an installation cell first."""
 
     def cell(number: int, kind: str, text: str) -> dict[str, Any]:
         own: dict[str, Any] = {"outputs": [], "execution_count": None} if kind == "code" else {}
@@ -65,7 +65,7 @@ def write_notebook(name: str) -> None:
 
 
 def run_cell(code: str, names: dict[str, Any]) -> tuple[str, Any]:
-    """What a cell prints, and the value of its last expression; ``names`` are those of the cells before it."""
+    """Return what a cell prints and the value of its last expression; ``names`` come from earlier cells."""
     tree = ast.parse(code)
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     said = io.StringIO()

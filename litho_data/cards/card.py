@@ -26,8 +26,8 @@ def load_card(path: str | Path) -> Card:
     """Read and check a dataset card.
 
     Raises:
-        InputError: no such file, no TOML, or a key that is unknown, missing or has an impossible value; the
-            message names the key, the value and what was expected.
+        InputError: no such file, text that is not TOML, or a key that is unknown, missing or has an
+            impossible value. The message names the key, the value and what was expected.
     """
     file = Path(path)
     content = parsed(file, tomllib.loads, f"cannot read {file} as a dataset card", "a TOML file")
@@ -192,7 +192,9 @@ class Ids(Record):
 
 
 class Standard(Record):
-    """A scan of a standard of known size; it is read like the card's scans unless stated here."""
+    """A scan of a standard of known size. Options of reading that are not given here are those of the card's
+    scans.
+    """
 
     file: InsidePath
     uncertainty_um: Uncertainty
@@ -248,7 +250,7 @@ class KnownGrating(Record):
 
 
 class Planned(Record):
-    """Planned prints: the hash of the dataset whose open questions they should answer."""
+    """Facts about planned prints: the hash of the dataset from which the prints were planned."""
 
     dataset_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -314,7 +316,7 @@ def _shown(value: object) -> str:
 
 
 def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the model to which the keys of an error location lead."""
+    """Return the model that contains the key at an error location."""
     model: type[BaseModel] = Card
     for part in location:
         annotation = model.model_fields[str(part)].annotation

@@ -22,9 +22,9 @@ packages.
 def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
     """Make sure that all files of a dataset are present and undamaged; return their folder.
 
-    Without ``into``, a folder that is already complete is used: first ``$LITHO_DATA_DIR/<name>``, then the
-    user cache, into which missing files are downloaded. Files with the right hash are not downloaded again,
-    so an interrupted fetch resumes.
+    Without ``into``, the first complete folder among ``$LITHO_DATA_DIR/<name>`` and the user cache is used.
+    If neither is complete, the missing files are downloaded into the user cache. Files with the right hash
+    are not downloaded again, so an interrupted fetch resumes.
 
     Args:
         dataset: name of a card of this project, for example ``neural-lithography``, or the path of a card.

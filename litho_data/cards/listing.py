@@ -1,4 +1,4 @@
-"""The printed fields of a card: its files are found, paired by id, and described by the card's table."""
+"""List the printed fields of a card: find its files, pair them by id, and read the card's table."""
 
 import glob
 import json
@@ -30,8 +30,9 @@ class PrintedField:
     """One field to build: its files and what the card says about it.
 
     ``columns`` contains the optional numbers (µm, dose) and words of the table. ``read`` contains the reading
-    options that the table gives instead of the card, and ``full_scale_um`` the height of the largest integer
-    of an image scan. ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
+    options that the table gives instead of the card. ``full_scale_um`` is the height of the largest integer
+    value of a scan that is an image. ``layout`` may be None only for a reference scan (whose ``use`` is not
+    dataset).
     """
 
     id: str
@@ -75,7 +76,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             ``$LITHO_DATA_DIR/<name>``, then the user cache, whichever has files.
 
     Raises:
-        InputError: a bad card, no folder with files, a bad table, or no id that has both files.
+        InputError: a bad card, no folder with files, a bad table, or no id that has both a layout and a scan.
     """
     file = Path(card_path)
     card = load_card(file)
@@ -176,7 +177,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 
 
 def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:
-    """Say why an id cannot be used although it has all files; return an empty text if it can be used."""
+    """Return why an id that has all files cannot be used, or an empty text if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may hold letters, digits, space and ._+- only"
     if print_id is None and use == "dataset":
@@ -187,7 +188,9 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
 
 
 def leads_out(files: tuple[Path, ...], folder: Path) -> str:
-    """Say why links that lead out of the data folder cannot be used: the card describes only this folder."""
+    """Return a message if a file is a link that leads out of the data folder, otherwise an empty text. The
+    card describes only this folder.
+    """
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
 
@@ -218,8 +221,8 @@ def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
 
 
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
-    """Return the group ``print`` of the expression for each whole id; None where the expression does not
-    match.
+    """Return, for each id, the text of the group ``print``; None if the expression does not match the whole
+    id.
 
     Without an expression every id counts as a print of its own. Matching nested repetitions can take forever
     and cannot be interrupted, so an expression with any repetition runs in a separate process.

@@ -98,7 +98,9 @@ def takes_more(
 
 
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that hides some of its options the option ``--help-all``, which shows them."""
+    """Add the option ``--help-all`` to a command that hides some of its options; it shows the hidden ones
+    too.
+    """
 
     @functools.wraps(command)
     def run(**values: Any) -> None:

@@ -45,7 +45,7 @@ def setting(
 
 @dataclass(frozen=True)
 class Leaf:
-    """One setting of a record and its parts, found by ``leaves``.
+    """One setting of a record or of one of its parts, as ``leaves`` finds it.
 
     Attributes:
         path: dotted, as in ``layout.pitch_um``.

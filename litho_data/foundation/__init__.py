@@ -1,6 +1,6 @@
 """Parts that all packages use: errors, files, hashes, units, records, and facts about a run.
 
-Here stand the names that most modules use; the others come from their modules.
+This package exports the names that most modules use. Import all other names from their modules.
 """
 
 from typing import TYPE_CHECKING

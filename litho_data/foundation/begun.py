@@ -34,7 +34,9 @@ BEGUN = "begun.json"
 
 @dataclass(frozen=True)
 class Begun:
-    """A folder in which a result grows; ``finished`` says that the same result was already complete."""
+    """A folder to which a command adds the files of its result. ``finished`` is true if the same result was
+    already complete at the start.
+    """
 
     folder: Path
     finished: bool
@@ -53,7 +55,8 @@ def growing_folder(
         out: the folder; made if need be.
         record: the file that a finished result holds, such as ``run.json``. The block writes it last.
         facts: fields of the record that determine the result; a folder with other values is refused.
-        holds: what may lie there before it is begun, such as designs made one by one.
+        holds: names of files that the folder may contain before the result is begun, such as designs made one
+            by one.
 
     Raises:
         InputError: ``out`` is a file, holds something else or other facts, is being written by another
@@ -96,7 +99,7 @@ def whole_folder(
         record, facts: as for ``growing_folder``; without a record any older result is replaced.
 
     Raises:
-        InputError: as for ``growing_folder``, and a folder with anything beside an older result in it.
+        InputError: as for ``growing_folder``, or the folder contains anything besides an older result.
     """
     require_replaceable_folder(out, *holds)
     if record:
@@ -109,7 +112,7 @@ def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
     """Return whether the folder contains an unfinished start of the same result."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
-    # A process that was stopped before it wrote ``begun.json`` has begun nothing.
+    # If a process was stopped before it wrote the content of ``begun.json``, the folder counts as empty.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
     require_own_folder(folder, record, *[BEGUN] * (own or nothing), *[holds] * bool(holds))
     require_same(folder, begun if own else read_record(folder / record), facts)

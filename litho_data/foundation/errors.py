@@ -39,10 +39,11 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Guard a block that reads a file written by a program and perhaps changed by somebody since.
+    """Guard a block that reads a file that a program wrote and that somebody may have changed.
 
     Raises:
-        InputError: in place of any error about the content: a missing key, a text for a number, no JSON, …
+        InputError: in place of any error about the content, such as a missing key, a text in place of a
+            number, or no JSON.
     """
     try:
         yield

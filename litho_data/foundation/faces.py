@@ -40,8 +40,8 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
 
     Args:
-        package: ``__name__`` of the package. No public name may equal that of a room of the package, because
-            importing a room binds its name.
+        package: ``__name__`` of the package. No public name may equal the name of one of its subpackages or
+            modules, because importing a subpackage or module binds that name.
         file: its ``__init__``; every import with ``as`` in it is a public name.
 
     ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.
@@ -90,7 +90,7 @@ def _missing(extra: str) -> str:
 
 
 def _version() -> str:
-    from importlib import metadata  # not needed by most users, and it takes 30 ms
+    from importlib import metadata  # this import takes 30 ms, and most users do not need it
 
     try:
         return metadata.version(_DISTRIBUTION)

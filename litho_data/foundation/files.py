@@ -69,7 +69,8 @@ def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
-    """Yield the folder ``.<name>.partial`` beside ``path``, with what a stopped process left in it.
+    """Yield the folder ``.<name>.partial`` beside ``path``, including the files that a stopped process left
+    there.
 
     Raises:
         InputError: the place cannot be written, or another process is writing it.
@@ -101,8 +102,8 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
 
 
 def publish(new: Path, path: str | Path) -> None:
-    """Rename a finished folder to ``path``; call this within ``unfinished``, which keeps an older folder
-    until then.
+    """Rename a finished folder to ``path``. Call this within ``unfinished``. An older folder at ``path``
+    stays until the new folder replaces it.
     """
     target = Path(path)
     if target.exists():
@@ -136,7 +137,8 @@ def _put_back(work: Path, target: Path) -> None:
 
 
 def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
-    """Open the file for appending and lock it; the advisory lock ends with the file or the process.
+    """Open the file for appending and lock it. The advisory lock ends when the file is closed or the process
+    ends.
 
     Raises:
         InputError: another process is writing ``target`` and holds the lock.

@@ -23,7 +23,7 @@ def file_sha256(path: str | Path) -> str:
 
 
 def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
-    """Return the hash of a decoded array: of type, shape, values, unit and dimension names, whatever its
+    """Return the hash of a decoded array: its type, shape, values, unit and dimension names, but not its
     chunks.
 
     Args:

@@ -1,4 +1,4 @@
-"""Types of many signatures: maps, their shapes, pairs of lengths along y and x, plain data."""
+"""Types that many signatures use: maps, their shapes, pairs of lengths along y and x, plain data."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -31,7 +31,7 @@ def require_plain_name(what: str, name: str) -> str:
     """Return the name if it is plain.
 
     Raises:
-        InputError: as part of a path, the name could lead somewhere else.
+        InputError: the name is not plain, so that a path with it could lead to another folder.
     """
     if not is_plain_name(name):
         raise InputError(what, got=repr(name)[:80], wanted="a plain name, without path")

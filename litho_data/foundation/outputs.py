@@ -1,4 +1,4 @@
-"""Rules for ``--out`` of every command, which only ever replaces its own older result.
+"""Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
 A missing or empty folder is accepted. If the folder contains an earlier run of the same command on the same
 subject (dataset, model, design) with the same settings, the run resumes or its result is made again. Anything
@@ -69,7 +69,8 @@ def first_difference(then: Facts, now: Facts, path: str = "") -> str:
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
-    """Accept a folder for the result with the record file ``record``: a free or empty folder, or its own.
+    """Accept a folder for the result with the record file ``record``: a free path, an empty folder, or a
+    folder with the same kind of result.
 
     A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
     with schema ``litho-models/close-loop/1``.

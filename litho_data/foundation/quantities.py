@@ -41,7 +41,7 @@ class Range:
             raise InputError(what, got=repr(wrong[0])[:40], wanted=f"a number from {self}")
 
 
-# The range extends from a tenth of a nanometre to one pixel of a centimetre.
+# A pitch lies between a tenth of a nanometre and one centimetre.
 PITCH_UM = Range(1e-4, 1e4, "µm")
 LEVEL_HEIGHT_UM = Range(1e-5, 1e3, "µm")
 HEIGHT_UM = Range(-1e5, 1e5, "µm")

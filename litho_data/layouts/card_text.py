@@ -28,8 +28,8 @@ def write_card(
     levelled: bool = False,
     **tables: Facts,
 ) -> Path:
-    """Write the card of layouts in the folder ``layouts`` and of their scans, which are or will be in
-    ``scans``.
+    """Write a card for the layouts in the folder ``layouts``, and for their scans, which are or will be in
+    the folder ``scans``.
 
     Args:
         folder: where the card goes.
@@ -42,7 +42,7 @@ def write_card(
     Raises:
         InputError: a value that a card may not have.
     """
-    plain = scan_format == "text-matrix"  # the others state unit and size
+    plain = scan_format == "text-matrix"  # files of other formats state unit and size
     scan = {
         "files": f"scans/{{id}}.{'txt' if plain else scan_format}",
         "format": scan_format,

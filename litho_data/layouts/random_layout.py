@@ -37,16 +37,16 @@ def random_layout(
         pitch_um: pixel pitch, µm.
         seed: anything that `numpy.random.default_rng` accepts.
         passband: ``square`` limits each axis, ``round`` the length of the frequency vector.
-        quantiser: ``round`` as the paper's equation, or ``floor``: then only the largest value has the
-            highest level.
-        field_px: side of a larger field, pixels, from whose middle the layout is cut: no longer periodic,
-            and it may lack the lowest or the highest level. None: the layout is the field.
+        quantiser: ``round``, as in the paper's equation, or ``floor``, with which only the largest value has
+            the highest level.
+        field_px: side of a larger field, pixels, from whose middle the layout is cut. Such a layout is not
+            periodic and may lack the lowest or the highest level. None: the layout is the whole field.
 
     Returns:
         uint8 (beyond 256 levels uint16), shape (ny, nx).
 
     Raises:
-        InputError: fewer than 2 or more than 65536 levels, a cut-off that leaves nothing to vary, or a field
+        InputError: fewer than 2 or more than 65536 levels, a cut-off that lets only the mean pass, or a field
             smaller than the layout.
     """
     LEVELS.require("levels of a layout", levels)

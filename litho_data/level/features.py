@@ -22,7 +22,7 @@ Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
 Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
-# If a smaller share of the pixels is left, the background is a guess.
+# If a smaller share of the pixels remains, the background is unreliable.
 _LEAST_BACKGROUND = 0.02
 
 

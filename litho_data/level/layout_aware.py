@@ -38,7 +38,7 @@ def level_layout_aware(
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
 ) -> Levelled:
-    """Subtract the background that remains after the layout has explained what it can.
+    """Fit the background and the printed structure together, and subtract only the background.
 
     The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
     response with one knot per level. A plain fit would count the structure's own slope as background. Only
@@ -102,7 +102,8 @@ def layout_in_scan_frame(
         bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
 
     Returns:
-        float64 of ``scan_shape``. Nearest pixel: levels are labels and must not be mixed.
+        float64 of ``scan_shape``, from the nearest layout pixel. Levels are labels and must not be
+            interpolated.
     """
     points_um = lattice(
         *((np.arange(n) + 0.5) * pitch for n, pitch in zip(scan_shape, scan_pitch_um, strict=True))

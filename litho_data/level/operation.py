@@ -32,8 +32,8 @@ class State:
 class Step(BaseModel):
     """Base of all steps: its fields are the arguments of an operation.
 
-    ``masking`` says how the current mask is used. This is the mask of the scan at first, and then the mask of
-    the latest step that marked something.
+    ``masking`` says how the current mask is used. The current mask is the scan's mask until a step marks
+    pixels, and then the mask of the latest such step.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -60,7 +60,7 @@ class Step(BaseModel):
 
 
 def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Register a function of heights and usable pixels as the operation of that name.
+    """Register a function of heights and usable pixels as the operation named ``op``.
 
     The function receives heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of
     any type, a ``mask`` and ``masking``; see ``select``. The function's keyword arguments become fields of

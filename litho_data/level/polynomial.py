@@ -16,7 +16,8 @@ from litho_data.level.selection import Levelled, subtract
 Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
-# Below this value, the smallest direction of the normal matrix is rounding noise.
+# If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this, the smallest
+# eigenvalue is only rounding noise.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
 # Widths in units of the noise. With these, 95 % of the efficiency of least squares is kept under Gaussian
@@ -123,7 +124,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
     """Return weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), where P are the Legendre
     polynomials.
 
-    x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the same
+    x = 2 j / (nx - 1) - 1, and likewise for y. Any set of terms that contains all lower ones spans the same
     polynomials in the Legendre basis as in powers, but far better conditioned. The moments are separable, so
     the fit costs only a few thin matrix products.
 

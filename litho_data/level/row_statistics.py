@@ -6,7 +6,8 @@ from litho_data.foundation import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Number of digits of heights in metres: more than files state, and fewer than unit conversions change.
+# Heights in metres are rounded to this many digits. Files state fewer digits, and rounding errors of unit
+# conversions affect only later digits.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to here are exact in a double.
 _LARGEST_EXACT_POWER = 22

@@ -46,9 +46,9 @@ def align_rows(
     """Align the rows of a scan, and warn if lines were shifted because of the print.
 
     Args:
-        z: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
-            first compare a squared height with a height, in metres as Gwyddion does, and the second
-            chooses between equally short windows as Gwyddion does in metres.
+        z: (ny, nx), µm. ``"matching"`` and ``"modus"`` require this unit, because both convert to metres as
+            Gwyddion does: the weights of ``"matching"`` compare a squared height with a height, and
+            ``"modus"`` chooses between equally short windows.
         method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
             the two ``-of-differences`` and ``matching`` add up steps between neighbouring rows, which
             keeps large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
@@ -90,12 +90,12 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """Return a warning if an alignment moved lines although many of their pixels stayed in place; otherwise
-    an empty text.
+    """Return a warning if an alignment shifted lines although many of their pixels have the height of the
+    neighbouring line; otherwise an empty text.
 
-    An offset of a line moves all of its pixels. The warning names lines that were shifted against their
-    neighbour by far more than the noise although many of their pixels do not differ from it; there, a
-    structure shifted the other pixels.
+    A real offset moves all pixels of a line. The alignment is suspect if it shifted a line relative to its
+    neighbour by far more than the noise although many pixels of the two lines agree. In that case, a
+    structure caused the difference in the other pixels.
 
     Args:
         z: (ny, nx) before alignment; ``removed``: what was subtracted from it; lines are rows in both.
@@ -175,7 +175,7 @@ def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
 
 
 def _fewest(lines: Array) -> int:
-    """Return the fewest selected values that a row needs for an estimate of its own."""
+    """Return the smallest number of selected values from which a row is estimated by itself."""
     return int(np.log(lines.shape[1]) + 1.5)
 
 

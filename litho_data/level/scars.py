@@ -59,8 +59,8 @@ def mark_scars(
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
-    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
-    other pixels stay bit for bit, and ``removed`` is zero there.
+    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All other pixels
+    keep exactly their values, and ``removed`` is zero there.
 
     Raises:
         InputError: marks of another shape, or a marked area without any measured neighbour.
@@ -107,7 +107,9 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Values of the unknown pixels, as ``z[unknown]``; the solution covers unmeasured pixels as well."""
+    """Return the values of the unknown pixels, in the order of ``z[unknown]``. The equation is solved over
+    the unmeasured pixels as well.
+    """
     from SurfaceTopography import Topography
 
     left_out = unknown | ~np.isfinite(z)

@@ -89,7 +89,7 @@ def records_of_use(records: Sequence[Facts]) -> list[Facts]:
 
 
 def facts_of_card(card: Card) -> dict[str, Any]:
-    """Return what a card says about all scans, as part of the dataset's hash."""
+    """Return what a card says about all scans; these facts are part of the dataset's hash."""
     write = card.write.model_dump(exclude_none=True) if card.write else None
     return dataset_facts(card.layout, card.scan.instrument, write)
 
@@ -101,7 +101,7 @@ def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> d
     """
     card = Card.model_validate(manifest["card"])
     facts = facts_of_card(card)
-    # The keys of a table are those of ``WRITE``.
+    # The keys of the table ``[write]`` get the prefix ``WRITE``.
     written = {f"{WRITE}{key}": value for key, value in facts.pop("write", {}).items()}
     operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
     return {

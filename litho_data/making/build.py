@@ -29,7 +29,8 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# If the pixel aspect differs by more than this from that of other scans, rows or columns are missing.
+# If a scan's aspect ratio of pixels differs by more than this from that of other scans, rows or columns are
+# missing.
 _ASPECT_TOLERANCE = 1e-3
 _MOST_SEARCHES = 2000
 
@@ -190,12 +191,15 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """For scans that did not register, add to the reason which other layout of the set they show, if any."""
+    """Find which other layout of the set the unregistered scans show, and add it to the reasons in
+    ``skipped``.
+    """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    # A layout may be printed, and a print scanned, more than once; the layout gets the name of its first id.
+    # Several ids may share a layout, if it was printed or its print was scanned more than once. The layout
+    # gets the name of its first id.
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
     # One search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
@@ -213,8 +217,8 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
-    """Find scans whose pixel aspect differs from that of most, if the size comes from the card, not from the
-    file.
+    """Find scans whose aspect ratio of pixels differs from that of most scans, if the card states the size,
+    not the file.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
     """

@@ -94,13 +94,14 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
-    """Find defects in a micrograph: film deep in a gap of the layout, or a pit in the film.
+    """Mark defects in a micrograph: film far inside a gap of the layout, or a pit in the film.
 
     A gap that is completely closed, or an island that is completely lost, counts as print.
 
     Args:
         covered: coverage (ny, nx), NaN where not seen; ``layout_share``: coverage by the layout.
-        depth_px: nearer to an edge of the layout, deviations may be print; defects are widened by as much.
+        depth_px: deviations within this distance of an edge of the layout may belong to the print and are not
+            defects. Defects are widened by the same distance.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

@@ -27,17 +27,17 @@ def height_sigma(
 ) -> tuple[Array, Mapping[str, float]]:
     """Return the standard uncertainty of registered heights, apart from the offset of the scan.
 
-    The variance is a sum of six parts: white noise of pixels and of lines after resampling; the error of the
-    resampling itself; the slope times the uncertainty of the warp; the surface that levelling left or wrongly
-    removed; and the uncertainty of the z scale times the height over the scan's mean.
+    The variance is a sum of six parts: white noise of pixels, and of lines, after resampling; the error of
+    the resampling itself; the slope times the uncertainty of the warp; the surface that levelling left or
+    wrongly removed; and the uncertainty of the z scale times the height relative to the scan's mean.
 
     Args:
         levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
         height_um: the same on the layout's grid, NaN where not valid.
         layout_level: levels on that grid.
         blur_px, model: blur and model of the registration, see ``warp_error``.
-        levelled: whether a recipe was applied. If so, what it removed of the print counts at its estimate; if
-            not, a surface beside the print counts only if it is clear.
+        levelled: whether a recipe was applied. If so, the estimated part of the print that the recipe removed
+            is included. If not, a surface in addition to the print is included only if it is significant.
         fast_axis: the axis along which the tip moved.
         z_uncertainty: relative uncertainty of the z scale; 0 if it was not calibrated.
 
@@ -76,7 +76,9 @@ def _resampling_nm2(
     line_nm: float,
     fast_axis: Axis,
 ) -> float:
-    """Return the fine structure that interpolation loses: the print's noise-free spectrum times the loss."""
+    """Return the variance of the fine structure that interpolation loses, nm²: the integral of the print's
+    noise-free spectrum times the relative loss at each frequency.
+    """
     filled = fill_gaps(levelled_um)
     lost = 0.0
     axes: tuple[Axis, Axis] = ("y", "x")

@@ -19,9 +19,11 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Rim of level 0 around a field that is alone on the substrate, because models extend the edge of a layout.
+# Width of the rim of level 0 around a field that is alone on the substrate. Models extend the outermost
+# levels of a layout, so that the rim makes them extend level 0.
 _BARE_PX = 2
-# Film this deep (px) in a gap of the layout is dirt, and ground this deep in its film is a pit.
+# Film in a gap of the layout is dirt if it is farther than this (px) from the layout's edges. Bare ground
+# that far inside the layout's film is a pit.
 _DIRT_PX = 5
 
 
@@ -40,9 +42,9 @@ class Job(Protocol):
 
 
 def finish(job: Job, unfinished: PartialStore) -> Facts | str:
-    """Run a job, store its result and return the record; arrays stay where they are made.
+    """Run a job, store its arrays from the process that made them, and return only the record.
 
-    Bad input becomes a text, the reason why the scan is skipped, so that one bad file never stops a build.
+    For bad input, return the reason why the scan is skipped, so that one bad file never stops a build.
     """
     try:
         piece = job.run()
@@ -141,7 +143,9 @@ class FieldJob:
         )
 
     def _cover(self, chain: Chain) -> None:
-        """Run the rest of the chain for a micrograph: edges, registration, coverage on the layout's grid."""
+        """Run the rest of the chain for a micrograph: find the edges, register, and compute the coverage on
+        the layout's grid.
+        """
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
         edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film})
@@ -150,8 +154,8 @@ class FieldJob:
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
     def _level(self, chain: Chain) -> None:
-        """Run the rest of the chain for heights: levelling, and for the dataset also registration and
-        resampling.
+        """Run the rest of the chain for heights: level the scan, and register and resample it if it belongs
+        to the dataset.
         """
         of_dataset = self.field.use == "dataset"
         pitch = {"scan_pitch_um": chain.pitch_um}

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# If the pixel aspect exceeds this, the message of a failed registration asks whether rows are missing.
+# If the aspect ratio of the pixels exceeds this, the message of a failed registration asks whether rows are
+# missing.
 _OBLONG = 0.01
 
 
@@ -30,7 +31,9 @@ READERS = ("read-scan", "read-micrograph")
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
-    """Register a function as the operation of that name; its result depends on ``code`` and this file."""
+    """Register a function as the operation ``name``. ``code`` names the source on which its result depends,
+    besides this file.
+    """
 
     def made(function: Function) -> Function:
         OPERATIONS[name] = Operation(
@@ -42,8 +45,8 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """Read a levelling recipe in canonical form; without a file, return the recipe that cannot ruin a
-    print.
+    """Read a levelling recipe in canonical form. Without a file, return the layout-aware plane, which does
+    not remove the print.
     """
     from litho_data.level import Recipe
 

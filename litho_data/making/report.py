@@ -100,7 +100,7 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
     if len(shown.columns) == 1:
-        # For pairs that come without their scans, only names are known.
+        # For pairs that come without their scans, the table has only the column of ids.
         return
     page.heading("Quality of every scan, in numbers", folded=True)
     page.table(

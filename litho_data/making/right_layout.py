@@ -21,9 +21,10 @@ _BLUR_PX = 3.0
 _SIDE_PX = 128
 # Number of outermost pixels that the surroundings of a field affect.
 _EDGE_PX = 2
-# Another layout must explain a scan better by this much, in correlation.
+# The correlation of a scan with another layout must exceed that with its own layout by this much.
 _BETTER = 0.02
-# With another layout a print reaches 0.3 to 0.5 at the best shift, with its own layout 0.9.
+# At the best shift, the correlation of a print with another layout is 0.3 to 0.5, and with its own layout
+# 0.9.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
 # Scatter of the log gain at one dose among prints of one layout, and among prints of different layouts.
@@ -35,9 +36,9 @@ _CLEAR_SIGMA = 4.0
 class Print:
     """One registered scan: its heights and its blurred layout at a few points, its orientation and its group.
 
-    ``turned`` says whether the print lay turned, according to the card. Scans of one ``group`` should share a
-    gain. The group is the dose, if the card gives it, or the printed block. ``response`` and ``edge_times``
-    come from ``_response`` and ``_edge_times``.
+    ``turned`` says whether the card states that the print was rotated under the microscope. Scans of one
+    ``group`` should share a gain. The group is the dose, if the card gives it, or the printed block.
+    ``response`` and ``edge_times`` come from ``_response`` and ``_edge_times``.
     """
 
     id: str
@@ -63,7 +64,7 @@ def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Return signs that scans do not show their own layout, by id; empty for most sets."""
+    """Return, by id, the reasons to suspect that a scan does not show its own layout; empty for most sets."""
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -146,7 +147,9 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield scans that lie mirrored or turned on their layout, unlike the others of the set or the card."""
+    """Yield scans that are mirrored or rotated relative to their layout, unlike the other scans or unlike the
+    card says.
+    """
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
     for one in (one for one in prints if not one.turned):
         if one.dihedral != usual and 2 * count > len(prints):
@@ -192,8 +195,8 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
-    """Return the slope of the heights over the blurred layout, µm per level, and the slope's growth with the
-    dose.
+    """Return the slope of the heights over the blurred layout, µm per level, and how that slope grows with
+    the dose.
 
     Exposure is level times dose, so the curve g of the heights over the blurred levels T also shows what a
     larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola
@@ -209,8 +212,8 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
 
 
 def _edge_times(topography: Array, height: Array, slope: float) -> float:
-    """Return the deviation of the outermost pixels from the layout, as a multiple of that of the others; 0 if
-    unknown.
+    """Return the rms deviation of the outermost pixels from the layout, divided by that of the inner pixels;
+    0 if unknown.
 
     ``slope``: height per blurred level, µm.
     """
@@ -228,8 +231,8 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     """Return messages for the doses that are out of order, if the height per level clearly falls somewhere.
 
     Args:
-        rising: for each dose whose prints should rise with more dose: log of the height per level, number of
-            scans.
+        rising: for each dose at which a larger dose should raise the height: the log of the height per level,
+            and the number of scans.
         scatter: standard deviation of that log for one scan.
     """
     doses = sorted(rising)
@@ -238,7 +241,8 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     falls = values[:, None] - values - _CLEAR_SIGMA * np.hypot.outer(error, error)
     if not (np.triu(falls, 1) > 0).any():
         return {}
-    # The rank of a value is the place of the dose to which it belongs.
+    # In the right order, values rise with the dose. The rank of a value is therefore the position of its true
+    # dose.
     pairs = {k: sorted((k, int(rank))) for k, rank in enumerate(np.argsort(np.argsort(values)))}
     return {
         doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"

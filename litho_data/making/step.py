@@ -55,7 +55,9 @@ class Step:
 
     @classmethod
     def from_record(cls, record: Facts) -> Step:
-        """Make the step of a record; the recorded id is not used, so that the two ids can be compared."""
+        """Make the step from a record. The recorded id is not used, so that it can be compared with the
+        computed id.
+        """
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
 

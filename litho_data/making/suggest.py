@@ -1,6 +1,4 @@
-"""Find the best levelling recipe for a card: the one whose heights the layout explains best in three
-scans.
-"""
+"""Find the levelling recipe after which the layout explains the heights of three scans of a card best."""
 
 from __future__ import annotations
 
@@ -54,7 +52,8 @@ method = "median-of-differences"
 }
 """The recipes that are compared, the simplest first."""
 _SCANS = 3
-# A recipe must leave less than this share of the residual of a simpler one.
+# A recipe is better than a simpler one only if its residual is below this share of the simpler one's
+# residual.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
 _LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
@@ -65,8 +64,8 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 class Suggestion:
     """The recipe that leaves the smallest residual, and the residual of every recipe and scan, nm.
 
-    ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks
-    outside its fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
+    ``left_nm[recipe][scan]`` is the root mean square residual of the fit to the layout, in blocks held out of
+    the fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
     """
 
     recipe: str
@@ -82,7 +81,8 @@ def suggest_recipe(
 
     A free response to the blurred layout is fitted to the levelled heights in half of the blocks of 16 px.
     The residual in the other half decides, because it contains both the tilt that a recipe leaves and the
-    print that it removes. A recipe that moves lines whose pixels did not move is not suggested.
+    print that it removes. A recipe is not suggested if it shifts lines that agree with their neighbours in
+    many pixels.
 
     Args:
         card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
@@ -159,7 +159,8 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Fit heights freely to the layout, and return the rms residual in blocks outside the fit, µm.
+    """Fit the heights by a free response to the layout, and return the rms residual in blocks held out of the
+    fit, µm.
 
     Args:
         height_um: (ny, nx), NaN where not measured.

@@ -11,14 +11,14 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# A number is wrong if heights differ from those of the layout, or of the other prints, by more than these
-# factors.
+# A number of the card is wrong if heights differ by more than these factors from the heights that the layout
+# states, or from those of the other prints.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # If the scales of the scans agree with each other but not with 1, the pitch of the card is wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
-# Measured prints have values of 1.1 to 1.5; simulated prints have 2 with a rim of substrate, and 6 to 8
-# without.
+# Limit of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints have 2 with a rim
+# of substrate around the field, and 6 to 8 without a rim.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # Largest residual of levelling, as a share of the print's own standard deviation.
@@ -131,8 +131,8 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
 def _of_the_card(
     records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Yield the numbers of the card that the scans together contradict: one scan or all, the text, and the
-    weight.
+    """Yield the numbers of the card that the scans together contradict, each with the scan (or all scans), a
+    text and the weight.
     """
     layout = card.layout
     times = _height_times(prints, card)

@@ -116,7 +116,7 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """Turn data that a check cannot read into a finding."""
+    """Yield what a check yields, and a finding if the check cannot read its data."""
     try:
         with damaged("what a check needs"):
             yield from check

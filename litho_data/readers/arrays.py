@@ -25,9 +25,9 @@ _UNKNOWN = re.compile(
     r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
     re.I,
 )
-# Numbers that convert counts into heights, as in m counts + b.
+# Names of the numbers that convert counts into heights, such as m and b in m counts + b.
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# The same numbers among the many others beside or above an array.
+# Names of such numbers among the many attributes beside or above an array, where only clear names count.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
     r"(z|heights?|data|values?|topography|add)[ _-]?offset",
@@ -47,9 +47,10 @@ Read = Callable[[], Array]
 
 @dataclass(frozen=True)
 class Coordinate:
-    """The positions along one dimension with the unit that the file states, or only a stated length.
+    """The positions along one dimension in the unit that the file states. If the file states only a length,
+    there are no positions.
 
-    ``axis`` is x or y, if the file states it in addition to the name.
+    ``axis`` is x or y if the file states the axis apart from the dimension's name.
     """
 
     values: Array | None
@@ -77,8 +78,8 @@ class Coordinate:
 class Held:
     """An array in a file: its type and shape, a function that reads it, and what the file says about it.
 
-    ``dims`` are the names of its dimensions. ``coordinates`` are the coordinates of these dimensions, and
-    others in the file. ``around`` contains the attributes beside and above the array.
+    ``dims`` are the names of its dimensions. ``coordinates`` maps names of these and other dimensions in the
+    file to their coordinates. ``around`` contains the attributes beside and above the array.
     """
 
     dtype: np.dtype
@@ -107,8 +108,8 @@ def array_channel(name: str, held: Held) -> Channel:
     x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
 
     Raises:
-        InputError: attributes that change the values in an unknown way, which the message names; values that
-            are no real numbers; coordinates at uneven steps.
+        InputError: attributes that change the values in an unknown way (the message names them), values that
+            are not real numbers, or coordinates at uneven steps.
     """
     says = {key: _plain(value) for key, value in held.attributes.items()}
     beside = {key: _plain(value) for key, value in held.around.items()}
@@ -156,7 +157,8 @@ def array_channel(name: str, held: Held) -> Channel:
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
     """Return the names of y and x, and whether the first index runs along x.
 
-    Dimensions without coordinates take the coordinates called x and y if the lengths match.
+    If neither dimension has coordinates, the file's coordinates that are named x and y are used if their
+    lengths match.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
@@ -234,12 +236,12 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 
 
 def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
-    """Return the name of a mask by its shape."""
+    """Return the names of the masks among the arrays, by shape."""
     return {one.shape: name for name, one in arrays if one.dtype.kind == "b"}
 
 
 def _refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Refuse a map that has a mask of its shape beside it, because the meaning of the mask is unknown."""
+    """Refuse a map if the file has a mask of the same shape, because the mask's meaning is unknown."""
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")
 

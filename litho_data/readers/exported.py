@@ -1,4 +1,4 @@
-"""Read files that the design package wrote for a printer back as levels, with the help of their sidecars."""
+"""Read the levels of files that the design package exported for a printer, with the help of sidecars."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def exported_levels(path: Path, says: Facts) -> Array:
 
 
 def exported_rows(path: Path, says: Facts) -> Any:
-    """Return the levels of a whole file, marks included; for TIFF and GDS, only the requested rows are read.
+    """Return the levels of a whole file, including alignment marks. For TIFF and GDS, only the requested rows
+    are read.
 
     Raises:
         InputError: as ``exported_levels``.
@@ -72,7 +73,7 @@ def exported_rows(path: Path, says: Facts) -> Any:
                 return _gwl_levels(path, shape, pitch_um, step_um, says["pedestal_um"], says["slicing_um"])
             case "dxf":
                 return _dxf_levels(path, shape, pitch_um, says["greys"])
-        # The first schema had a step instead of the greys.
+        # Sidecars of the first schema state the step between grey values instead of the grey values.
         greys = says.get("greys") or (np.arange(says["levels"]) * says["grey_per_level"]).tolist()
         return _image_levels(path, greys)
 
@@ -108,8 +109,8 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Read levels uint8 (ny, nx), row 0 on top, from closed polylines; each begins with its layer and an
-    unused number.
+    """Read levels uint8 (ny, nx), row 0 on top, from closed polylines. Each polyline begins with its layer
+    and an unused number.
     """
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)

@@ -1,4 +1,6 @@
-"""Read GDSII files of the design package, one band of rows at a time: rectangles in cells that repeat."""
+"""Read GDSII files of the design package, one band of rows at a time. They contain rectangles in repeated
+cells.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 _UNIT_M, _PRECISION_M = 1e-6, 1e-9
-# Side of the blocks that a part is cut into.
+# Side of the blocks into which the design package cuts a layout, px.
 _BLOCK_PX = 128
 # Number of shapes that are read at once.
 _CHUNK = 1 << 10
@@ -50,7 +52,8 @@ class GdsRows:
     def __getitem__(self, rows: slice) -> Array:
         top, bottom, _ = rows.indices(self.shape[0])
         low, high = self.shape[0] - bottom, self.shape[0] - top
-        # Each corner of a rectangle adds to everything above it and to the right of it.
+        # A rectangle is the sum of its four corners: each corner adds a constant, of either sign, above and
+        # to the right of it.
         steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
@@ -67,7 +70,7 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find where the shapes of every cell are in the file, and to which cells it refers."""
+        """Find the position of every cell's shapes in the file, and the cells that it refers to."""
         at, cell, name = 0, "", ""
         while True:
             # Only records of shapes are longer.

@@ -16,7 +16,7 @@ _JPK = b"JPK SCAN"
 _UM_PER_M = 1e6
 _UM_PER_NM = 1e-3
 _NANOSURF = "nsf_file_version_major"
-# Names of the same fact in versions 2 and 1 of Nanosurf's files.
+# Names of one attribute in versions 2 and 1 of Nanosurf's files.
 _NAMES, _LOW, _HIGH, _UNIT = (
     ("signal_name", "name"),
     ("signal_calibration_min", "base_calibration_min"),
@@ -83,7 +83,9 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
 
 
 def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: float) -> Loaded:
-    """Read values in the default calibration; y of the grid points up, so the last row comes first."""
+    """Read values in the default calibration. The y axis of the grid points up, so the rows are returned in
+    reverse order.
+    """
     column, row = positions().astype(int).T
     values = np.full((row.max() + 1, column.max() + 1), np.nan)
     values[row.max() - row, column] = counts()[:, frame]
@@ -108,8 +110,8 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """Make a channel whose type of counts has the calibrated range as its range; rows and columns stay as
-    stored.
+    """Make a channel from counts. The range of their integer type stands for the calibrated range. Rows and
+    columns stay as stored.
     """
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])

@@ -1,5 +1,5 @@
-"""Read layouts, that is, what was sent to the printer, as integer levels, from files of levels or pictures of
-them.
+"""Read layouts, which are what was sent to the printer, as integer levels, from files of levels or grey
+pictures.
 """
 
 from pathlib import Path
@@ -37,8 +37,8 @@ def read_layout(
             bottom is cut off.
 
     Raises:
-        InputError: no such file, damaged, another format, a true colour image, values that are no levels or
-            no steps of grey, or the sidecar of another file.
+        InputError: no such file, a damaged file, another format, a true colour image, values that are neither
+            levels nor whole steps of grey, or the sidecar of another file.
     """
     file = require_file(path)
     if says := export_of(file):

@@ -10,14 +10,15 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# An unknown number at this distance from the other values, in spans, counts as a mark; a lone pixel must be
-# farther away.
+# Apart from the usual marks, an extreme value counts as a mark if its distance from the other values exceeds
+# this multiple of their span. For a single pixel, the second limit applies.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
-# Relative tolerance: values are stored as float32, and very large values are written with few digits.
+# Relative tolerances for equal values: values may be stored as float32, and very large values are written
+# with few digits.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# An extreme value is suspicious from this share of the pixels, this number, and this multiple of the mean
-# count on.
+# An extreme value is suspicious if it fills at least this share of the pixels, this number of pixels, and
+# this multiple of the mean count of a value.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
@@ -31,7 +32,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
             list if there are none.
 
     Raises:
-        InputError: a word that is not among them; without ``missing``, a number that looks like a mark.
+        InputError: a word that is not in ``missing``, or, if ``missing`` is None, a number that looks like a
+            mark.
     """
     marks = {one for one in missing or () if isinstance(one, str)}
     for word, line in channel.words.items():

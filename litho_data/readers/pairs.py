@@ -1,7 +1,7 @@
 """Read fields in the authors' pair format: 8-bit layouts and heights, cut into four quadrants.
 
-A grey value stands for value / 255 · full scale. The format has no validity, no negative heights and only 256
-grey values, so it loses accuracy.
+A grey value stands for value / 255 · full scale. The format has no mask of valid pixels, no negative heights
+and only 256 grey values, so it loses accuracy.
 """
 
 from collections.abc import Sequence

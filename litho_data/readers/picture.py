@@ -20,7 +20,8 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
         what: what messages call the file.
 
     Raises:
-        InputError: no such file, damaged, another format, a true colour image, numbers that are not finite.
+        InputError: no such file, a damaged file, another format, a true colour image, or numbers that are not
+            finite.
     """
     file = require_file(path)
     with about(f"{what} {file}"):

@@ -27,7 +27,7 @@ from litho_data.scan import Axis, Scan
 _NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
-# Possible sides of a scan, for coordinates without a unit.
+# A scan's side lies in this range. The range decides the unit of coordinates that have none.
 _SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
@@ -57,13 +57,13 @@ def read_scan(
             height = value / largest value · full_scale_um. Replaces ``unit``.
         missing: numbers (as in the file) and words that mark pixels without a measurement, besides those that
             the file states; an empty list says that there are none.
-        defaults: ``unit`` and ``size_um`` apply only if the file states none. Without ``defaults`` they must
+        defaults: whether ``unit`` and ``size_um`` are only used if the file states none. Otherwise they must
             not contradict the file.
 
     Raises:
-        InputError: an unreadable file, no or several height channels, a missing or contradicting unit or
-            size, a value that looks like an unnamed mark of missing pixels, heights that cannot be, or no
-            finite value.
+        InputError: an unreadable file, no height channel or several, a missing or contradicting unit or size,
+            a value that looks like a mark of missing pixels that ``missing`` does not name, impossible
+            heights, or no finite value.
     """
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
@@ -134,7 +134,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:
-    """Take the unit from the name of a channel if it states one, as ``height_nm`` does."""
+    """Take the unit from the name of a channel if the name states one, as in ``height_nm``."""
     ends = _NAMED_UNIT.search(channel.name)
     return replace(channel, unit=ends[1]) if ends and channel.unit is None else channel
 
@@ -208,8 +208,8 @@ def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
 
 
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
-    """Return (y, x) in µm for coordinates without a unit: in µm or in the heights' unit, if only one makes
-    sense.
+    """Return (y, x) in µm for coordinates without a unit. The unit is µm or that of the heights, if only one
+    of them gives a possible size.
     """
     if channel.extent is None or channel.full_scale is not None:
         return None

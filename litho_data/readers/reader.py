@@ -17,15 +17,16 @@ import numpy as np
 from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.scan import Axis
 
-# 2 GiB as float64: beyond this size, a damaged header is far more likely than a scan.
+# Largest scan, 2 GiB as float64. A larger size is far more likely to come from a damaged header than from a
+# scan.
 _MAX_PIXELS = 2**28
-# This is the limit of Deflate, the strongest compression in use.
+# Largest compression ratio: that of Deflate, the strongest compression in use.
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
-# What parsers say about a truncated or changed file; any other message means that the kind of file is
-# unknown.
+# Words of parsers' messages about a truncated or changed file. Any other message means that the kind of file
+# is unknown.
 _CUT = re.compile(
     r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
     r"crc|incomplete|reach(es)? beyond",
@@ -51,9 +52,10 @@ class Channel:
         fast_axis: axis along which the tip moved; None if the file does not state it.
         header: everything that the file states, as strings.
         problem: why the channel cannot be read; empty if it can.
-        x_is: in words, what in the file runs along x.
+        x_is: the direction in the file that runs along x, in words, such as "a row of the file".
         extent: (y, x) from edge to edge in a unit that the file does not state.
-        words: words in place of numbers, each with its first line; their pixels are NaN.
+        words: words that the file has in place of numbers, each with the line where it first occurs. Their
+            pixels are NaN.
         notes: warnings for whoever uses the map.
     """
 
@@ -82,7 +84,7 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Return whether the unit is a length, or must be stated by the caller."""
+        """Return whether the unit is a length, or unknown so that the caller must state it."""
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
@@ -114,7 +116,9 @@ class Reader:
 
 
 def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
-    """Make a channel, or one that says why it cannot be read, so that the other channels stay usable."""
+    """Make a channel. If that fails, make a channel that says why it cannot be read, so that the other
+    channels stay usable.
+    """
     try:
         with foreign_parser("a map"):
             return make()
@@ -146,7 +150,7 @@ def extent_um(y: float, x: float, unit: str | None) -> YX | None:
 
 
 def unknown_content(head: bytes) -> InputError:
-    """Return the error for a file that no reader recognises."""
+    """Make the error for a file that no reader recognises."""
     return InputError("format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
@@ -162,7 +166,7 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
-    """Silence warnings, and these loggers up to a level."""
+    """Silence Python warnings, and messages of these loggers up to the level ``above``."""
     named = [logging.getLogger(name) for name in loggers]
     levels = [logger.level for logger in named]
     try:

@@ -51,7 +51,7 @@ def reader_of(format: str) -> Reader:
     """Return the reader of that name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no reader of that name.
     """
     for reader in _READERS:
         if reader.name == format:
@@ -63,7 +63,7 @@ def detect_format(path: Path) -> str:
     """Return the name of the first format that recognises the file; ``"image"`` for PNG and BMP.
 
     Raises:
-        InputError: none does.
+        InputError: no format recognises the file.
     """
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)

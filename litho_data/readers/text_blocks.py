@@ -15,14 +15,14 @@ NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+
 _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
-# A semicolon may also stand before the first cell of a row. In a spreadsheet, cells with errors begin like a
-# comment.
+# A semicolon may also precede the first cell of a row. A spreadsheet's cell with an error begins with the
+# character of a comment.
 _COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _LOOKED_AT = 400
 _FEWEST_NULS = 0.8
-# This many equal words in a line are a row of missing pixels.
+# A line with at least this many equal words is a row of missing pixels.
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
 _QUOTED = re.compile(r'"([^",\n]*)"')
@@ -30,7 +30,7 @@ _QUOTED = re.compile(r'"([^",\n]*)"')
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = table_beside(__file__, "words.toml")
 _KEYS: dict[str, list[str]] = WORDS["keys"]
-# The unit of a column or of all numbers, as in "Height [nm]"; in front of a number it belongs to a length.
+# The unit of a column or of all numbers, as in "Height [nm]". A unit before a number belongs to a length.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
     r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
@@ -223,7 +223,7 @@ def is_row(line: str) -> bool:
     words = [cell for cell in cells if NUMBER.fullmatch(cell) is None]
     if len(cells) >= _FEWEST_EQUAL and len(set(words)) == 1 and not is_length(words[0].strip("[]()")):
         return True
-    # `ncols 32` is a word and its value, and so is `Width: 6,4 µm`.
+    # `ncols 32` and `Width: 6,4 µm` are words with their values, not rows of numbers.
     starts = NUMBER.match(cells[0]) is not None
     return 2 * len(words) <= len(cells) and (
         starts or (len(cells) != 2 and not _ASSIGNMENT.search(" ".join(cells[:2])))

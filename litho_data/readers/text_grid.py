@@ -11,7 +11,7 @@ from litho_data.foundation import YX, Array, InputError, is_length, um_per
 # Coordinates are written with few digits, so a step may differ from the usual one by this share.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# A single axis or uneven axes need more numbers.
+# A single axis, or axes with uneven steps, must have at least this many numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -25,9 +25,11 @@ _AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 on top and x to the right, and the lengths in the table; ``extent`` has no unit.
+    """Heights with row 0 on top and x to the right, and the side lengths that the table states. ``extent`` is
+    in an unknown unit.
 
-    ``corner`` says whether the first cell belonged to axes."""
+    ``corner`` says whether the first cell of the table belonged to an axis.
+    """
 
     values: Array
     extent: YX | None = None
@@ -106,8 +108,8 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 
 
 def _columns(words: Sequence[str], count: int) -> list[int]:
-    """Find the columns of x, y and z by the words above them, or take the only three columns; otherwise
-    return none.
+    """Find the columns of x, y and z by the words above them, or take the columns in order if there are only
+    three. Otherwise return no columns.
     """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))

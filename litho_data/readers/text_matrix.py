@@ -13,7 +13,7 @@ from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# A few numbers per row of a long table are points, not lines of a map.
+# A long table with only a few numbers per row contains points, not the lines of a map.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
 _IGOR = "IGOR\n"
 

@@ -22,7 +22,9 @@ _TRUNCATED = "the file may be truncated"
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers (rows, columns), NaN for words, the first line of each word, and the word in the first cell."""
+    """Numbers (rows, columns) with NaN for words, the line where each word first occurs, and the word in the
+    first cell.
+    """
 
     values: Array
     words: dict[str, int]
@@ -66,7 +68,7 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
             commas as well as separators; or commas that may separate thousands.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
-    for mark in "\t;,":  # at the end of every row it separates nothing
+    for mark in "\t;,":  # a separator at the end of every row separates nothing
         if all(row.endswith(mark) for row in rows if row):
             rows = [row[:-1] for row in rows]
         if all(row.startswith(mark) for row in rows if row):
@@ -126,7 +128,7 @@ def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:
     ]
     width = max(len(cells) for _, cells in rows[1:]) if len(rows) > 1 else len(rows[0][1])
     if len(rows) > 2 and len(rows[0][1]) == width - 1:
-        rows[0][1].insert(0, "")  # the corner between a column and a row of coordinates
+        rows[0][1].insert(0, "")  # fills the corner between a column and a row of coordinates
     width, width_line = len(rows[0][1]), rows[0][0]
     words: dict[str, int] = {}
     corner = rows[0][1][0] if _number(rows[0][1][0]) is None else None

@@ -77,8 +77,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Return SurfaceTopography's name for the format of the maker that signs this TIFF; empty if no maker
-    does.
+    """Return SurfaceTopography's name for the format of the instrument maker whose tags this TIFF has; empty
+    if it has none.
     """
     try:
         with open_tiff(path) as file:
@@ -129,7 +129,8 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     """Return scale, offset, unit and no-data value of a page.
 
     Raises:
-        InputError: a calibration of ImageJ that is no straight line, or an unknown scale in the description.
+        InputError: a calibration by ImageJ that is not a straight line, or an unknown scale in the
+            description.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -167,8 +168,8 @@ def _plain_unit(unit: Any) -> str:
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
     """Read (y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
 
-    The pages belong to the images in turn, and each image has as many pages as its sizes in z, channel and
-    time say.
+    The pages are those of the first image, then those of the second, and so on. Each image has as many pages
+    as its sizes in z, channel and time say.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):

@@ -77,8 +77,8 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Return whether the header has a version of Igor's waves and (except for the usual one) the right
-    checksum.
+    """Return whether the header has a version number of Igor's waves and the right checksum. The usual
+    version 5 is accepted without a checksum.
     """
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
@@ -114,8 +114,8 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Refuse a wave shorter than its header says, because igor2 trusts version 5 and would walk through
-    gigabytes.
+    """Refuse a wave shorter than its header says, because igor2 trusts the header of version 5 and could read
+    through gigabytes.
     """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
@@ -140,7 +140,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
     nx, ny = info.nb_grid_pts
     sizes = info.physical_sizes
     lateral_unit, unit = info.lateral_unit, info.unit
-    if isinstance(unit, tuple):  # how a Nanoscope channel says that its values are no lengths
+    if isinstance(unit, tuple):  # a Nanoscope channel whose values are not lengths has two units
         lateral_unit, unit = unit[0], unit[1] or "not a length"
     elif not info.is_height_channel:
         unit = info.data_unit or "not a length"
@@ -190,7 +190,8 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 def _fast_axis(header: dict[str, str]) -> Axis | None:
     """Return ``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
 
-    At other angles the lines of the file may follow the scanner or the scan, so the caller has to know.
+    At other angles the file does not say whether its lines follow the scanner's or the scan's axes. The
+    caller must state the axis.
     """
     try:
         angle = float(header["ScanAngle"]) % 180

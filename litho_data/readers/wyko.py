@@ -21,8 +21,8 @@ def read_channels(path: Path) -> list[Channel]:
     """Read one channel per block; the second flag of the first line says whether heights are in nm or in
     waves.
 
-    The format stores columns one after another, each from the bottom. A file with one line per row is read by
-    rows.
+    The format stores one column after another, each from bottom to top. A file with one line per row is read
+    row by row.
 
     Raises:
         InputError: a header without sizes or wavelength, or blocks of other sizes.

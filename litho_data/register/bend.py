@@ -10,7 +10,8 @@ from litho_data.foundation import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# Tolerance as a share of the half width of the scan: far below a thousandth of a pixel.
+# Tolerance of the iteration, as a share of the half width of the scan. It is far below a thousandth of a
+# pixel.
 _SETTLED = 1e-9
 # A bend with a slope of 0.1 is undone in 10 steps, one with a slope of 0.9 in 200.
 _STEPS = 400
@@ -99,7 +100,9 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """Return the largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
+        """Return the largest local stretch or rotation of the bend, as a fraction. A bend with a slope of 1
+        or more may fold.
+        """
         # The grid is exact for a bend, and exact to a thousandth for creep.
         spacing = 2 * self.half[::-1] / (_GRID - 1)
         gradient = np.array([np.gradient(one, *spacing, edge_order=2) for one in self._field()])

@@ -112,7 +112,7 @@ def _fit_features(
     layout_shape = layout_level.shape
     from_family = np.linalg.inv(orientation_matrix(orientation, shape))
     to_layout = np.linalg.inv(linear_part(from_family @ points.layout_to_scan, centre(layout_shape)))
-    # The keypoints may have found a rotation by 90° that the correlation missed.
+    # The keypoints may show a rotation by 90° that the correlation missed.
     found = nearest_orientation(to_layout)
     turn = orientation_matrix(found, shape) @ from_family
     warp = turn @ points.layout_to_scan

@@ -1,8 +1,8 @@
-"""Register scans that no straight warp fits, because the scanner bends them or creeps.
+"""Register scans that no straight warp fits, because the scanner bends the image or creeps.
 
 A bend displaces the image by a quadratic function of position. A scanner that is still settling displaces its
 lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the linear part of
-the creep. The rest distorts the print by a tenth of the creep and leaves no other trace.
+this creep. The remaining part distorts the print by a tenth of the creep and cannot be seen in any other way.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from litho_data.register.topography import fill_gaps, predicted_topography, quad
 
 Curve = int | Literal["quadratic"] | None
 """What is fitted in addition to an affine: creep along the slow axis (0 = x, 1 = y), a bend, or nothing."""
-# Every second pixel of the layout in both directions locates the print as well as all pixels do.
+# Step between the pixels that are used, in both directions. Every second pixel locates the print as well as
+# all pixels do.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
@@ -43,7 +44,7 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
         scan, layout_level: as in ``refine_pyramid``.
         straight: the result of ``refine_pyramid``; its error may reach the width of structures at a quarter
             resolution.
-        curve: ``quadratic``, or the axis of the oriented scan along which the lines follow each other.
+        curve: ``quadratic``, or the slow axis of the oriented scan, across its lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -164,8 +165,8 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Return the squared misfit of every pixel after gain and background are fitted to ``fitted``; NaN
-        outside the scan.
+        """Return the squared misfit of every pixel after gain and background are fitted to the pixels
+        ``fitted``; NaN outside the scan.
         """
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)

@@ -22,7 +22,7 @@ from litho_data.register.topography import fill_gaps, quadratic_basis
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# Beyond this share no main surface is left, and the whole print is doubtful.
+# If defects cover a larger share of the field, no main surface remains, and the whole print is doubtful.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
@@ -31,12 +31,13 @@ _FEWEST_PX = 60
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
-# Pixels that enter and leave at the edge of a mask keep the steps above a thousandth of a pixel.
+# As pixels at the edge of a mask enter and leave the fit, its steps do not fall below a thousandth of a
+# pixel.
 _TOLERANCE_PX = 0.01
 # A suspected area of at least this share of the field may have spoiled the fit, so that its own misfit looks
 # small.
 _WORTH_A_FIT = 0.005
-# Below this correlation a whole print may misfit; the measured prints have 0.945 and more.
+# Below this correlation the fit of the whole print may be wrong. The measured prints have 0.945 and more.
 _SUSPICIOUS = 0.9
 _MAD_PER_SIGMA = 0.6745
 _TUKEY = 4.685
@@ -46,8 +47,8 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """Return the fit without the defects, and the defects, bool (ny, nx) of the layout; or the plain fit if
-    there are none.
+    """Return the fit to the pixels outside the defects, and the defects, bool (ny, nx) of the layout. Without
+    defects, return the plain fit.
 
     Every round starts from the coarse warp, which is robust. The round finds the defects under the last warp
     and fits the warp to the rest, until the corners of the warp no longer move.
@@ -79,8 +80,8 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Find the pixels of the layout where the scan shows something else, with a margin; also return the
-    largest misfit.
+    """Find the pixels of the layout where the scan shows something other than the print, with a margin; also
+    return the largest misfit.
 
     The misfit is the scan on the layout's pixels, minus a free function of the predicted topography
     (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
@@ -99,8 +100,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     misfit = _misfit(scan, fine)
     if misfit is None:
         return nowhere
-    # Without noise the whole misfit may come from edges, so a misfit that is small compared with the print is
-    # not a defect.
+    # Without noise, the whole misfit may come from edges. Sigma therefore has a lower limit, so that a misfit
+    # that is small compared with the print is not a defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
     if size.max() <= SUSPECT_SIGMA:
@@ -112,7 +113,7 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
         return nowhere
-    # A missing part is missing even where the ground happens to have the right height.
+    # Inside a missing part, the ground may happen to have the right height. Such pixels are marked too.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 

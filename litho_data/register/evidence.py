@@ -13,13 +13,14 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# On straight scans the mean shifts of blocks differ by up to this much, and by up to 4 standard errors.
+# On straight scans, the mean shifts of blocks differ by up to this many pixels, and by up to 4 standard
+# errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """How single blocks of the field fit the warp; arrays (n, 2) of (x, y) in layout pixels.
+    """Shifts of single blocks of the field relative to the warp; arrays (n, 2) of (x, y) in layout pixels.
 
     ``shift_px`` is the displacement of a block's content from its position by the warp. ``held_out_px`` is
     the same for a warp fitted without the block.
@@ -39,7 +40,7 @@ class BlockShifts:
         ``along``.
 
         A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
-        not linear or that the scanner creeps, which no rung of the ladder can follow.
+        not linear or that the scanner creeps. No warp of the ladder describes this.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
@@ -127,7 +128,7 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 def height_correlation(height: Array, layout_level: Array) -> float:
     """Return the Pearson correlation of heights, smoothed with sigma = 1 px, with the unblurred layout.
 
-    Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
+    Only valid pixels at least 8 px from the border of the layout are used. Heights (ny, nx) may contain NaN.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:

@@ -8,7 +8,7 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# Each rung uses the first generators of the list, this many of them, so the ladder is nested.
+# Each rung of the ladder uses this many of the first generators, so every rung contains the lower ones.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0
@@ -17,7 +17,8 @@ GENERATORS[3, 0, 0] = GENERATORS[3, 1, 1] = 1.0
 GENERATORS[4, 0, 0], GENERATORS[4, 1, 1] = 1.0, -1.0
 GENERATORS[5, 0, 1] = GENERATORS[5, 1, 0] = 1.0
 GENERATORS[6, 2, 0] = GENERATORS[7, 2, 1] = 1.0
-# An affine and a bend: two of the six quadratic flows are the generators of the perspective.
+# Number of flows of an affine and a bend. Two of the six quadratic flows are the generators of the
+# perspective.
 BENT_COUNT = 12
 
 
@@ -41,8 +42,8 @@ def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield the velocities of the first ``count`` generators; for ``BENT_COUNT``, of all affine and quadratic
-    ones.
+    """Yield the velocities of the first ``count`` generators. If ``count`` is ``BENT_COUNT``, yield those of
+    all affine and quadratic flows.
     """
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)

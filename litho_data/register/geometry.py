@@ -11,8 +11,8 @@ from litho_data.foundation import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
-# Each name stands for: transpose, then flip rows, then flip columns; this operation turns the scan onto the
-# layout.
+# For each name: whether to transpose, then flip rows, then flip columns. The operation turns the scan onto
+# the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),

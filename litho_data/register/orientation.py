@@ -66,8 +66,8 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 def rival_alignment(registered: Array, topography: Array) -> float:
     """Return the correlation of the best rival shift, as a share of the registration's own correlation.
 
-    A rival is a local maximum of the correlation over shifts at least a sixteenth of the field away. With the
-    topography in place of the scan, the result says how much the layout repeats itself.
+    A rival is a local maximum of the correlation over shifts at least a sixteenth of the field away. If the
+    topography is given in place of the scan, the result says how strongly the layout repeats.
     """
     from scipy.ndimage import maximum_filter
 
@@ -84,8 +84,8 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Return the largest correlation, over all shifts, of the registered scan after rotation, mirroring or
-    inversion.
+    """Return the largest correlation with the topography, over all shifts, of the registered scan after
+    rotation, mirroring or inversion.
     """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)

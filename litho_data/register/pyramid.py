@@ -149,7 +149,7 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """Choose the fit on the lowest rung that no higher rung beats on held-out blocks.
+    """Return the fit on the lowest rung of the ladder that no higher rung surpasses on held-out blocks.
 
     Args:
         fine: a converged affine fit; every rung starts from its projection.

@@ -57,11 +57,11 @@ class RegistrationQuality:
 # Limits of a pass; docs/registration.md gives the reason for each.
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
-# If the blur of the print (sigma) exceeds this, the last two limits grow with the blur.
+# If the blur of the print (sigma) exceeds this, MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX grow with the blur.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
-# From a slope of 1 on, two points of the scan may show the same position.
+# If the slope is 1 or more, two points of the scan may show the same position.
 MAX_BEND_SLOPE = 1.0
 
 

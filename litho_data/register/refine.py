@@ -22,7 +22,8 @@ from litho_data.register.topography import fill_gaps, quadratic_basis
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
 _BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
 CELL_PX = 32
-# The unknown surroundings of the print (bare ground or a neighbour) blur across the layout's border.
+# In a border of this width, the blurred heights depend on the unknown surroundings of the print (bare ground
+# or a neighbouring print).
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
 
@@ -77,8 +78,8 @@ def refine(
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
-    """Find the warp of this model that maximises the correlation; the start may be off by the structures'
-    width.
+    """Find the warp of this model that maximises the correlation; the error of the start may reach the width
+    of the structures.
 
     Args:
         scan: (ny, nx) smoothed heights, NaN where not measured.
@@ -167,7 +168,7 @@ def residual_energy(gram: Array, coefficients: Array) -> Array:
 def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
     """Return the displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
 
-    Not finite where the fitted gain of the topography is 0.
+    The result is not finite where the fitted gain of the topography is 0.
     """
     normalise = normalisation(shape)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -83,7 +83,8 @@ def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Return frequencies (n,) up to Nyquist's, cycles/µm, and the squared error of a resampled wave at each.
+    """Return frequencies (n,) up to the Nyquist frequency, cycles/µm, and the squared error of a resampled
+    wave at each frequency.
 
     The error is relative to the wave's squared amplitude and averaged over sub-pixel positions. Averaging a
     finely sampled scan over the layout's pixel does not count as an error.
@@ -98,8 +99,8 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return the weights in one layout pixel of scan pixels at a distance of lag + phase pixels, (phases,
-    lags).
+    """Return the weights (phases, lags) in one layout pixel of the scan pixels at a distance of lag + phase
+    pixels.
     """
     from scipy.ndimage import map_coordinates
 

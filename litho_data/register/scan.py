@@ -31,12 +31,12 @@ from litho_data.register.topography import predicted_topography, remove_bow
 from litho_data.scan import Axis, Scan
 
 MIN_SIZE_PX = 32
-# One picometre is below the resolution of any instrument and above rounding.
+# One picometre is below the resolution of any instrument and above rounding errors.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend contains an affine, so models that were chosen to be stiffer do not bend.
+# A bend is fitted together with an affine. If the caller chose a stiffer model, no bend is fitted.
 BENDABLE = ("affine", "homography", "ladder")
-# A real bend accounts for nearly all of the displacement; the limit of one half separates the two cases
-# clearly.
+# A bend is accepted if it reduces the error on held-out blocks to this share. A real bend removes nearly all
+# of the error, so the limit separates real bends clearly from others.
 BENT_SHARE = 0.5
 
 
@@ -205,7 +205,7 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # The bend is rounded like the matrix: no digits below physical meaning.
+        # The bend is rounded like the matrix, to digits with physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -233,7 +233,9 @@ def _check(height: Array, layout: Array, scan_pitch_um: YX, layout_pitch_um: flo
 
 
 def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
-    """Resample a copy for comparison; the heights that are stored are resampled once, from the original."""
+    """Resample a copy of the scan for comparison. The stored heights are resampled once, from the original
+    scan.
+    """
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
     shape = _shape_at(layout_pitch_um, height.shape, scan_pitch_um)
@@ -265,7 +267,7 @@ def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> t
 
 
 def _rounded(matrix: Array) -> Array:
-    """Round off digits of the matrix far below physical meaning, which could differ between machines."""
+    """Round the matrix to digits with physical meaning, as further digits could differ between machines."""
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)

@@ -25,7 +25,7 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
 
 
 def smooth_measured(height: Array, sigma_px: float) -> Array:
-    """Smooth with a Gaussian by normalised convolution: gaps neither pull the mean nor spread.
+    """Smooth with a Gaussian by normalised convolution, so that gaps neither bias the mean nor grow.
 
     Args:
         height: (ny, nx), NaN where not measured.
@@ -42,16 +42,16 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         return gaussian_filter(height.astype(float), sigma_px)
     weight = gaussian_filter(measured.astype(float), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
-    # The limit 1e-9 separates pixels with a few distant measured pixels in reach from pixels with rounding
-    # only.
+    # A weight above 1e-9 means that at least a few distant measured pixels lie within reach. A smaller weight
+    # is only rounding error.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: Array) -> Array:
     """Replace every NaN in the heights: extrapolate for three pixels, then continue with a constant.
 
-    The first pixels of a gap are the point reflection of the measured side about the nearest measured pixel.
-    Slopes therefore continue, and an interpolating spline does not ring at the border.
+    The first three pixels of a gap are a point reflection of the measured heights about the nearest measured
+    pixel. Slopes therefore continue, and an interpolating spline does not ring at the border.
     """
     from scipy.ndimage import distance_transform_edt
 

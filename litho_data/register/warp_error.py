@@ -19,14 +19,14 @@ from litho_data.register.topography import predicted_topography, quadratic_basis
 # A surface is real if the root mean square of its terms exceeds that of their standard errors by this factor.
 # On virtual prints without tilt and bow the factor is at most 1.9.
 _CLEAR = 6.0**0.5
-# How far the surrounding print has an effect (proximity, shrinkage), in layout pixels. A fit without this
-# effect takes it for a surface. The surface is similar in neighbouring blocks, so the jackknife does not see
-# the error.
+# Distances over which the surrounding print has an effect (proximity, shrinkage), in layout pixels. A fit
+# that ignores this effect mistakes it for a surface. The surface is similar in neighbouring blocks, so the
+# jackknife does not show the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
-# Within a cell's width of the layout's border, a print has other surroundings than inside. The effect of
-# these surroundings is the same on all four sides and in all blocks there, and changes the magnification by
-# more than the jackknife states. A field of this many cells keeps two thirds of its area without the
-# outermost cells.
+# Within a cell's width of the layout's border, a print has different surroundings than in the interior. The
+# effect of these surroundings is the same on all four sides and in all blocks there, and changes the
+# magnification by more than the jackknife states. A field of this many cells keeps two thirds of its area
+# without the outermost cells.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
@@ -36,9 +36,10 @@ class WarpError:
     """The errors of the fit that places a scan on its layout.
 
     Attributes:
-        covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
-        surface_rms: root mean square over the field of the quadratic surface that the fit finds beside the
-            print, without its offset, in the unit of the heights.
+        covariance: covariance (k, k) of the amounts of the flows in ``register.flows``, in the normalised
+            layout frame.
+        surface_rms: root mean square over the field of the quadratic surface that the fit finds in addition
+            to the print, without its offset, in the unit of the heights.
         surface_error_rms: root mean square of the error of that surface.
         is_clear: whether the surface is significant.
     """
@@ -52,9 +53,9 @@ class WarpError:
         """Return the mean square of the surface that the heights contain in addition to the print.
 
         The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
-        Levelling has removed a surface not of the scan but of the print with its roughness. The print's part
-        of that surface is in the error of the fit and no longer in the heights, so after levelling the two
-        squares add up.
+        Levelling wrongly removes the quadratic part of the print and its roughness. That part is then missing
+        from the heights and is described by the error of the fit. After levelling, the two mean squares are
+        therefore added.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
@@ -96,7 +97,8 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
     around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
     cells = aligned_gram(smooth, topography, count, around)
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
-    # The registration ignores the surroundings, so its error is that of a fit without them.
+    # The registration ignores the surroundings, so its error is that of a fit without the terms of the
+    # surroundings.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
     _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:

@@ -32,7 +32,7 @@ Words = Mapping[str, Sequence[str]]
 _SPELT = table_beside(__file__, "words.toml")
 # Columns that name a model are coloured like it.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns whose values are keys; the keys are spelt out like the names of columns.
+# Columns whose values are keys. These keys are spelt out like the names of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -41,7 +41,7 @@ class Page:
 
     Args:
         title: what was done, on what.
-        lead: one line below it.
+        lead: one line below the title.
         run: the run that made the result; by default the one that writes the page.
         facts: further facts that identify the result, such as hashes and seeds, by name.
         words: titles and meanings of the columns of its tables, or the TOML file with them; other columns are
@@ -75,11 +75,11 @@ class Page:
         self._add("verdict", text=text)
 
     def paragraph(self, text: str) -> None:
-        """Plain prose."""
+        """Add a paragraph of plain text."""
         self._add("paragraph", text=text)
 
     def note(self, *texts: str) -> None:
-        """Add one box with what the reader must not overlook; without texts, add nothing."""
+        """Add a box with texts that the reader must not overlook. Without texts, add nothing."""
         if texts:
             self._add("note", texts=texts)
 
@@ -88,7 +88,7 @@ class Page:
         self._add("points", texts=list(texts))
 
     def code(self, text: str) -> None:
-        """Add a text of fixed width."""
+        """Add a text in a font of fixed width."""
         self._add("code", text=text)
 
     def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:
@@ -110,10 +110,11 @@ class Page:
         """Add a sortable table; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
-            table: a frame, columns by name, or rows: mappings or records. A record inside a row gets a column
-                for each of its fields, ``row_field``; intervals and lists are spelt out.
+            table: a frame, a mapping of names to columns, or a sequence of rows (mappings or records). A
+                record inside a row gets a column for each of its fields, ``row_field``. Intervals and lists
+                are spelt out.
             digits: decimal places; numbers too small for them keep two significant figures.
-            columns: those to show, in this order; all by default.
+            columns: the columns to show, in this order; all by default.
         """
         frame = _frame(table, digits)
         frame = frame if columns is None else frame.reindex(columns=list(columns))
@@ -142,7 +143,7 @@ class Page:
 
         Args:
             columns: title and colour bar of each.
-            rows: label and one picture per column, as of :func:`coloured_png`.
+            rows: label and one picture per column, as :func:`coloured_png` returns it.
             caption: text below the pictures.
         """
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)

@@ -1,4 +1,4 @@
-"""Copies of the figures and tables of a report, in the form that a paper needs."""
+"""Write copies of the figures and tables of a report in the form that a paper needs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=Non
 
 @contextmanager
 def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
-    """Reports that are written inside also write their figures and tables for a paper."""
+    """Make every report that is written in this context also write its figures and tables for a paper."""
     token = _WANTED.set(PaperCopies(figures, tables))
     try:
         yield
@@ -49,12 +49,12 @@ def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iter
 
 
 def wanted() -> PaperCopies:
-    """The copies requested by the surrounding ``paper_copies``."""
+    """Return the copies requested by the surrounding ``paper_copies``."""
     return _WANTED.get() or PaperCopies()
 
 
 def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that writes a report ``--figures`` and ``--tables``."""
+    """Add the options ``--figures`` and ``--tables`` to a command that writes a report."""
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -67,8 +67,8 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
-    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page; this changes the
-    figures.
+    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page. The figures are changed in
+    place.
     """
     if not figures:
         return
@@ -88,10 +88,11 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
 
 
 def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
-    """Write a table in the wanted format with ``digits`` places, beside its CSV file with full precision.
+    """Write a table in the requested format with ``digits`` decimal places, beside its CSV file with full
+    precision.
 
     Args:
-        frame: the table; ``names``: what a reader calls its columns.
+        frame: the table; ``names``: the titles of its columns.
         csv_path: its CSV file.
     """
     if wanted().tables == "csv":

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _OWN = table_beside(__file__, "colours.toml")
 LIGHT, DARK = _OWN["light"], _OWN["dark"]
-# Colours of a figure that change with the screen's colours.
+# Colours of a figure that follow the light or dark mode of the screen.
 _OF_SCREEN = ("ink", "paper", "soft", "accent")
 _FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87400")
 _PICTURE_DPI = 110
@@ -47,7 +47,7 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
 
 
 def svg_address(figure: Figure) -> str:
-    """Return the data address of a figure as SVG; its colours of ``LIGHT`` change with the screen."""
+    """Return the data address of a figure as SVG. Its ``LIGHT`` colours follow the mode of the screen."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
@@ -107,7 +107,7 @@ def shown_html(line: str, **images: Array) -> str:
     range.
 
     Args:
-        line: the line.
+        line: the ``repr`` of the object, one line.
         images: maps (ny, nx) by name.
     """
     figures = []

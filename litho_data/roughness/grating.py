@@ -13,7 +13,8 @@ from litho_data.scan import Axis
 
 # The period that an uncalibrated scanner shows differs from the true period by at most this factor.
 SEARCHED = 1.25
-# A window of two periods is blind to the mean and to all harmonics; phases need several windows side by side.
+# In a window of two periods, the mean and all harmonics cancel. A fit of the phases needs several windows
+# side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
 # The limit is far below 1.8 rad, by which the phases of noise scatter.
 _MOST_SCATTER_RAD = 0.5
@@ -178,7 +179,7 @@ def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, flo
 
 
 def _wider(freedom: int) -> float:
-    """Return how much wider Student's t is with this freedom, as a factor for the uncertain scatter of a few
-    phases.
+    """Return the standard deviation of Student's t with this number of degrees of freedom. As a factor, it
+    corrects an uncertainty whose scatter was estimated from few phases.
     """
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

@@ -36,7 +36,8 @@ def retained_variance(
 ) -> float:
     """Return the expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
 
-    Sq of a levelled surface is too low by the square root of this share; divide by the root to correct it.
+    Sq of a levelled surface is too low by a factor that is the square root of this share. To correct Sq,
+    divide it by that factor.
 
     Args:
         shape: (ny, nx), pixels; (1, nx) with a degree of (0, n) for rows that are levelled separately.

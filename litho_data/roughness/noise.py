@@ -16,13 +16,13 @@ _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
-    """Estimate the pixel noise and line noise of a scan of any print, nm: whatever is white at the finest
-    scales.
+    """Estimate the pixel noise and line noise of a scan of any print, nm: the noise that is white at the
+    finest scales.
 
-    A printer writes nothing finer than its spot, so differences of high order leave only noise. Along both
-    axes it is that of the pixels; in the line means along the slow axis it is that of the lines. Line noise
-    that is correlated over lines (drift), and noise that the feedback smooths, look like the print and are
-    not counted.
+    A printer writes nothing finer than its spot, so differences of high order leave only noise. Differences
+    along both axes give the noise of the pixels. Differences of the line means along the slow axis give the
+    noise of the lines. Line noise that is correlated over lines (drift), and noise that the feedback smooths,
+    look like the print and are not counted.
 
     Args:
         height_um: heights, µm, shape (ny, nx), NaN where not measured.
@@ -45,8 +45,8 @@ def _fine(values: Array, axis: int) -> Array:
 
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
-    """Return differences of an order along an axis: white noise keeps its variance, lower polynomials
-    vanish.
+    """Return differences of an order along an axis, scaled so that white noise keeps its variance.
+    Polynomials of lower order vanish.
     """
     return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 

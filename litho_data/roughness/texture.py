@@ -17,7 +17,7 @@ _OWN = 3
 # 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# The lowest frequencies contain what levelling leaves of a bow.
+# The lowest frequencies contain the part of a bow that levelling did not remove.
 _FIRST = 3
 
 
@@ -43,7 +43,7 @@ class LinePeriod:
     """The strongest period of lines.
 
     Args:
-        period_um: centre of the strongest peak over its surroundings.
+        period_um: centre of the peak that exceeds its surroundings most.
         share: share of the squared line means that is in the peak.
         p: chance of such a peak anywhere in a smooth spectrum.
         amplitude_um: root mean square over the surfaces of the amplitude at this period.
@@ -96,7 +96,8 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
-    # Beyond the Nyquist frequency of the axes only the corners of the square are left, in four directions.
+    # Beyond the Nyquist frequency of the axes, the spectrum has only its four corners. They would favour four
+    # directions.
     used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
     power, angle = power[used], np.arctan2(fy, fx)[used]
     total = power.sum()
@@ -111,7 +112,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
     If lines are random, the mean periodogram of F scans divided by its level is distributed as Gamma(F) / F.
     The level is a parabola through the logarithms at the surrounding frequencies, and its uncertainty is
-    integrated out. The p of the largest of all frequencies is corrected by Bonferroni.
+    integrated out. The p-value of the largest peak is corrected for the number of frequencies (Bonferroni).
 
     Args:
         means_um: mean height of each line, one array per scan; all are cut to the shortest.

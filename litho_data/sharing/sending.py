@@ -21,7 +21,7 @@ _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20
 
 @dataclass(frozen=True)
 class Known:
-    """Large objects that other processes make for themselves; jobs and results refer to them by name.
+    """Large objects that each process makes for itself; jobs and results refer to the objects by name.
 
     ``make`` makes ``objects`` again; it must be importable by name, as a partial is. A process keeps the
     objects that it made last.
@@ -33,9 +33,10 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A function as another process runs it: in the same folder, for results with the same command line.
+    """A function that another process runs in the same folder, recording the same command line in results.
 
-    ``plugins`` are files of plug-ins to load first; ``software`` is what a Dask worker must run too.
+    ``plugins`` are files of plug-ins to load first; ``software`` is the software that a Dask worker must also
+    run.
     """
 
     function: Callable[[Any], Any]
@@ -63,9 +64,7 @@ def _made(make: bytes) -> Facts:
 
 
 def sent(content: Any, names: Mapping[int, str]) -> bytes:
-    """Convert anything to bytes; ``names`` maps the ``id`` of objects that are sent as a name to this
-    name.
-    """
+    """Convert anything to bytes. ``names`` maps the ``id`` of each object sent by name to that name."""
     stream = BytesIO()
     _Sender(stream, names).dump(content)
     return stream.getvalue()
@@ -95,8 +94,8 @@ class _Receiver(pickle.Unpickler):
 
 
 def _require_alike(wanted: Facts, folder: str) -> None:
-    """Refuse a Dask worker whose results would differ; this is checked with each job, as workers come and
-    go.
+    """Refuse a Dask worker whose results would differ; this is checked with each job, because workers may
+    join and leave.
     """
     from distributed import get_worker
 

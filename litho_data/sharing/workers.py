@@ -40,7 +40,7 @@ class Pool(NamedTuple):
     """Workers that take jobs: their present number, and the errors that mean that a job was lost with its
     worker.
 
-    ``tries`` is how often a job is begun; ``restart`` is called before lost jobs are begun again.
+    ``tries`` is how often a job is started at most; ``restart`` is called before lost jobs are started again.
     """
 
     submit: Callable[..., Future[bytes]]
@@ -57,8 +57,8 @@ class Workers:
     bit if each process has the same number of threads.
 
     Attributes:
-        processes: number of local processes, with one thread each unless the environment says otherwise; 1 is
-            this process.
+        processes: number of local processes, with one thread each unless the environment says otherwise; 1
+            means that jobs run in this process.
         dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
         known: objects in jobs that need not be sent.
         pool: see ``kept_open``.
@@ -98,7 +98,7 @@ def run_jobs(
     Args:
         function: importable by name; jobs and results can be pickled.
         name: what messages call a job.
-        apart: the function starts a process and waits for it, so that local workers can be threads.
+        apart: whether the function starts a process and waits for it. Local workers can then be threads.
 
     Raises:
         InputError: no scheduler at the address, a worker of other software or with several threads, or a job
@@ -164,8 +164,8 @@ def _tried(
 
 @contextmanager
 def kept_open(workers: Workers) -> Iterator[Workers]:
-    """Yield the same workers, started once for all jobs of the block; workers that cannot start raise at
-    once.
+    """Yield the same workers, started once for all jobs of the block. If they cannot start, raise the error
+    at once.
 
     Raises:
         InputError: no scheduler at the address, or no worker there.
@@ -289,8 +289,8 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Check what answers at the address, because a client that meets another program waits long, then
-    crashes.
+    """Check that a scheduler answers at the address. A client that meets another program there waits long and
+    then crashes.
     """
     from distributed.core import rpc
 

@@ -54,7 +54,7 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
 
 
 class PartialStore:
-    """The finished scans on disk, and the group into which they grow."""
+    """The finished scans on disk, and the group to which they are added."""
 
     def __init__(self, out: Path, folder: Path):
         self.out = out

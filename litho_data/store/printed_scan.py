@@ -35,9 +35,9 @@ class PrintedScan:
         groups: what the card's pattern of ids says in addition to the print, such as the field; by name.
         instrument: name of the instrument, if the card's table gives it; ``seen_by``: its kind, which says
             what the heights are (``Instrument``).
-        surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 shows),
-            ``continues`` (more of the print, so that the outermost pixels are not valid) or ``unknown``,
-            which is also the default.
+        surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 in the layout
+            shows), ``continues`` (more of the print, so that the outermost pixels are not valid) or
+            ``unknown``, which is also the default.
     """
 
     id: str

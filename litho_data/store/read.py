@@ -55,7 +55,8 @@ _SHOWN_SCANS = 12
 
 
 def open_store(path: str | Path) -> Store:
-    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading; everything is read once.
+    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading. All data are read once to check
+    them.
 
     Raises:
         InputError: no such path, not a Zarr v3 group, a declared file that is missing or damaged, or arrays
@@ -64,7 +65,7 @@ def open_store(path: str | Path) -> Store:
     root = open_root(path)
     require_complete(Path(path))
     store = Store(root, Path(path))
-    # Both are checked as they are read.
+    # Reading the hash and the manifest checks them.
     _ = store.sha256, store.manifest
     return store
 
@@ -134,7 +135,7 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """Return the groups that the card's pattern for ids names, except the print, with their values in one
+        """Return the named groups of the card's pattern for ids, except ``print``, with their values for one
         id.
 
         A pattern with repetitions is not applied, because a pattern in a store from elsewhere might never

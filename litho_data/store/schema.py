@@ -46,7 +46,7 @@ class Variable:
 
 
 class DatasetId(Record):
-    """The dataset to which a result refers: its name, and the hash of what a model can see of it."""
+    """The dataset to which a result refers: its name, and the hash of all data that a model can use."""
 
     name: str
     sha256: str
@@ -92,8 +92,8 @@ def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[s
 
 
 def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
-    """Return the hash of what a model can see of a dataset, independent of chunking, padding and metadata
-    texts.
+    """Return the hash of all data of a dataset that a model can use, independent of chunking, padding and
+    metadata texts.
 
     Args:
         facts: see ``dataset_facts``.

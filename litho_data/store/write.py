@@ -1,4 +1,4 @@
-"""Write a dataset store: one scan per chunk, as other tools copy it; every chunk has a checksum."""
+"""Write a dataset store: one scan per chunk, which suits copies by other tools, and a checksum per chunk."""
 
 from __future__ import annotations
 
@@ -133,14 +133,14 @@ def write_table(
 
 
 def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str) -> None:
-    """A one-dimensional array of UTF-8 texts."""
+    """Write a one-dimensional array of UTF-8 texts."""
     _write(group, name, np.array(values, dtype=object), dim, "string")
 
 
 def write_numbers(
     group: zarr.Group, name: str, values: Array, dim: str, attributes: Facts | None = None
 ) -> None:
-    """A one-dimensional array of numbers."""
+    """Write a one-dimensional array of numbers."""
     _write(group, name, values, dim, values.dtype, attributes=dict(attributes or {}))
 
 

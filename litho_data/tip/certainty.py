@@ -20,10 +20,10 @@ from litho_data.tip.curvature import (
 )
 from litho_data.tip.morphology import paraboloid_erosion
 
-# Curvature of a valley in units of the tip's: above the first value it may be a jump, above the second it is
-# one. The image of a valley of curvature k has k / (1 − kR), so 0.6 of the tip's curvature means 0.375 in the
-# surface. If noise requires a disc as wide as the valley, the disc underestimates the curvature; noise alone
-# reaches 0.6 at 3.5 sd.
+# Curvature of a valley in units of the tip's curvature. Above the first value the valley may be a jump, and
+# above the second value it is one. The image of a valley of curvature k has k / (1 − kR), so 0.6 of the tip's
+# curvature means 0.375 in the surface. If noise requires a disc as wide as the valley, the disc
+# underestimates the curvature; noise alone reaches 0.6 at 3.5 sd.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
 # A disc shows a jump, weakened, up to its radius away; the jump is where the signal exceeds this share of its
 # peak.

@@ -39,7 +39,7 @@ class TipEstimate(RunFacts, Result):
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of an estimate; None for a bound.
         reason: why it is only a bound; empty for an estimate.
-        depth_um: range of heights, without tilt and bow, of the scan behind the radius.
+        depth_um: range of heights, without tilt and bow, of the scan from which the radius comes.
         reach_px: √(2 R depth) in pixels: how far the image of a spike reaches.
         pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
         window_px: side of the windows in which curvatures were measured; None without a bound.

@@ -12,7 +12,9 @@ from litho_data.foundation import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A surface (ny, nx), and row and column (int32) of the pixel that sets each height; NaN sets none."""
+    """A surface (ny, nx), and row and column (int32) of the pixel that sets each height. NaN pixels set no
+    height.
+    """
 
     surface: Array
     row: Array

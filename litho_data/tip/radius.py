@@ -15,7 +15,7 @@ from litho_data.foundation import YX, Array
 from litho_data.register.topography import remove_bow
 from litho_data.tip.curvature import QUIET, noise_of
 
-# Half sides of the square windows of a parabola, pixels.
+# Half sides of the square windows in which a parabola is fitted, pixels.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
 # Windows with half sides of a third of the reach average most and still fit on the image of an edge; up to
 # 0.45 is allowed.
@@ -24,7 +24,7 @@ _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
 # standard deviations there.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
-# Near the scanner's turning points, a line says little.
+# Share of a line, at each end, that is not used: near the scanner's turning points it is unreliable.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
 # Share of the tops above 0.4 of the edge that exceed 0.8 of it; it is up to 0.16 on surfaces that no tip
@@ -189,7 +189,9 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Return where the curvatures end, minus what noise adds; 0 or less if there is only noise."""
+    """Return the edge at which the distribution of the curvatures ends, minus the part that noise adds. The
+    result is 0 or less if there is only noise.
+    """
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:
         return 0.0

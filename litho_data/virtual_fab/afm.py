@@ -59,8 +59,8 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Return the path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``, also between
-    pixels.
+    """Return the path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``. The tip may
+    touch the surface between two pixels.
     """
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
@@ -71,7 +71,7 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
     from scipy.interpolate import CubicSpline
 
     fine_um = pitch_um / _TIP_OVERSAMPLING
-    # The tip touches where its slope u/R equals that of the surface.
+    # The tip touches where its slope u/R equals the slope of the surface.
     steepest = np.abs(np.diff(height, axis=0)).max() / pitch_um
     reach = int(np.ceil(1.5 * radius_um * steepest / fine_um)) + 1
     rows = height.shape[0]
@@ -86,7 +86,7 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
 
 
 def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
-    """Apply first-order feedback along the lines, which loses the surface more easily on falling edges."""
+    """Apply first-order feedback along the lines; it follows falling edges more slowly than rising ones."""
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
     at = height[:, 0].copy()

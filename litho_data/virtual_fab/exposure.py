@@ -45,7 +45,7 @@ def accumulate_dose(
         knobs: effects on the dose.
         relative_dose: two-photon dose of this print relative to the recipe's.
         order: place in the print order, −0.5 (first) to 0.5 (last).
-        scan_index: number of the scan, for draws that are new in every scan.
+        scan_index: number of the scan, for random draws that differ from scan to scan.
     """
     nominal = canvas.level / (printer.levels - 1)
     if strength := knobs["unseen-neighbours"]:
@@ -87,16 +87,17 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Expose every point of a hatch line at x + strength·x(1 − x/L), where 0 ≤ x ≤ L is the write field."""
+    """Expose every point x of a hatch line at x + strength·x(1 − x/L), with 0 ≤ x ≤ L in the write field."""
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point that is written here is the root of x + strength·x(1 − x/L) = at that vanishes at 0.
+    # The point x that is written at ``at`` solves x + strength·x(1 − x/L) = at; of the two roots, it is the
+    # one that is 0 for at = 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
     rows, columns = np.indices(nominal.shape, dtype=float)
     meant = columns + (meant_um - inside) / canvas.pitch_um
-    # The spot smooths the overshoot of a cubic at the edges of levels.
+    # The cubic interpolation overshoots at the edges of levels. The spot smooths this overshoot.
     return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
 
 

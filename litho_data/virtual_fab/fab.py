@@ -1,4 +1,4 @@
-"""The fab: a printer and a microscope with their knobs and noise; a field goes in, a scan comes out."""
+"""The fab: a printer and a microscope with their knobs and noise, which make a scan from a field."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs, their noise, and a cause that is not a knob."""
+    """A printer and a microscope with their knobs and noise, and optionally an effect that is not a knob."""
 
     printer: Printer
     microscope: Microscope

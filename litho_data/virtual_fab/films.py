@@ -29,7 +29,8 @@ _FINER, _AROUND = 4, 64
 # Rim of a random layout without film, px.
 _RIM_PX = 12
 _RESIST = 30.0
-# Points along each side of the source. With 9, edges are displaced by 1.5 nm; with 21, by 0.5 nm.
+# Number of points along each side of the source. With 9 points, edges are displaced by 1.5 nm, and with 21
+# points by 0.5 nm.
 _SOURCE_POINTS = 21
 _CARD = """name = "virtual-{process}"
 title = "Simulated films of the process {process}, with simulated micrographs"
@@ -211,8 +212,8 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """Make a random layout with a bare rim, uint8 (ny, nx) of 0 and 1, of features that the process resolves;
-    a third are fine.
+    """Make a random layout with a bare rim, uint8 (ny, nx) of 0 and 1. The process resolves its features;
+    ``finer`` makes them finer, and the films of a run use 0, 1 and 2 in turn.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)

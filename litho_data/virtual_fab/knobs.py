@@ -45,7 +45,7 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """Return the largest strength as text, without a unit if that is 1."""
+        """Return the largest strength as text, without the unit if the unit is 1."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 

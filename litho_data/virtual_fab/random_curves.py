@@ -12,7 +12,7 @@ _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# A 0.2 µm spot writes nothing that changes faster than this along the line.
+# A 0.2 µm spot writes no structure along the line that is smaller than this.
 _SMOOTH_UM = 0.06
 
 

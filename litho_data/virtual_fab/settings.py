@@ -95,7 +95,7 @@ class Noise:
 
     @classmethod
     def off(cls) -> Noise:
-        """No noise at all."""
+        """Return settings without any noise."""
         return cls(0.0, 0.0, 0.0, 0.0, 0.0)
 
 

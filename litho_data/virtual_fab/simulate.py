@@ -55,9 +55,9 @@ def simulate(
         size_px: size of a layout, pixels (one number, or ny and nx).
         seed: seed of every random draw of the run.
         knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
-        cause: an effect of your own that is no knob; the truth file does not know it.
-        noise: ``default``, ``off``, or own standard deviations.
-        microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or own values.
+        cause: an effect of your own that is not a knob; the truth file does not record it.
+        noise: ``default``, ``off``, or your own standard deviations.
+        microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or your own values.
         fields_per_print: fields that share a print block.
         write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
         references: add scans of a bare substrate, a flat print and a five-step print.
@@ -134,7 +134,7 @@ def simulate(
             levels=fab.printer.levels,
             scan_size_um=scan.frame.size_um,
             scan_format=fab.microscope.files,
-            # Tilt and bow are among the effects that are planted.
+            # Levelling would remove tilt and bow, which are among the simulated effects.
             levelled=True,
             **tables,
         )
@@ -143,7 +143,7 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """Write one scan as its microscope would."""
+    """Write one scan in the file format of its microscope."""
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
         write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
@@ -151,7 +151,7 @@ def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
         write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
-# Not turned, in trace, with the first tip and the pixel size of the layout.
+# The usual values: not rotated, in trace, with the first tip and the pixel size of the layout.
 AS_EVER = (0.0, 1.0, 1.0, 1.0)
 
 

@@ -20,7 +20,9 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """A strength and its rms. ``rms_nm`` is smaller than requested if the knob's range does not reach it."""
+    """A knob's strength and the rms ``rms_nm`` that it causes. The rms is smaller than requested if the
+    knob's range is too small.
+    """
 
     setting: KnobSetting
     rms_nm: float
@@ -61,7 +63,7 @@ def strength_for_rms(
         strength = min(rms_nm, highest)
         return KnobStrength(KnobSetting(name, strength, seed), strength)
     at_limit = measured(highest)
-    # Remainders of the size of float32 rounding are no trace of the effect.
+    # Residuals of the size of float32 rounding do not count as an effect.
     if at_limit < 1e-3:
         raise InputError(
             f"knob {name}", got="no trace in addition to offset, gain, plane and bow", wanted="another knob"
@@ -80,8 +82,8 @@ def search_strength(
     at_highest: float,
     precision: float = _RELATIVE_PRECISION,
 ) -> tuple[float, float]:
-    """Find the strength below ``highest`` at which a growing measure reaches ``wanted``; also return the
-    measure there.
+    """Find the strength below ``highest`` at which a measure that grows with the strength reaches ``wanted``;
+    also return the measure there.
 
     Args:
         measured: gives the measure at a strength; ``at_highest``: the measure at ``highest``, above
@@ -117,7 +119,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Subtract from ``change`` its least-squares fit by the prediction and a quadratic surface; keep the
+    """Return ``change`` minus its least-squares fit by the prediction and a quadratic surface, in the same
     shape.
     """
     y, x = (

@@ -1,4 +1,6 @@
-"""The record of what a simulated run hides from the build: knobs, warps, clean prints and the noise floor."""
+"""The record of everything that the build of a simulated run must not know: knobs, warps, clean prints and
+the noise floor.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,7 @@ class KnobTruth(Record):
 
 
 class ScanTruth(Record):
-    """One scan: its position, its datum, and the remaining error of perfect models of print and
+    """One scan: its position, its datum, and the error that remains with perfect models of print and
     microscope.
     """
 

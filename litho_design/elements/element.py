@@ -1,6 +1,4 @@
-"""A printed element as a differentiable module: levels become printed heights, and these a wave behind the
-resin.
-"""
+"""A printed element as a differentiable module: levels become printed heights, and heights become a wave."""
 
 from __future__ import annotations
 
@@ -46,15 +44,16 @@ class Element(nn.Module):
         surroundings: refractive index above the relief.
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
         kind: ``thin``, or ``thick`` for the wave propagation method through the relief, in air.
-        tile_px: elements larger than this are printed in overlapping tiles. The gradient computes the tiles
-            again, so memory grows with the tile, not with the element; None prints in one piece.
+        tile_px: elements larger than this are printed in overlapping tiles. The backward pass
+            recomputes the tiles, so memory grows with the tile, not with the element. None prints in one
+            piece.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
     Raises:
-        InputError: what ``load_printer`` refuses, a printer without gradients, a resin whose index is not
-            above that of the surroundings, tiles for a model that depends on the position, or a thick element
-            that is not in air.
+        InputError: ``load_printer`` refuses the model, the printer has no gradients, the index of the resin
+            is not above that of the surroundings, tiles are requested for a model that depends on the
+            position, or a thick element is not in air.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class Element(nn.Module):
 
         Args:
             field: the wave on the pixels of the layout, complex (..., size, size).
-            wavelength_um: in vacuum.
+            wavelength_um: wavelength in vacuum.
             height_um: a known print (size, size), such as a measured one, instead of the print of the levels.
         """
         height = self.height_um() if height_um is None else height_um
@@ -138,7 +137,7 @@ class Element(nn.Module):
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
-        """Start from a layout (size, size), whole or real levels."""
+        """Set the free levels to those of a layout (size, size), whole or real."""
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
@@ -159,7 +158,7 @@ class Element(nn.Module):
             unit_um: that unit in µm; 1e6 for metres.
 
         Raises:
-            InputError: torchoptics is not installed, or a thick element, which is no complex factor.
+            InputError: torchoptics is not installed, or the element is thick and so is no complex factor.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement

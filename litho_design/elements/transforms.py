@@ -26,7 +26,7 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
         return printed
 
 
-# This is the mark that ``torch.compiler.disable`` sets; importing that function would take two seconds.
+# ``torch.compiler.disable`` sets this attribute; to import that function would take two seconds.
 printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
 
 

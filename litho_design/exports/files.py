@@ -155,7 +155,7 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
     """Return the level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
 
     Raises:
-        InputError: no sidecar, or a file that was changed.
+        InputError: there is no sidecar, or the file was changed.
     """
     path = Path(file)
     sidecar = read_sidecar(path)

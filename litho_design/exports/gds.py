@@ -32,12 +32,12 @@ def write_gds(
 
     Layer k contains {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0). Runs
     along a row are merged with equal runs in the rows below, so every shape is a rectangle. The cell LAYOUT
-    refers to one cell per part, each of these to one cell per 128 rows, and each of those to blocks of 128
-    pixels. Equal blocks share a cell. Only the shapes of one block are in memory at a time.
+    refers to one cell per part. The cell of a part refers to one cell per 128 rows, and these cells refer to
+    blocks of 128 pixels. Equal blocks share a cell. Only the shapes of one block are in memory at a time.
 
     Args:
-        parts: first and last row, first and last column of each part by name; by default the whole map is
-            ELEMENT.
+        parts: first and last row, first and last column of each part, by name. By default, the only part is
+            ELEMENT, the whole map.
     """
     import gdstk
 

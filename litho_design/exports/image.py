@@ -24,7 +24,7 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
     """Return the grey of each level: linear in height, with as many grey values per level as ``bits`` allow.
 
     Raises:
-        InputError: more levels than grey values.
+        InputError: there are more levels than grey values.
     """
     step = (2**bits - 1) // (layout.levels - 1)
     if step < 1:
@@ -36,10 +36,11 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
     """Return the greys whose measured heights equal those of the levels, up to a constant height.
 
     Args:
-        curve: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
+        curve: CSV with the columns ``grey`` and ``height_um``, both rising, such as from a dose matrix.
 
     Raises:
-        InputError: no such table, a level beyond the heights, or two levels of one grey.
+        InputError: there is no such table, a level lies beyond the measured heights, or two levels have the
+            same grey.
     """
     try:
         table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))

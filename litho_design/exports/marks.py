@@ -24,8 +24,8 @@ class Marks(Record):
     """Positions of element, mark and witness in an exported map: first and last row, first and last column,
     in pixels.
 
-    ``witness_height_um`` is the height that the design's model predicts for the middle of the witness over
-    the ground.
+    ``witness_height_um`` is the height above the ground that the design's model predicts for the middle of
+    the witness.
     """
 
     element_px: Box
@@ -55,7 +55,7 @@ def with_marks(
         Levels uint8 (size, wider), and the positions of the parts.
 
     Raises:
-        InputError: an element with less height in the map than mark and witness together.
+        InputError: the element is less high in the map than mark and witness together.
     """
     cell = 1 if layout.symmetry == "radial" else layout.cell_px
 

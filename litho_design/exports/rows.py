@@ -54,7 +54,7 @@ def layout_rows(folder: str | Path) -> LevelRows:
     disk.
 
     Raises:
-        InputError: no design, or levels that changed after it.
+        InputError: there is no design, or its levels changed after it was written.
     """
     if Design.read(folder).in_rings:
         return RingRows(read_array(folder, RINGS_FILE))

@@ -68,7 +68,7 @@ class Sidecar(Result):
 
 
 def cell_of(layout: LayoutSettings) -> int:
-    """Return the side, in pixels, of the squares of one level; a ring layout has none."""
+    """Return the side, in pixels, of the square cells of a layout; a ring layout has none."""
     return 1 if layout.symmetry == "radial" else layout.cell_px
 
 
@@ -112,7 +112,7 @@ def read_sidecar(file: Path) -> Sidecar:
     """Read the sidecar of an exported file and check the file against it.
 
     Raises:
-        InputError: no sidecar, or a file that was changed after the export.
+        InputError: there is no sidecar, or the file was changed after the export.
     """
     sidecar = Sidecar.read(sidecar_path(file))
     if file_sha256(file) != sidecar.file_sha256:

@@ -31,7 +31,7 @@ def write_stl(
         pedestal_um: base under level 0, above 0.
 
     Raises:
-        InputError: no pedestal: level 0 would have no volume.
+        InputError: there is no pedestal, so level 0 would have no volume.
     """
     if pedestal_um <= 0:
         raise InputError(
@@ -111,7 +111,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     south, north = cells[row, column + 1], cells[row + 1, column + 1]
     low, high = np.minimum(south, north), np.maximum(south, north)
     ends = []
-    # This is the direction of the higher cell as seen from the western and from the eastern end.
+    # These are the directions of the higher cell, seen from the western and the eastern end of a wall.
     for point, place in (
         (np.stack([row, column], 1), np.where(north > south, 3, 1)),
         (np.stack([row, column + 1], 1), np.where(north > south, 2, 0)),

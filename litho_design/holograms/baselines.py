@@ -55,8 +55,7 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Find a phase with the most power on the signal {T > 0.5}, starting from a print (size, size); return
-    that power.
+    """Return the largest power on the signal {T > 0.5} that a search over phases finds from a print.
 
     Each step is u <- exp(j arg P^H S P u), where S selects the signal; every pixel has its own phase. P^H S P
     is positive, so no step reduces the power, and the result is never below that of the print.

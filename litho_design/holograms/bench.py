@@ -23,7 +23,7 @@ from litho_design.images.similarity import (
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
-# A 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its own.
+# A 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its camera.
 _CAMERA_PITCH_UM, _CAMERA_NA = 0.345, 0.3
 
 Waves = Sequence[tuple[float, Tensor]]
@@ -66,8 +66,8 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """The score with a signal window: light outside the window is free in the loss, but counts as an error in
-    the other figures.
+    """The score with a signal window: the loss ignores light outside the window, but the other figures
+    count it as an error.
     """
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
@@ -106,7 +106,7 @@ def hologram_score(
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Return a target (m, m) at the resolution of an element of the same size, real (m, m).
 
-    The target is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
+    The target is convolved with the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
     where NA is the sine of the angle from the axis to the edge. Beyond the window it is dark.
     """
     blurs = []

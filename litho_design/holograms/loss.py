@@ -14,8 +14,8 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Select the pixels (size, size) near the wanted light, which count in the error; None stands for all
-    pixels.
+    """Return the mask (size, size) of the pixels near the wanted light, which count in the error; None for
+    all.
     """
     if not settings.signal_window_um:
         return None

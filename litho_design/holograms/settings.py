@@ -21,8 +21,8 @@ from litho_design.printers.layout import LayoutSettings
 class HologramLoss(Record):
     """RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
-    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error; light
-    beyond them is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
+    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error. The
+    error ignores light beyond them (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
     doi:10.1364/OE.16.002176). ``scale`` says how the image is matched to the target: ``paper`` divides by the
     mean over the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is
     the share of the incident power on pixels whose target is above zero.

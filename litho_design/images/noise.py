@@ -28,8 +28,9 @@ def white_noise(values: np.ndarray) -> float:
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Return the noise of a photograph (ny, nx): its sd in the dark, and its sd as a share of the light, as
-    speckle has.
+    """Return the noise of a photograph (ny, nx): its sd in the dark, and its sd as a share of the light.
+
+    Speckle, for example, is proportional to the light.
 
     The variance of the highest frequencies is fitted as (sd in the dark)^2 + (share)^2 times the squared
     light.

@@ -22,7 +22,7 @@ from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
-# Largest share of pixels at an end of their range; more would change the similarity of an image.
+# Largest allowed share of saturated or dark-clipped pixels. A larger share would change the similarity.
 _LARGEST_SATURATED = 0.01
 # Prints close to the expected one give apparent exponents of counts over light of 0.9 to 1.1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
@@ -100,12 +100,12 @@ class Photograph:
 
     Attributes:
         counts: cleaned, upright counts without the dark level (ny, nx).
-        window_to_photo: projective map (3, 3) from window pixels to its pixels.
+        window_to_photo: projective map (3, 3) from window pixels to photograph pixels.
         side_px: side of the window.
         pitch_um: pixel of the window.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
-        expected: counts (m, m) that replace what lies beyond the photograph.
+        expected: counts (m, m) for the pixels that lie beyond the photograph.
     """
 
     counts: np.ndarray
@@ -176,9 +176,9 @@ def photographed_image(
     The dark level is subtracted, and single hot or dead pixels are replaced by their neighbours' median. Then
     a model of the camera (shifted, turned and, if needed, tilted) is fitted by least squares to the expected
     image, with free gain and background. The scale follows from the pitch unless the pitch has an
-    uncertainty; otherwise an image that is too large because of the print would be blamed on the camera. All
-    eight orientations are tried, and a photograph that fits another orientation better than ``orientation``
-    is refused.
+    uncertainty; otherwise an image that is too large because of the print would be attributed to the camera.
+    All eight orientations are tried, and a photograph that fits another orientation better than
+    ``orientation`` is refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
@@ -187,8 +187,8 @@ def photographed_image(
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
 
     Raises:
-        InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
-            is overexposed, not linear, unlike the expected image, mirrored or turned.
+        InputError: the file is no image, the pitch is not positive, the orientation is unknown, or the
+            photograph is overexposed, not linear, unlike the expected image, mirrored or turned.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -423,7 +423,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         at[columns] += found.x * unit[columns]
         return at, found
 
-    # The fit goes from coarse to fine, because the fine structure of an image has false maxima beside the
+    # The fit goes from coarse to fine, because the fine structure of an image has false optima next to the
     # right one.
     for more in (4 * blur_px, 0.0):
         images = smooth, fixed
@@ -516,7 +516,7 @@ def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Shift (x, y) of ``moving`` (n, n) in whole pixels, by the maximum of the correlation."""
+    """Return the shift (x, y) of ``moving`` (n, n) in whole pixels, at the maximum of the correlation."""
     correlation = correlate(moving - moving.mean(), reference - reference.mean(), method="fft")
     y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)
     return np.array([x, y]) - (len(reference) - 1)

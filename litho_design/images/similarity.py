@@ -33,7 +33,7 @@ def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
 def ssim(image: Tensor, target: Tensor) -> float:
     """Return the structural similarity of two images in [0, 1], the mean of ``ssim_map``.
 
-    Windows that reach over the edge do not count.
+    Windows that extend beyond the edge do not count.
     """
     edge = SSIM_WINDOW_PX // 2
     found = ssim_map(image.double().cpu().numpy(), target.double().cpu().numpy())

@@ -65,7 +65,7 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
             square; or an array (size_px, size_px) in [0, 1], used unchanged.
 
     Raises:
-        InputError: not a drawing, not a readable image, or an image without light.
+        InputError: the source is neither a drawing nor a readable image, or the image has no light.
     """
     if isinstance(source, Target):
         return source
@@ -172,7 +172,7 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
     each.
 
     Raises:
-        InputError: no file, or not a readable image.
+        InputError: the file does not exist or is not a readable image.
     """
     import cv2
 
@@ -203,7 +203,7 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
         float32 (size, size) in [0, 1], and the conversions, one phrase each.
 
     Raises:
-        InputError: not a readable image, values that are not numbers, or no light.
+        InputError: the image is not readable, has values that are not numbers, or has no light.
     """
     import cv2
 

@@ -63,7 +63,7 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # The types are in order of their number of fields; your own task has the fields common to all designs.
+    # The types are ordered by their number of fields. Your own task has the fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]

@@ -38,10 +38,10 @@ class LoadedDesign:
 
     Attributes:
         folder: folder of the design.
-        record: what ``design.json`` holds.
+        record: the contents of ``design.json``.
         level: layout (size, size).
         expected_um: height (size, size), µm, of the print that the design expects.
-        task: what the layout was designed for.
+        task: the task that the layout was designed for.
         target: wanted image (size, size) of a hologram; None for other tasks.
         bench: the optics, from a height map to an image or a PSF.
 
@@ -50,7 +50,7 @@ class LoadedDesign:
             levels and heights along a radius instead of a plane.
         device: where prints and waves are computed.
         element: ``thin`` or ``thick`` instead of the design's own (see ``Optics``).
-        band_px: most rows of a band, to print and score a large hologram band by band.
+        band_px: largest number of rows of a band, to print and score a large hologram band by band.
 
     Raises:
         InputError: an incomplete or altered folder, a task that is not registered here, a device that this
@@ -116,7 +116,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def image(self, height_um: Tensor) -> np.ndarray:
-        """Image or PSF behind a print: share of the incident power per pixel."""
+        """Return the image or PSF behind a print, as the share of the incident power per pixel."""
         return self.bench(height_um).cpu().numpy()
 
     def score(self, height_um: Tensor) -> Record:
@@ -148,6 +148,6 @@ def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> Lo
     """Return the finished design in ``folder``, ready to be printed and scored on ``device``.
 
     Raises:
-        InputError: what ``LoadedDesign`` refuses.
+        InputError: ``LoadedDesign`` refuses the folder or the device.
     """
     return LoadedDesign(folder, device=device)

@@ -24,7 +24,7 @@ _SMALLEST_COVERAGE = 0.8
 # Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# Dust is higher than random errors of a print and wider than a step.
+# Dust deviates more than random errors of a print, and over a wider area than a displaced step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # This share of the change that the tip causes remains uncertain.
 _TIP_SD = 0.3
@@ -85,8 +85,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
     set so that the medians of measured and designed print agree. Tilt and bow of the scanner are fitted
-    together with the designed print, so that nothing of its own shape is removed. Unmeasured pixels take
-    their values from the designed print.
+    together with the designed print, so that no part of the shape of the design is removed. Unmeasured pixels
+    take their values from the designed print.
 
     Args:
         loaded: the design.
@@ -96,7 +96,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         Height (size, size), µm, and its record.
 
     Raises:
-        InputError: a scan that cannot be registered, covers too little of the element, or does not
+        InputError: the scan cannot be registered, covers too little of the element, or does not
             resemble the print that the design expects.
     """
     from litho_data.readers import read_scan

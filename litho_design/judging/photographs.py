@@ -80,8 +80,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     """Score a photograph of a printed hologram's image.
 
     Raises:
-        InputError: what ``photographed_image`` refuses, an incident power that is not positive, an object in
-            front of a hologram, or noise that makes the score too uncertain.
+        InputError: ``photographed_image`` refuses the photograph, the incident power is not positive, an
+            object is given for a hologram, or noise makes the score too uncertain.
     """
     assert loaded.target is not None
     if source.imaged is not None:
@@ -155,12 +155,12 @@ def score_lens_photo(
     Args:
         loaded: a lens's design.
         source: an upright photograph (a lens turns its image by half a turn), or one whose
-            ``orientation`` says how it lies.
+            ``orientation`` says how to turn it upright.
         printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
 
     Raises:
-        InputError: no object, an unknown object, a name that two objects share, or what
-            ``photographed_image`` refuses.
+        InputError: there is no object, the object is unknown, two objects share its name, or
+            ``photographed_image`` refuses the photograph.
     """
     assert isinstance(loaded.task, LensTask)
     wanted, which = _object(loaded.task, source.imaged)

@@ -127,7 +127,7 @@ def judge_design(
             with ``scan`` it is deconvolved with the PSF of the measured print too.
 
     Raises:
-        InputError: a measurement that does not match the design.
+        InputError: a measurement does not match the design.
     """
     scores, pictures = [], {"in design": loaded.image(loaded.expected_um)}
     printed_um: Tensor | None = None

@@ -1,7 +1,7 @@
 """Bands of rows, in which a large element is printed and transformed.
 
-The bands depend only on the layout: an element has the same bands with the same numbers, whether one process
-or many compute them.
+The bands depend only on the layout. An element has the same bands, numbered in the same way, whether one
+process or many compute them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ class Bands:
 
     Args:
         size_px: side of the element.
-        most_px: most rows of a band; all bands have the same number, only the last may have fewer.
+        most_px: largest number of rows of a band. All bands have the same number of rows, except that the
+            last may have fewer.
         ranks: the processes.
         cell_px: side of a free cell; no band cuts a cell.
 
     Raises:
-        InputError: more processes than bands.
+        InputError: there are more processes than bands.
     """
 
     size_px: int
@@ -74,7 +75,7 @@ class Bands:
         """Refuse bands so narrow that a row would lie in the halos of two other bands.
 
         Raises:
-            InputError: fewer rows than twice the halo, or than the halo in the last band.
+            InputError: a band has fewer rows than twice the halo, or the last one fewer than the halo.
         """
         last = self.size_px - (self.count - 1) * self.band_px
         if self.count > 1 and (self.band_px < 2 * halo or last < halo):
@@ -108,7 +109,7 @@ def require_reach(printer: Printer) -> None:
     """Refuse a printer that cannot print an element in parts.
 
     Raises:
-        InputError: a print that depends on the whole image or on the position in the write field.
+        InputError: the print depends on the whole image or on the position in the write field.
     """
     whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     if whole or printer.depends_on_position:

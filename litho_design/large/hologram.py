@@ -51,7 +51,7 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 
 
 class BandedHologram(HologramTask):
-    """A hologram whose rows are shared by several processes; each process computes the loss of the whole.
+    """A hologram whose rows several processes share; each process computes the loss of the whole element.
 
     All processes run this task with the same arguments and share the file system of the folder. The resulting
     layout does not depend on their number.
@@ -60,7 +60,7 @@ class BandedHologram(HologramTask):
         settings: settings of the hologram; those of its search are checked by ``only``.
         printer: frozen model with a finite reach, or nominal heights.
         bands: bands of the element.
-        inputs: ``target``, the wanted image (size, size) in [0, 1], in memory or on disk.
+        inputs: contains ``target``, the wanted image (size, size) in [0, 1], in memory or on disk.
         record: source of the target.
 
     Raises:
@@ -96,8 +96,8 @@ class BandedHologram(HologramTask):
         self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
-        """Return the hash of inputs and bands. The bands are included because they decide the rounding of
-        sums and so the layout.
+        """Return the hash of inputs and bands. The bands are included because they decide how sums
+        are rounded, and therefore the layout.
         """
         return f"bands of {self.bands.band_px}"
 
@@ -120,7 +120,7 @@ class BandedHologram(HologramTask):
         size).
         """
         loss, parts = super().objective(level)
-        # Every process has the whole loss, but the gradient must count it once.
+        # Every process returns the whole loss, but the gradient must count it once.
         return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
@@ -180,7 +180,7 @@ def only(settings: Record, values: dict[str, Any]) -> None:
     """Refuse settings, by path, that a large element does not support.
 
     Raises:
-        InputError: a value other than the one in ``values``.
+        InputError: a setting has another value than the one in ``values``.
     """
     for path, wanted in values.items():
         given: Any = settings

@@ -1,5 +1,4 @@
-"""Design a lens of any size ring by ring: a strip along one radius is printed, and a wave of rings
-propagated.
+"""Design a lens of any size ring by ring: only a strip along one radius is printed and propagated.
 
 The plane is never computed, because an element of 10 mm has 10¹⁰ pixels but only 50,000 rings of 0.1 µm.
 """
@@ -78,7 +77,7 @@ class RingLens(DirectLensTask):
         require_reach(printer)
 
     def inputs_sha256(self) -> str:
-        """Return a constant, because nothing but the settings decides the layout."""
+        """Return a constant, because the layout depends only on the settings."""
         return "rings"
 
     def make_cells(self) -> CellMap:

@@ -33,7 +33,7 @@ class BandedPropagator:
 
     Args:
         pitch_um: pixel, µm.
-        optics: wavelength, distance, kind of propagation.
+        optics: wavelength, distance and kind of propagation.
         bands: bands of the element.
 
     Raises:
@@ -73,7 +73,7 @@ class BandedPropagator:
         for block in self._blocks:
             wave = torch.fft.fft(columns[:, block].T.contiguous(), n=self.length)
             half, rest = self._transfer[block], self.length - self.length // 2 - 1
-            # Above the middle frequency the same numbers follow in reverse.
+            # Above the middle frequency, the values of the even kernel repeat in reverse order.
             mirrored = half[:, 1 : rest + 1].flip(1)
             wave[:, : half.shape[1]] *= half.conj() if conjugate else half
             wave[:, half.shape[1] :] *= mirrored.conj() if conjugate else mirrored

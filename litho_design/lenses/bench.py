@@ -26,7 +26,7 @@ CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """What the benches of a plane and of rings share: aperture, focal window and perfect lens."""
+    """The common part of the benches of a plane and of rings: aperture, focal window and perfect lens."""
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
@@ -145,8 +145,8 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
     """Return sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
 
-    Photon noise is also Gaussian, with the variance of Poisson noise; the gradient treats its size as
-    constant.
+    Photon noise is also Gaussian, with the variance of Poisson noise. The gradient treats its standard
+    deviation as constant.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)

@@ -32,7 +32,7 @@ def object_stack(
         pictures: float32 (size, size) in [0, 1] of each picture among the objects, in their order.
 
     Raises:
-        InputError: a picture whose pixels are missing, or have another size.
+        InputError: the pixels of a picture are missing or have another size.
     """
     border, brought, frames = size_px // _BORDER_SHARE, iter(pictures), []
     for item in objects:
@@ -58,8 +58,8 @@ def with_objects(
     only scored. Without ``objects``, the design uses the drawings.
 
     Returns:
-        The settings, with name, SHA-256 and conversion of each picture, and the pixels as inputs of the task;
-        without paths, unchanged settings and no inputs.
+        The settings, which contain the name, SHA-256 and conversion of each picture, and the pixels as inputs
+        of the task. Without paths, the settings are unchanged and there are no inputs.
 
     Raises:
         InputError: a task that images no objects, a file that is not a picture, a picture without light or
@@ -114,7 +114,7 @@ def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
         float32 (size, size) in [0, 1], and its record.
 
     Raises:
-        InputError: not a picture, or one without light.
+        InputError: the file is not a picture, or the picture has no light.
     """
     border = size_px // _BORDER_SHARE
     inner, notes = read_image(path, size_px - 2 * border, "object")

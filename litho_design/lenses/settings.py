@@ -48,8 +48,8 @@ class ImagingSettings(Record):
 
     An object is the name of a drawing or the record of a picture (see ``with_objects``). ``read_noise`` is
     the standard deviation relative to a white object behind a lens that focuses all light; the paper does not
-    state its own. The image of an object is ``object_px * pixel_px`` pixels of the layout wide, and light
-    outside the PSF window does not reach it.
+    state its read noise. The image of an object is ``object_px * pixel_px`` pixels of the layout wide, and
+    light outside the PSF window does not reach it.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)

@@ -36,7 +36,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
-# Figures that make sense even if nothing focuses.
+# Figures that are defined even if the lens does not focus.
 _OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
 # The noise is the same in every iteration, so that the search compares layouts, not noise; scores draw other
 # noise.

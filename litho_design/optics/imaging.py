@@ -9,8 +9,8 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Number of steps in a block that the gradient computes again. If all steps fit into the memory below, they
-# are kept instead: about twenty values per pixel and step.
+# Number of steps in a block that the backward pass recomputes. If all steps fit into the memory below, at
+# about twenty values per pixel and step, they are kept instead.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
@@ -22,7 +22,7 @@ class Blur:
     The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
     Args:
-        psf: real (k, k), any energy; its gradient is kept.
+        psf: real (k, k) with any sum; gradients flow to it.
         frame: (ny, nx) of the object and of the recorded image.
     """
 
@@ -62,7 +62,7 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tens
     """Estimate the object behind a recorded image.
 
     e <- e * H^T (b / H e) / (H^T 1), from a flat start of the right flux (Richardson 1972, Lucy 1974). The
-    division by H^T 1 makes the result correct at the borders and for a PSF of any energy: the estimate
+    division by H^T 1 makes the result correct at the borders and for a PSF with any sum: the estimate
     approaches the object itself, and sum(H e) = sum(b) after every step.
 
     Args:
@@ -70,8 +70,8 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tens
         psf: real (k, k) of odd sides, on the same pixels.
 
     Returns:
-        Estimate (..., ny, nx); gradients flow to both arguments. For large images the gradient computes the
-        steps again, block by block, so memory does not grow with ``iterations``.
+        Estimate (..., ny, nx); gradients flow to both arguments. For large images the backward pass
+        recomputes the steps block by block, so memory does not grow with ``iterations``.
     """
     blur = Blur(psf, (int(recorded.shape[-2]), int(recorded.shape[-1])))
     seen = recorded.clamp(min=_DARKEST)

@@ -66,8 +66,9 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return into how many equal parts the first and the second pitch are divided; None if too many are
-    needed.
+    """Return the numbers of equal parts into which the first and the second pitch are divided.
+
+    Return None if too many parts are needed.
     """
     found = Fraction(pitches).limit_denominator(_LARGEST_RATIO)
     if found.numerator > _LARGEST_RATIO or abs(found / Fraction(pitches) - 1) > 1e-12:

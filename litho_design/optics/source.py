@@ -30,7 +30,7 @@ def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]
         size_um: side of the element.
 
     Raises:
-        InputError: a source too wide, or with too many colours, for an element of this resolution.
+        InputError: the source needs too many directions or colours for an element of this resolution.
     """
     directions = _directions(optics, size_um)
     return [
@@ -59,7 +59,7 @@ def _directions(optics: Optics, size_um: float) -> list[tuple[float, float]]:
     area = math.pi * (optics.source_sine * size_um / optics.wavelength_um) ** 2
     count = _checked(max(_FEWEST, math.ceil(_POINTS_PER_AREA * area)), "width")
     number = np.arange(count)
-    # The points are arranged like the seeds of a sunflower, so that each has the same area.
+    # The points lie on a sunflower spiral, so that each covers the same area.
     disc = optics.source_sine * np.sqrt((number + 0.5) / count) * np.exp(1j * _GOLDEN_ANGLE * number)
     disc += complex(*middle) - disc.mean()
     return [(one.real, one.imag) for one in disc.tolist()]

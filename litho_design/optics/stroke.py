@@ -1,4 +1,4 @@
-"""The stroke of a print: how much light its staircase of levels can send into a diffraction order."""
+"""The stroke of a print, and how much light a staircase with this stroke sends into a diffraction order."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ _SLICES_PER_WAVELENGTH = 20
 def wave_through_relief(
     field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
 ) -> Tensor:
-    """Return the wave behind a relief, from the wave at its foot; the result is carried back to the foot, as
-    for a thin element.
+    """Return the wave behind a relief, from the wave at its foot; the result is propagated back to the
+    foot, as for a thin element.
 
     In every slice the wave is propagated by the angular spectrum twice, in the resist and in air, and each
     pixel takes the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the

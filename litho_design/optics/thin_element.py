@@ -11,9 +11,9 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
-# A shorter or longer wavelength was probably given in metres or nanometres.
+# A wavelength outside this range was probably given in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
-# Border around the element: how far light spreads within the height of a relief.
+# Width of the border around the element; light spreads no farther within the height of a relief.
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:

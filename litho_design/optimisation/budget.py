@@ -44,7 +44,7 @@ def measure_budget(
     search: SearchSettings,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Budget:
-    """Time one iteration with gradient and one without, at the present parameters."""
+    """Time one iteration with gradient and one without, at the current parameters."""
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()

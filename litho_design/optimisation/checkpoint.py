@@ -58,7 +58,7 @@ def load_checkpoint(
     """Load the parts in place from a checkpoint, and return its state on ``device``.
 
     Raises:
-        InputError: a checkpoint of another task, or a damaged file.
+        InputError: the checkpoint is of another task, or the file is damaged.
     """
     content = _load(path)
     if content["fingerprint"] != fingerprint:
@@ -84,8 +84,9 @@ def checkpoint_path(folder: Path, part: str = "") -> Path:
 
 
 def finished_iterations(folder: Path, ranks: Ranks) -> int:
-    """Return how many iterations of an interrupted run in ``folder`` all its processes have finished; 0
-    without a run.
+    """Return the number of iterations that all processes of an interrupted run in ``folder`` have finished.
+
+    Return 0 if there is no such run.
 
     Raises:
         InputError: the processes differ in their iterations, or their number has changed.

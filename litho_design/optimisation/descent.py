@@ -1,4 +1,4 @@
-"""Plain gradient descent of a few free numbers, for baselines that need no printer."""
+"""Gradient descent on a few free parameters, for baselines that need no printer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 T = TypeVar("T")
 
 
-# Descent needs gradients, even if the caller disabled them, as scores mostly do.
+# Descent needs gradients even if the caller disabled them, as most scores do.
 @torch.enable_grad()
 def descended(
     free: Iterable[Tensor],
@@ -25,7 +25,7 @@ def descended(
 
     Args:
         free: the numbers to change, in place.
-        loss: the loss at their present values, and a result that does not change with them.
+        loss: returns the loss at their current values, and a result that later steps do not change.
         project: called after every step, to bring the numbers back into their range.
     """
     optimiser = torch.optim.Adam(free, lr=rate)

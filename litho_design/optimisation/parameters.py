@@ -16,7 +16,7 @@ from litho_design.printers.layout import LayoutSettings
 # A learning rate of 1 moves a height by one of 13 levels, and by the same share of the height with more or
 # fewer levels.
 _RATE_STEPS = 12
-# Measured in levels, so that the first step can reach the neighbours of the starting level.
+# This width is in levels, so that the first step can reach the neighbours of the starting level.
 _START_SPREAD_LEVELS = 1.0
 
 
@@ -72,7 +72,7 @@ class GumbelLevels(nn.Module):
     A sample is the expected level under the sampled weights (Jang, Gu and Poole 2017, arXiv:1611.01144).
     """
 
-    # Factor on the learning rate; logits have no range, so it is 1.
+    # Factor on the learning rate. It is 1, because logits have no range.
     rate_unit = 1.0
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -170,7 +170,7 @@ def make_parametrisation(
     layout.
 
     Raises:
-        InputError: a filter over cells together with distributions over levels.
+        InputError: a filter over cells is combined with distributions over levels.
     """
     if search.parametrisation == "direct":
         return DirectLevels(layout, cells)

@@ -105,8 +105,7 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels nearest to a lens's ``phase``, after the constant phase shift that loses the least
-    light.
+    """Return the levels nearest to a lens's ``phase`` plus the constant phase that loses the least light.
 
     A stroke below one wave leaves a gap in the phase circle, and a constant phase shift moves this gap. The
     mean of exp(j error) over the cells is the amplitude at the focus.

@@ -20,8 +20,8 @@ def polish_levels(
 ) -> tuple[Tensor, list[float]]:
     """Improve an integer layout by one-level moves of cells; the loss never rises.
 
-    The gradient at the integer layout ranks the moves, and the best share of them is applied at once. This
-    share is halved whenever the true loss of the changed layout does not fall.
+    The gradient at the integer layout ranks the moves, and a share of them, the best ones, is applied at
+    once. This share is halved whenever the true loss of the changed layout does not fall.
 
     Args:
         levels: int64 (*cells).
@@ -52,8 +52,9 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate the gain of the best one-level move of each cell to first order; return gain, move (-1 or +1)
-    and loss.
+    """Estimate the gain of the best one-level move of each cell to first order.
+
+    Return gain, move (-1 or +1) and loss.
     """
     values = levels.float().requires_grad_()
     loss, _ = objective(cells(values)[None, None])

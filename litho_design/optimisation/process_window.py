@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# A print passes if no figure in dB falls further than this below the print as modelled, every other figure
-# keeps this share, and no error grows by more than the inverse of this share.
+# A print passes if no figure in dB falls further than the first value below the print as modelled, every
+# other figure keeps the second value as a share, and no error grows by more than the inverse of this share.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
 # (1e-6 µm)^2 is far below any height and keeps the root differentiable where all models agree.
@@ -216,14 +216,14 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     """Return ``window`` with the spread and correlation of gain and offset of measured prints.
 
     Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound of the
-    spread between prints: it also contains the changing scale of the microscope and what the fit leaves over.
+    spread between prints: it also contains the changing scale of the microscope and the residual of the fit.
     Locked scans are left out, so that a search never depends on them.
 
     Args:
         store: a ``litho_data`` store with at least three scans outside its lock box.
 
     Raises:
-        InputError: too few scans, or layouts without structure.
+        InputError: there are too few scans, or the layouts have no structure.
     """
     locked = store.locked_ids
     fits = []

@@ -20,8 +20,9 @@ class Ranks:
 
     @classmethod
     def joined(cls) -> Ranks:
-        """Join the processes that torchrun started, over gloo for processors and NCCL for GPUs; without
-        torchrun, stay alone.
+        """Join the processes that torchrun started, over gloo for CPUs and NCCL for GPUs.
+
+        Without torchrun, this process is the only one.
         """
         if int(os.environ.get("WORLD_SIZE", "1")) == 1:
             return cls()
@@ -33,7 +34,7 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """Return the name of this process for files that each process writes; empty if it is alone."""
+        """Return the name of this process for files that each process writes; empty for a single process."""
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
     def device(self, device: str | torch.device) -> str | torch.device:

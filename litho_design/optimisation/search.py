@@ -43,7 +43,7 @@ def search_layout(
         objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
         folder: folder of ``checkpoint.pt``; None to run without a checkpoint.
         fingerprint: identifies the task; a checkpoint of another task is refused.
-        part: which part of a shared search this is, in the name of its checkpoint.
+        part: name of this process's part of a shared search, used in the name of its checkpoint.
 
     Returns:
         The state with the kept argmax levels (``best_levels``, per cell), and the history: one record per
@@ -130,7 +130,7 @@ def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) ->
 
 
 def lower_rate(schedule: StepLR | ReduceLROnPlateau, loss: float) -> None:
-    """Tell the scheduler that an iteration is finished, and the loss of its sample."""
+    """Pass the loss of a finished iteration's sample to the scheduler."""
     if isinstance(schedule, ReduceLROnPlateau):
         schedule.step(loss)
     else:

@@ -71,7 +71,7 @@ class SearchSettings(Record):
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The search of the paper for holograms and lenses, each of which adds its own learning rate.
+# The search of the paper. Holograms and lenses each add a different learning rate.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -136,7 +136,7 @@ def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[s
     given one.
 
     Raises:
-        InputError: no such preset, or what ``changed`` refuses.
+        InputError: there is no such preset, or ``changed`` refuses a change.
     """
     given = dict(changes or {})
     variant = given.pop("variant", variant)

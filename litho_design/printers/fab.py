@@ -20,7 +20,7 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# A separate random stream, so that no scan of the run in the truth file has this roughness.
+# A separate random stream, so that this roughness differs from that of every scan of the truth file's run.
 _ROUGHNESS_STREAM = 2
 
 
@@ -79,8 +79,8 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
     """Load the fab of a truth file.
 
     Raises:
-        InputError: no truth file, or a layout with another pitch or level height, or with more levels, than
-            it prints.
+        InputError: there is no truth file, or the layout has another pitch or level height, or more levels,
+            than the fab prints.
     """
     fab = FabSimulator(Truth.read(source))
     asked = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um}

@@ -57,7 +57,7 @@ class LayoutSettings(Record):
         """Return the width of a ring in pixels; it need not be a whole number.
 
         Raises:
-            InputError: rings narrower than a pixel.
+            InputError: rings are narrower than a pixel.
         """
         # 0.7 / 0.1 is a little less than 7, and a pixel on the edge would change its ring.
         width_px = round(self.cell_um / self.pitch_um, 9)
@@ -71,7 +71,7 @@ class LayoutSettings(Record):
         """Return the number of pixels along the side of a cell.
 
         Raises:
-            InputError: cells that are not a whole number of pixels, or that do not fill the element.
+            InputError: cells are not a whole number of pixels, or do not fill the element.
         """
         cell_px = round(self.cell_um / self.pitch_um)
         if cell_px < 1 or abs(cell_px * self.pitch_um - self.cell_um) > 1e-9 or self.size_px % cell_px:

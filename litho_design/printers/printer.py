@@ -26,8 +26,8 @@ Precision = Literal["float32", "bfloat16"]
 class TilingCheck(Record):
     """Difference between a print computed as a whole and the same print in tiles.
 
-    For models with a finite reach the difference is rounding; for others (a Fourier operator) it is an error
-    of the model.
+    For models with a finite reach the difference is only rounding. For others, such as a Fourier operator,
+    the difference is an error of the model.
     """
 
     tile_px: int
@@ -100,7 +100,7 @@ class Printer(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Return the device of the model or, without a model, that of the waves."""
+        """Return the device of the model or, without a model, the device of the waves."""
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ class Printer(nn.Module):
         """Print levels that include the printer's halo on all sides, tile by tile; return the height, µm (b,
         1, y, x).
 
-        The gradient prints each tile again, so memory grows with ``tile_px`` instead of the element. For
+        The backward pass prints each tile again, so memory grows with ``tile_px`` instead of the element. For
         models of finite reach the result equals that of ``forward`` up to rounding; for others
         ``tiling_check`` measures the difference.
         """
@@ -159,7 +159,8 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Starts are odd, because a tile at a multiple of the model's own tile would be compared with itself.
+        # Tiles start at odd pixels, because a tile that coincides with a tile of the model would be compared
+        # with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):

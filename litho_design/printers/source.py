@@ -34,8 +34,8 @@ def load_printer(
     results, by default the model's own. A loaded printer is returned unchanged.
 
     Raises:
-        InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
-            device that this machine does not have.
+        InputError: there is no frozen model, its pitch differs, it was not calibrated for the levels, or this
+            machine does not have the device.
     """
     if isinstance(source, Printer):
         return source
@@ -63,7 +63,7 @@ def load_printers(
     """Load printers by name, from a mapping, or from NAME=MODEL, MODEL, ``none`` and loaded printers.
 
     Raises:
-        InputError: one without a name, two of the same name, or what ``load_printer`` refuses.
+        InputError: a printer has no name, two have the same name, or ``load_printer`` refuses one.
     """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     if isinstance(sources, Mapping):
@@ -141,7 +141,7 @@ def check_device(device: Device) -> None:
     """Refuse a device that this machine does not have.
 
     Raises:
-        InputError: no such device.
+        InputError: there is no such device.
     """
     try:
         wanted = torch.device(device)

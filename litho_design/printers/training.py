@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # If half of the pixels have levels that are rare in the training layouts, most of the print is extrapolated.
 _FLAG_DISTANCE = 0.5
-# The limit is a tenth of all neighbours, because a few edges do not make a layout unusual.
+# This limit is a tenth of all pairs of neighbours, because a few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
 # A layout may have a level or step this many times as often as the training layouts, or by this share more.
 ALLOWED_TIMES = 2.0
@@ -110,8 +110,8 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
     """Return the expected rms error of a model, µm, on the print of a relief of this standard deviation, µm.
 
     The error is that on the prints in the model's card, scaled up for a relief that is higher than those
-    prints, plus the scatter of the prints' gains. Errors are taken as normal, so the mean absolute error is
-    sqrt(2 / pi) of the rms error. If the card has no prints, the result is 0.
+    prints, plus the scatter of the prints' gains. Errors are assumed to be normal, so the mean absolute error
+    is sqrt(2 / pi) of the rms error. If the card has no prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:

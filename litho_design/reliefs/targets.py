@@ -26,7 +26,8 @@ def load_relief(
             heights in µm: a float TIFF, or an array.
 
     Raises:
-        InputError: not a drawing, not a readable file, or heights of another shape or that are not numbers.
+        InputError: the source is neither a drawing nor a readable file, or the heights have another shape or
+            are not numbers.
     """
     size = layout.size_px
     if isinstance(source, np.ndarray):
@@ -50,7 +51,7 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
     """Return the deviation of a print (size, size) from its expectation, µm, blurred and without its mean:
     float32.
 
-    A second print will have other roughness than the first, so the blur removes the roughness.
+    The roughness of a second print differs from that of the first, so the blur removes the roughness.
     """
     from scipy.ndimage import gaussian_filter
 

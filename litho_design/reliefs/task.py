@@ -58,7 +58,7 @@ class ReliefTask(Task):
     """A wanted height map (size, size), µm, as ``load_relief`` gives it with its record.
 
     The input ``off_um`` is the deviation of a first print from its expectation, without its mean. The search
-    expects the same deviation again. Figures describe the print alone, as others will measure it.
+    expects the same deviation in the next print. Figures describe the print alone, as others will measure it.
 
     Raises:
         InputError: a start that is for light, or spreads beyond the range of any propagator.
@@ -127,7 +127,7 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors except for the offset: the zero is free and must not decide whether a print
+        """Return the errors without the offset. The zero is free and must not decide whether a print
         passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
@@ -145,7 +145,7 @@ class ReliefTask(Task):
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two layouts of ``untouched``, and of levels that are not rounded."""
+        """Return the errors of the two uncorrected layouts, and those of levels that are not rounded."""
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
@@ -197,9 +197,7 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the task's arrays, and the error that remains with unrounded levels, a lower limit for all
-        layouts.
-        """
+        """Return the task's arrays, and the error with unrounded levels, which no layout can undercut."""
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 

@@ -39,9 +39,9 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("mae_calibrated", "MAE {} with the print's own PSF", 4),
 )
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
-# Reflection alone takes 4.6 %.
+# Reflection alone causes a loss of 4.6 %.
 _THICK_SHARE = 0.1
-# Below this share of the training pixels, a model has hardly seen the lowest and the highest level.
+# Below this share of the training pixels, a model has hardly been trained on the lowest and highest level.
 _SEEN_SHARE = 0.02
 
 
@@ -56,8 +56,9 @@ def called(printer: str) -> str:
 
 
 def distribution_warning(design: Design) -> str:
-    """Warn if a layout is far from the training layouts, or if the distance is unknown; otherwise return an
-    empty text.
+    """Return a warning if a layout is far from the training layouts, or if its distance is unknown.
+
+    Otherwise return an empty text.
     """
     gauge = design.out_of_distribution
     if gauge is None:
@@ -78,8 +79,9 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """State what the available models of the printer predict; return an empty text if there is only the
-    design's own.
+    """Return a sentence on the predictions of all available models of the printer.
+
+    The sentence is empty if there is only the design's own model.
     """
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
@@ -100,7 +102,9 @@ def width_sentence(design: Design) -> str:
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """State a figure by the first model, in the median and at worst, and whether the models differ too much.
+    """Return a sentence with a figure by the first model, its median over models, and its worst value.
+
+    The sentence also states whether the models differ too much.
 
     Args:
         less: whether the figure is better when lower; ``gain``: gain of the design over doing nothing.
@@ -120,13 +124,13 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
 
 
 def _parted(figure: str) -> tuple[str, str]:
-    """The name of a figure, and its unit after a blank; empty if it has none."""
+    """Return the name of a figure, and its unit after a blank; the unit is empty if the figure has none."""
     name, _, unit = named(figure).partition(" (")
     return name, f" {unit.rstrip(')')}" if unit else ""
 
 
 def thickness_warning(design: Design) -> str:
-    """Warn if the same print performs clearly worse as a thick element; otherwise return an empty text."""
+    """Return a warning if the print performs clearly worse as a thick element; otherwise an empty text."""
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
         return ""

@@ -1,4 +1,4 @@
-"""Write the report of one design, whatever its task."""
+"""Write the report of one design of any task."""
 
 from __future__ import annotations
 

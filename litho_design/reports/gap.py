@@ -92,7 +92,7 @@ def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Name the best arm under each judge that is not an arm; if all judges are arms, under every judge."""
+    """Return sentences that name the best arm under each judge that is not an arm; if none, under all."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1
     unit = " dB" if figure.endswith("_db") else ""

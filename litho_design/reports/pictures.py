@@ -1,4 +1,4 @@
-"""Draw designs and scores: maps side by side, the curves of a lens, the course of a search."""
+"""Draw designs and scores: maps side by side, the curves of a lens, the loss during a search."""
 
 from __future__ import annotations
 

@@ -33,8 +33,8 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     if judgement.photos:
         page.figure(
             panels_figure([[Panel(*shown, judgement.frame_um) for shown in judgement.photos.items()]]),
-            "Photograph through the printed lens, each image at the scale of least error. The scores are of "
-            "this one object.",
+            "Photograph through the printed lens, each image at the scale with the smallest error. The "
+            "scores are of this one object.",
         )
     for score in result.scores:
         for remark in score.remarks():
@@ -82,8 +82,9 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """State the design's own figure and those of its judging models; return an empty text with fewer than two
-    models.
+    """Return a sentence with the design's own figure and those of its judging models.
+
+    The sentence is empty with fewer than two models.
     """
     task = registered_task(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
@@ -94,7 +95,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """State the difference from the expectation, in the figure that compares holograms."""
+    """Return the difference from the expectation, in the figure that compares holograms, as text."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

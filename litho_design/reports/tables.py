@@ -19,7 +19,7 @@ def meanings(score: type[Record]) -> dict[str, str]:
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return one row per figure and one column per print or baseline, with the meaning of each figure."""
+    """Return a row for each figure, with its meaning and a column for each print or baseline."""
     # Your own task need not describe its figures.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels

@@ -27,7 +27,7 @@ from litho_design.workflows.first import small_hologram
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
 # Cut-offs of the random layouts, used in turn; the measured prints have the same, cycles per µm.
 _CUTOFFS_PER_UM = (0.25, 0.5)
-# Few wide steps, because the stair takes three fifths of a side and the printer rounds the edges of steps.
+# The stair has few, wide steps, because it covers three fifths of a side and the printer rounds the edges.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
@@ -64,7 +64,7 @@ def new_sheet(
         device, announce: as for ``design_hologram``.
 
     Raises:
-        InputError: what ``compare`` and ``export`` refuse, or fields too small for a stair.
+        InputError: ``compare`` or ``export`` refuses an argument, or the fields are too small for a stair.
     """
     made = settings or small_hologram()
     asked = {"model": str(model), "format": format, "layouts": layouts, "seed": seed}
@@ -118,7 +118,7 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Return the fields to learn from, by id: first the witnesses, then random layouts."""
+    """Return the fields from which the printer is learned, by id: the witnesses, then random layouts."""
     shape = geometry.size_px, geometry.size_px
 
     def random(number: int) -> np.ndarray:

@@ -29,12 +29,12 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
 
     Args:
         sheet: folder of ``new_sheet``, with the scans in it.
-        out: folder of the answer: ``prints.zarr``, ``printer`` (the model and its card), ``loop``,
+        out: folder of the result: ``prints.zarr``, ``printer`` (the model and its card), ``loop``,
             ``evaluation``, a score of each hologram, and ``report.html``. An interrupted run resumes.
         device: where prints and waves are computed.
 
     Raises:
-        InputError: no sheet, a hologram without its scan, or what the steps refuse.
+        InputError: there is no sheet, the scan of a hologram is missing, or one of the steps refuses.
     """
     source = Path(sheet)
     given = Sheet.read(source)
@@ -77,7 +77,7 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
 
 
 def sheet_text(result: ReadSheet) -> str:
-    """State the answer in two sentences."""
+    """Return the result in two sentences."""
     gain = {kind: db["with"] - db["without"] for kind, db in _by_kind(result).items()}
     better = "better" if gain["measured"] >= 0 else "worse"
     return (
@@ -105,7 +105,7 @@ def _by_kind(result: ReadSheet) -> dict[str, dict[Arm, float]]:
 
 def _write_report(folder: Path, result: ReadSheet) -> None:
     page = Page(
-        "What the sheet says",
+        "What the sheet shows",
         "A printer learned from one sheet of prints, and one hologram printed twice.",
         run=result,
         facts={"dataset": result.dataset.sha256},

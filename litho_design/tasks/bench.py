@@ -19,7 +19,7 @@ class ElementBench(nn.Module):
     """Propagate the light of a source through a printed element onto the image plane; element and window have
     equal size.
 
-    ``propagator`` is the one for the middle of the source.
+    ``propagator`` belongs to the wave from the middle of the source.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):

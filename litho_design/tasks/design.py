@@ -57,7 +57,7 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """What a task finds out about its levels and their print; ``thick`` contains the figures as a thick
+    """Findings of a task about its levels and their print; ``thick`` contains the figures as a thick
     element.
     """
 
@@ -129,7 +129,7 @@ def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.nd
     file.
 
     Raises:
-        InputError: no such file, or one that changed after the design.
+        InputError: there is no such file, or it changed after the design.
     """
     path = Path(folder) / name
     wanted = Design.read(folder).files.get(name)

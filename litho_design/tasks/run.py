@@ -24,7 +24,7 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# How many layouts every model prints: the searched and the uncorrected one. How many seconds a page takes.
+# Number of layouts that every model prints (the searched and the uncorrected one), and seconds for a page.
 _CANDIDATES, _PAGE_S = 2, 7.0
 # A function that writes the report into the folder of a design, from the record and the history of the
 # search.

@@ -53,11 +53,11 @@ class Task:
         starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
         headline: figures that reports and commands show first; if empty, all.
         errors: figures that are better when lower; ``loss_unit``: see ``Width``.
-        in_one_piece: whether the search ends with single-level changes, and the run with a page.
+        in_one_piece: whether the search ends with single-level changes, and the run writes a page.
         ranks: the processes that share the task.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
         settings, printer, printers, inputs: as given; ``notes``: notes for the record.
-        bench: from a height map to what is seen, in the optics of the settings.
+        bench: optics of the settings, which turn a height map into what is seen.
 
     Args:
         settings: geometry, optics, search, process window.
@@ -67,7 +67,7 @@ class Task:
         record: source of the inputs.
 
     Raises:
-        InputError: a start that the task does not have, or spreads beyond the range of the propagator.
+        InputError: the task does not have this start, or the spreads exceed the range of the propagator.
     """
 
     name: ClassVar[str]
@@ -342,7 +342,7 @@ def register_task(task: type[Task]) -> type[Task]:
     """Register your own task, so that its designs can be opened; also works as a class decorator.
 
     Raises:
-        InputError: no name, or the name of another task.
+        InputError: the task has no name, or the name of another task.
     """
     name = getattr(task, "name", "")
     known = _TASKS.get(name)

@@ -12,7 +12,7 @@ _SURE = 2.0
 
 
 class Width(Record):
-    """One entry per model: first the models of the search, then the judges, which the search did not use.
+    """Figures of a design by model: first the models of the search, then the judges, which it did not use.
 
     Attributes:
         searched_with: how many of the models the search used.
@@ -20,8 +20,8 @@ class Width(Record):
             the uncorrected ones.
         returned: the candidate with the smallest loss over all models (``Task.over_models``).
         figure: the first figure of the task; ``less``: whether it is better when lower.
-        loss_unit: factor from the loss to the figure that includes the model's own error; None if the loss is
-            no such error.
+        loss_unit: factor that converts the loss to the unit of the figure, if the loss is an error that
+            includes the model's own; otherwise None.
         level_heights_um: printed height of a wide field of each level, by model.
     """
 
@@ -53,7 +53,7 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Return the gain of the figure over the best uncorrected layout, as the median over models."""
+        """Return the median over models of the figure's gain over the best uncorrected layout."""
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
         return float(np.median(sign * self.values() - np.max(idle, axis=0))) if idle else None

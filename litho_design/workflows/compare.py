@@ -83,8 +83,8 @@ def compare(
         The record written to ``out/gap.json``.
 
     Raises:
-        InputError: no arm or no seed, a judge with the name of an arm, an ``out`` that holds another kind
-            of result, or anything that ``design_hologram`` and ``design_lens`` refuse.
+        InputError: there is no arm or no seed, a judge has the name of an arm, ``out`` holds another kind
+            of result, or ``design_hologram`` or ``design_lens`` refuses an argument.
     """
     every_seed = list(seeds)
     fit: Any = {"device": device, "extrapolate": extrapolate}

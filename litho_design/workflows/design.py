@@ -38,7 +38,7 @@ S = TypeVar("S", bound=DesignSettings)
 
 
 class How(TypedDict, total=False):
-    """Arguments of every design.
+    """Arguments that all design functions share.
 
     Attributes:
         judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
@@ -163,16 +163,17 @@ def correct(
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction whose print was measured; ``scan``: that measurement. The
-            deviation of that print from its expectation is expected again.
+            same deviation from the expectation is expected in the next print.
         how: see ``How``; robust by default.
 
     Returns:
-        The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
+        The record written to ``out/design.json``; the part of the relief
+        that no layout can print is in ``unprintable_um.npy``.
 
     Raises:
-        InputError: what ``load_relief`` refuses, or what ``design_hologram`` refuses about models and
-            folders; ``after`` without ``scan`` or the reverse, a first element of another layout, or a scan
-            of another element.
+        InputError: ``load_relief`` refuses the relief; the model or the folder is refused as in
+            ``design_hologram``; ``after`` and ``scan`` are not given together; or the first element has
+            another layout, or the scan shows another element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -188,8 +189,9 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """Return the deviation of a first element's measured print, as an input of the second; empty without a
-    first element.
+    """Return the deviation of a first element's measured print, as an input of the second element.
+
+    Return no inputs if there is no first element.
     """
     if after is None and scan is None:
         return {}
@@ -229,8 +231,8 @@ def design(
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: a task that is not registered, or what ``design_hologram`` refuses about models and
-            folders.
+        InputError: the task is not registered, or the model or the folder is refused as in
+            ``design_hologram``.
     """
     if isinstance(task, str):
         hint = "design_hologram, design_lens and correct design what the package knows"
@@ -256,7 +258,7 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """Make the design of a task; printers are loaded first, to refuse bad ones before a target is read."""
+    """Make the design of a task. Printers are checked before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
     if judges is None:

@@ -17,8 +17,9 @@ WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
 def small_hologram() -> HologramSettings:
-    """Return settings small enough for a minute on two cores, with a distance at which the hologram can draw
-    the letters.
+    """Return settings of a hologram that takes a minute on two cores.
+
+    At its distance, the hologram can draw the letters.
     """
     small = {
         "layout.size_px": 256,
@@ -50,7 +51,7 @@ def first(
         judges both.
 
     Raises:
-        InputError: what ``compare`` refuses.
+        InputError: ``compare`` refuses an argument.
     """
     return compare(
         settings or small_hologram(),

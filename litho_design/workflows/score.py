@@ -49,8 +49,8 @@ def score(
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
     Raises:
-        InputError: nothing to judge with, an incomplete or altered design folder, a measurement that
-            does not match it, or an ``out`` that holds another kind of result.
+        InputError: there is no judge, the design folder is incomplete or was altered, a measurement
+            does not match it, or ``out`` holds another kind of result.
     """
     in_memory = isinstance(design, LoadedDesign)
     record = design.record if isinstance(design, LoadedDesign) else Design.read(design)

@@ -1,4 +1,4 @@
-"""Make a board that any loop can enter: stores, a record of their hidden causes, and the judge."""
+"""Make a board on which any loop can be judged: stores, a record of their hidden causes, and the judge."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str
     Raises:
         InputError: settings that cannot be drawn, or fields that cannot be printed.
     """
-    Plan(n_scans, (size_px, size_px))  # Refuses impossible fields before a trial fails on them.
+    # This call refuses impossible fields now, before a trial fails on them.
+    Plan(n_scans, (size_px, size_px))
     trials = draw_board(board, seed)
     return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
 
@@ -59,7 +60,7 @@ def new_board(
         out: folder of the board.
         board: ``singles`` (one cause per trial) or ``mixtures`` (two to four); ``seed``: determines all
             draws.
-        trials: number of drawn trials to make, from the first; None: all.
+        trials: number of drawn trials to make, starting with the first; None: all.
         n_scans: scans in each store; ``size_px``: side of a layout.
 
     Raises:
@@ -101,10 +102,10 @@ def judge_board(
 
     Args:
         board: folder of ``new_board``.
-        out: folder of the trials; each keeps what the loop wrote.
+        out: folder of the trials; each trial keeps the files that the loop wrote.
         loop: function of a store and an empty folder that returns an answer; by default our closed loop.
         name: name of the loop; an ``out`` with the trials of another loop is refused.
-        report: gets the progress messages of the default loop.
+        report: function that receives the progress messages of the default loop.
 
     Raises:
         InputError: no board, or a folder with the trials of another board or loop.

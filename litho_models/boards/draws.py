@@ -1,4 +1,5 @@
-"""Draw the planted causes from everything that the virtual fab can do, with one seed, before any run.
+"""Draw the planted causes, with one seed and before any run, from all causes that the virtual fab can
+simulate.
 
 There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. This module
 does not read the loop's catalogue of effects.
@@ -17,20 +18,21 @@ from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest drawn size. A size that was set on four scans may be 13 % smaller on all scans, and must still
-# count.
+# Smallest drawn size. The strength is set on four scans. On all scans the size may be 13 % smaller, and the
+# cause must still count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
-# Numbers of mixtures with these features: a linear slope loss by batch, an S-shaped axis in half of the
-# scans, another cause whose strength differs by batch or field, a printer beyond the Physics model.
+# Numbers of mixtures with a linear slope loss by batch; an S-shaped axis in half of the scans; another cause
+# whose strength differs by batch or field; and a printer that the Physics model cannot imitate.
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
 # These are not drawn: the first is part of the default noise, and a refit leaves less than 10 nm of the
 # second.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# These are new in every scan, or do not change the height map, so no model of all scans can contain them.
+# These causes differ randomly between scans, or do not change the height map, so a model of all scans cannot
+# contain them.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -39,7 +41,7 @@ _OF_SINGLE_SCANS = {
     "slow-drift",
     "periodic-lines",
 }
-# The measured prints may already have these, so finding them would prove nothing.
+# The measured prints may already have these causes, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
 # These knobs were added after the first boards and are left out there, so that the draws stay the same.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
@@ -56,8 +58,8 @@ _PRINTER_RANGES = {
 def draw_board(board: Board, seed: int) -> list[Draw]:
     """Draw the trials of a board, in random order, each with its own printer.
 
-    Knobs and forms are dealt like cards: each is used once before any is used again. An ``alias`` is a knob
-    that the base can imitate or that scan terms absorb; other knobs are ``in-form``. Sizes are log-uniform.
+    Each knob or form is used once before any is used again. An ``alias`` is a knob that the base can imitate
+    or that scan terms absorb. Other knobs are ``in-form``. Sizes are drawn log-uniformly.
 
     Raises:
         InputError: a negative seed.
@@ -111,7 +113,9 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 
 
 def _draw_mixtures(rng: Rng) -> list[Draw]:
-    """Draw about as many causes in form as causes of another form. No two in a trial share a right name."""
+    """Draw about as many causes with a form of the catalogue as causes of another form. No two causes of a
+    trial share a right name.
+    """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
     deck = chain.from_iterable(zip(in_form, other, strict=False))

@@ -13,7 +13,7 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Outcome, Scoreboard, Trial, Verdict
 
-# Return the largest accepted error with the findings, as a multiple of the true models' error.
+# Largest accepted error with the findings, as a multiple of the true models' error.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -45,7 +45,9 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Format hits and total with the exact 95 % interval (Clopper and Pearson)."""
+    """Format the number of hits and the total, with the exact 95 % interval of the share (Clopper and
+    Pearson).
+    """
     known = [*hits]
     if not known:
         return "none of 0"
@@ -103,7 +105,7 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Return whether the error with the findings is within the tolerance; False if unknown."""
+    """Return whether the error with the findings is within the tolerance; False if the error is unknown."""
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 

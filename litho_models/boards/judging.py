@@ -21,7 +21,7 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# A name for these forms is right only with this exponent.
+# The name found for these forms is right only if the found exponent includes this one.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # This form consists of line offsets, so a loop that reports line offsets has noticed it.
@@ -70,7 +70,8 @@ def judge(
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """Return one outcome per planted cause, in order, or one for the whole trial if nothing was planted.
+    """Return one outcome per planted cause, in their order, or one outcome for the whole trial if nothing was
+    planted.
 
     Each finding counts for at most one cause; larger causes come first.
     """
@@ -103,7 +104,7 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the named sets of causes that contain nothing planted, where the base's form also counts as
+    """Return the named sets of causes that contain no planted cause. The form of the base also counts as
     planted.
     """
     return [
@@ -139,8 +140,8 @@ def _displacement_is_shared(
     return False
 
 
-# No model of all scans can predict these: values drawn anew in every scan (or line), rounding, and scars at
-# random positions. Bends are not among them, because the store's transform contains them.
+# A model of all scans cannot predict values drawn anew in every scan (or line), rounding, and scars at random
+# positions. Bends are not listed, because the store's transform contains them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -159,8 +160,8 @@ def true_floor(
 ) -> float:
     """Return the mean absolute error of the noise-free scans with all causes, k = 1, nm.
 
-    The store's transform (and bend) of each scan maps it onto the layout. Scans, pixels and terms per scan
-    are those of the loop's scores.
+    The store's transform (and bend) of each scan maps it onto the layout. The error uses the same scans,
+    pixels and per-scan terms as the scores of the loop.
     """
     by_id = {job.id: job for job in jobs}
     predictions = []
@@ -194,7 +195,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # This is the sd of the squared spot, if the base fits it.
+    # This is the standard deviation of the squared spot, if the base fits the spot.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:

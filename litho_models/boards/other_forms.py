@@ -38,9 +38,10 @@ class Form:
     """One form; ``draw`` fixes its random values and returns its law.
 
     Attributes:
-        limit: largest strength, in ``unit``; at strength 0 a law changes nothing.
+        limit: largest strength, in ``unit``; the law of a form changes nothing at strength 0.
         meaning: the meaning of a strength of one unit, and the drawn values.
-        deck: boards that deal it; ``base``: part of a mixture's printer, not dealt.
+        deck: boards that draw this form; ``base``: a part of a mixture's printer, which is not drawn as a
+            cause.
         names: right names in the catalogue; most forms have none.
     """
 
@@ -110,7 +111,7 @@ def _far_copy(rng: Rng) -> Law:
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
         shift = distance_um / canvas.pitch_um * np.array([np.sin(direction), np.cos(direction)])
-        # The copy may lie beyond the frame, where the outermost levels continue.
+        # The copy may reach beyond the frame, where the outermost levels are repeated.
         rows, columns = (
             np.clip(np.arange(n) - round(s), 0, n - 1) for n, s in zip(dose.shape, shift, strict=True)
         )
@@ -222,7 +223,7 @@ def _diagonal_slope_loss(rng: Rng) -> Law:
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall in one direction."""
-    # This is half a loss on both flanks and half a displacement; registration removes the displacement.
+    # The change is a loss of half the amount on both flanks, plus a displacement, which registration removes.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -386,11 +387,13 @@ def _hill_response(rng: Rng) -> Law:
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
-        # Doses at which the default printer's logistic gives the Hill curve's conversion at ``dose``.
+        # Doses at which the default printer's logistic curve gives the conversion that the Hill curve gives
+        # at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
-        # The sum of doses may exceed full conversion on the Hill curve, which a logistic never reaches.
+        # For a sum of doses the Hill curve may give more than full conversion, which a logistic curve never
+        # reaches.
         response = np.minimum(low + (high - low) * hill, 0.99)
         return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
 

@@ -1,4 +1,4 @@
-"""Enter our closed loop in a board."""
+"""Run our closed loop on the stores of a board."""
 
 from __future__ import annotations
 

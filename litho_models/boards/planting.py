@@ -1,8 +1,8 @@
 """Plant the causes of a trial at their strengths, and print its fields.
 
 The size of a cause is the rms of the change that the best refitted base cannot absorb. The Physics model,
-which contains the plain fab, is fitted to the noise-free scans with the cause. Datum, gain, tilt, bow and an
-affine registration error are free in each scan.
+which can represent the fab without causes, is fitted to the noise-free scans with the cause. Datum, gain,
+tilt, bow and an affine registration error are free in each scan.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# The search for a strength uses four scans (both cut-offs, spread over the order); the size is measured on
-# all scans.
+# The search for a strength uses four scans, spread over the printing order and with both cut-offs. The size
+# is then measured on all scans.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
@@ -91,8 +91,8 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
     the base.
 
     A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded.
-    Nothing is drawn again. The size of an alias is its change of the scans before a refit, because the refit
-    absorbs most of it.
+    The cause is not drawn again. The size of an alias is the change of the scans before a refit, because the
+    refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [_sized(one, jobs, draw) for one in drawn]
@@ -136,7 +136,7 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
     Args:
         heights_um: (y, x) on the layout's grid, µm, one per job.
-        printer: gives the start of the fit.
+        printer: printer whose values are the starting values of the fit.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
     model = plain_model(printer)

@@ -26,11 +26,12 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A knob or a form, with its wanted size (see `Planted.rms_nm`).
+    """A knob of the virtual fab or a form of its own, with the size that it should have (see
+    `Planted.rms_nm`).
 
     Attributes:
-        by: ``batch``: scans after ``place`` in the printing order have ``weak`` times the strength;
-            ``field``: scans whose id ends in none of the digits of ``place`` have it.
+        by: with ``batch``, scans after ``place`` in the printing order have ``weak`` times the strength. With
+            ``field``, scans whose id ends in none of the digits of ``place`` have it.
     """
 
     name: str
@@ -45,7 +46,8 @@ class Draw(Record):
 
     Attributes:
         seed: determines layouts, noise and the random values of knobs.
-        printer: parameters that differ from the default printer; ``base``: a form beyond Physics.
+        printer: parameters that differ from those of the default printer; ``base``: a form that the Physics
+            model cannot imitate.
     """
 
     number: int
@@ -75,9 +77,10 @@ class Planted(Record):
 
     Attributes:
         names: right names in the catalogue of effects.
-        strength: in ``unit``; ``at_limit``: whether its range ended before the wanted size.
-        rms_nm: rms residual that it alone leaves after a refit of base, scan terms and registration, without
-            noise.
+        strength: strength in ``unit``; ``at_limit``: whether its range ended before the wanted size was
+            reached.
+        rms_nm: rms residual that this cause alone leaves after a refit of base, scan terms and registration,
+            without noise.
     """
 
     draw: CauseDraw
@@ -128,8 +131,9 @@ class Found(Record):
     """One finding of a loop.
 
     Attributes:
-        names: its name in the catalogue, then those of effects that look the same.
-        by: grouping in which its strength differs; ``scan``: one strength per scan; ``all``: a common one.
+        names: name of the finding in the catalogue, then the names of effects that look the same.
+        by: grouping of scans between which the strength differs; ``scan``: one strength per scan; ``all``:
+            one strength for all scans.
         exponents: intervals of its exponent, if it is a power law.
     """
 
@@ -147,8 +151,9 @@ class Answer(Result):
         left: whether the residual has structure that the loop cannot explain.
         absorbed: names of effects that its base absorbs.
         displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
-        before_nm, after_nm: mean absolute error without and with the findings over the scans that are not
-            locked, each predicted by a fit that did not see it, with one free offset. None: not stated.
+        before_nm, after_nm: mean absolute error without and with the findings, over the scans that are not
+            locked. Each scan is predicted by a fit that did not use it, with one free offset. None: not
+            stated.
         base_values, corrected_values: values of the Physics model, without and with the findings.
     """
 
@@ -170,9 +175,9 @@ class Trial(Result, extra="ignore"):
     """The result of one trial; a failed trial has a reason and no errors.
 
     Attributes:
-        false_names: named sets of causes that contain nothing planted.
-        bias: median relative error of the base's values, without and with the findings; None if printer or
-            chosen base is not a Physics model.
+        false_names: named sets of causes that contain no planted cause.
+        bias: median relative error of the base's values, without and with the findings; None if the printer
+            or the chosen base is not a Physics model.
         dataset_cpu_s: processor seconds of build and loop.
     """
 

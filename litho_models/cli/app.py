@@ -39,7 +39,7 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
     option("terms fitted to each scan for its datum-free error; offset by default, for films none"),
 ]
-_BACKGROUND_HELP = "training: add the smooth background that the training scans share"
+_BACKGROUND_HELP = "training: add to predictions the smooth background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
@@ -57,7 +57,7 @@ VariantOption = Annotated[
     Literal["default", "paper", "authors"],
     option("ours, as printed in the paper, or as in the authors' code"),
 ]
-Steps = Annotated[int | None, option("optimiser steps; the recipe's by default", min=1)]
+Steps = Annotated[int | None, option("optimiser steps; by default those of the recipe", min=1)]
 Seed = Annotated[int, option("seed of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
@@ -159,14 +159,14 @@ def benchmark(
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"], option("what is held out")
     ] = "grouped",
-    models: Annotated[str | None, option("names, comma-separated; all by default")] = None,
+    models: Annotated[str | None, option("names, separated by commas; by default all")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
     folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
-        option("number of folds to fit; all by default", min=1),
+        option("number of folds to fit; by default all", min=1),
     ] = None,
     policy: PolicyOption = None,
     background: SharedOption = None,
@@ -278,14 +278,14 @@ def show_zoo(name: Annotated[str, argument("name of a model of the zoo")]) -> No
     Example: litho-models zoo show pbl
     """
     folder = litho_models.zoo.folder(name.removeprefix(litho_models.zoo.PREFIX))
-    # Without the front matter, which is for machines.
+    # The front matter is left out, because only programs read it.
     typer.echo((folder / "README.md").read_text(encoding="utf-8").split("---\n", 2)[-1].strip())
 
 
 @app.command()
 def compare(
     first: Annotated[Path, argument("benchmark.json or evaluation.json")],
-    second: Annotated[Path, argument("another one, of the same protocol")],
+    second: Annotated[Path, argument("another result with the same protocol")],
 ) -> None:
     """Compare two results, paired by scan; results with different data, folds or per-scan terms are refused.
 
@@ -303,7 +303,7 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "cause of effects of undetermined role, for all of them or for NAME; repeatable",
+            "side that causes effects of undetermined role: for all of them, or for EFFECT; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,

@@ -21,8 +21,8 @@ def new(
     kind: Annotated[
         Literal["singles", "mixtures"], option("one cause per store, or two to four")
     ] = "singles",
-    seed: Annotated[int, option("seed of everything that is drawn", min=0)] = 0,
-    trials: Annotated[int | None, option("number of stores; by default all, about 40", min=1)] = None,
+    seed: Annotated[int, option("seed of all random draws", min=0)] = 0,
+    trials: Annotated[int | None, option("number of stores; by default all (about 40)", min=1)] = None,
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
     size_px: Annotated[int, option("side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:

@@ -42,7 +42,7 @@ def close_loop(
     folds: Annotated[int, option("number of folds, by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
-        option("also repeat every choice without each fold, or print, and judge it on that part; slow"),
+        option("also repeat every choice without each fold or print, and judge it on the omitted part; slow"),
     ] = None,
     inject: Annotated[
         list[str] | None,
@@ -56,7 +56,7 @@ def close_loop(
     steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
     cache: Annotated[
         Path | None,
-        option("folder of a network's trainings per fold; beside --out by default"),
+        option("folder of a network's trainings per fold; by default beside --out"),
     ] = None,
     seed: Annotated[int, option("seed of folds and bootstrap, not of the lock box", min=0)] = 0,
     workers: WorkersOption = 1,
@@ -97,7 +97,7 @@ def close_loop(
     typer.echo(f"report: {out / 'report.html'}")
 
 
-# This code differs from those for bad input (2) and for a defect of this package (1).
+# This exit code differs from those for bad input (2) and for a defect of this package (1).
 EXIT_ALARM = 3
 
 
@@ -107,7 +107,7 @@ def check(
     out: Annotated[Path, option("folder for check.json, report and tables")],
     reference: Annotated[
         Path | None,
-        option("store of unchanged prints; the prints in the model's card by default"),
+        option("store of unchanged prints; by default the prints in the model's card"),
     ] = None,
     new: Annotated[
         list[str] | None,
@@ -149,7 +149,7 @@ def next_print(
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],
-        option("random: the same scans of layouts that are not optimised, as a control"),
+        option("random: plan the same scans of random layouts, as a control"),
     ] = "optimised",
     seed: Annotated[int, option("seed of the random layouts to start from", min=0)] = 0,
     steps: Annotated[int, option("steps of the ascent for each tile", min=0)] = 40,

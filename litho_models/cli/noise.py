@@ -22,7 +22,7 @@ def noise(
     unit: Annotated[str | None, option("unit of these scans where the files state none")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
-        option("their size in µm where the files state none", metavar="Y X"),
+        option("size of these scans in µm where the files state none", metavar="Y X"),
     ] = None,
     level_height_um: Annotated[
         float | None, option("nominal step of the step print, µm; 0.1 by default")
@@ -34,8 +34,8 @@ def noise(
             "zoo:NAME), for σ(x) alone"
         ),
     ] = None,
-    model: Annotated[str | None, option("which model of the benchmark; its best one by default")] = None,
-    seed: Annotated[int, option("seed of the pixels drawn", min=0)] = 0,
+    model: Annotated[str | None, option("which model of the benchmark; by default the best")] = None,
+    seed: Annotated[int, option("seed of the choice of pixels", min=0)] = 0,
 ) -> None:
     """Estimate roughness, dose matrix, noise budget, and σ(x) with its calibration; lengths in µm, noise in
     nm.

@@ -23,7 +23,7 @@ class EffectChain(nn.Module):
 
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
-        effects: effect name to parameter values; unnamed parameters are off.
+        effects: parameter values by the name of the effect; parameters that are not given are off.
         frames: whether a height effect turns with the print or with the scan, if that differs from the
             default: effects of stage ``measurement`` turn with the scan, all others with the print.
     """

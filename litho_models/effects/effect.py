@@ -17,12 +17,12 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
-# Kinds of knowledge that a found effect provides: the cause, a formula, or only a dependence.
+# What is known about a found effect: its cause, its formula, or only a variable on which it depends.
 Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
-# Tolerance as a share of a range, because a value on its bound is stored in float32.
+# Tolerance, as a share of the range, for values on a bound: storing them in float32 rounds them.
 _ROUNDING = 1e-6
 
 
@@ -33,12 +33,12 @@ class Parameter:
     Args:
         unit: ``1`` for dimensionless.
         lower, upper: physical range; an estimate outside it contradicts the effect.
-        typical: a usual value, for screening and as start of fits.
-        kind: an ``amplitude`` switches the effect off at ``null``; a ``shape`` (a length, a position) has no
-            meaning while the amplitudes are null; a ``choice`` is a shape with few values (a direction),
-            never fitted.
+        typical: a usual value, used for screening and as the starting value of fits.
+        kind: at its ``null``, an ``amplitude`` switches the effect off. A ``shape`` (a length, a position)
+            has no meaning while all amplitudes are null. A ``choice`` is a shape with few values (a
+            direction) that is never fitted.
         null: value of an amplitude at which the effect changes nothing.
-        tried: values for screening; ``typical`` if empty.
+        tried: values that screening tries; if empty, it tries ``typical``.
     """
 
     unit: str
@@ -62,23 +62,24 @@ class Parameter:
 
 @dataclass(frozen=True)
 class FieldContext:
-    """What an effect may know about a field in addition to the array that it changes.
+    """The information about a field that an effect receives in addition to the array that it changes.
 
     Args:
-        layout_um: exposure, as nominal height times relative dose (1, 1, y, x), µm.
+        layout_um: exposure (1, 1, y, x), µm: the nominal height times the relative dose.
         pitch_um: lateral sampling, µm.
         full_height_um: nominal height of the highest level, µm, the scale of pointwise effects.
         slice_um: height of one slice, which is one level, µm.
         field_centre_um: (y, x) of this field's centre in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
-        slow_axis: axis along which written lines follow each other.
+        slow_axis: axis perpendicular to the written lines.
         order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
-        scan_shape: (rows, columns) of the whole scan, if this field is a part of it.
+        scan_shape: (rows, columns) of the whole scan, if this field is only a part of a scan.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        quarter_turns: number of quarter turns (as by ``rot90``) in which the microscope saw the array.
-        backward: whether the scan lines are the retrace.
-        new_tip: whether another, sharp tip was used.
-        pixel_size: pixel size relative to other scans; lags in time scale with it.
+        quarter_turns: number of quarter turns (as by ``rot90``) by which the array was turned under the
+            microscope.
+        backward: whether the scan consists of retrace lines.
+        new_tip: whether the scan was made with a new, sharp tip.
+        pixel_size: pixel size relative to that of the other scans, by which lags in time are scaled.
         dose: dose relative to the recipe, already contained in ``layout_um``.
     """
 
@@ -100,7 +101,7 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Cache what an effect computes from the field alone."""
+        """Return what ``make`` computes from the field alone; it is computed once and cached."""
         if name not in self._kept:
             self._kept[name] = make(self)
         return self._kept[name]
@@ -156,7 +157,7 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Stand in for the formula of a per-scan effect, whose terms are fitted to each scan separately."""
+    """Raise an error, because the terms of a per-scan effect are fitted to each scan and have no formula."""
     raise InputError(
         "an effect in a model",
         got="a per-scan effect",
@@ -170,21 +171,22 @@ class Effect:
 
     Args:
         name: the identifier used in code, JSON and on the command line.
-        title: short description for a process engineer.
-        stage, role: stage of the process; whether the effect may enter the exported process model.
+        title: short description that a process engineer understands.
+        stage, role: stage of the process, and whether the effect may enter the exported process model.
         acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
         parameters: name to ``Parameter``; at least one amplitude.
         apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm; ``of_single_scans``
             for per-scan effects.
-        trials: parameter sets at which screening takes secants; by default one amplitude at a time, at each
-            of its ``tried`` values, in each shape.
+        trials: parameter sets that screening compares with the null values. By default it tries one amplitude
+            at a time, at each of its ``tried`` values and for each combination of shapes.
         source: source of the formula.
-        separating: experiment that separates this effect from similar effects.
+        separating: experiment that distinguishes this effect from similar effects.
         needs: what a test of the effect requires: a known order of the scans, or a microscope with a probe.
-        reverses: parameters with the opposite sign on retrace lines.
+        reverses: parameters whose sign is opposite on retrace lines.
         of_tip: whether a new tip removes this effect.
-        of_films: whether this effect moves the edges of a film seen from above; other effects change heights.
-        knowledge: a cause has a name, a law only a formula, and a description only a covariate.
+        of_films: whether this effect moves the edges of a film seen from above. Other effects change heights.
+        knowledge: for a cause, the physical cause is known; for a law, only a formula; for a description,
+            only a covariate.
     """
 
     name: str
@@ -226,11 +228,11 @@ class Effect:
                     yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
-        """Return parameters at which the effect changes nothing."""
+        """Return the parameters at which the effect changes nothing."""
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the off values, with some of them replaced.
+        """Return the parameters at which the effect is off, with the given ones replaced.
 
         Raises:
             InputError: a name this effect does not have.
@@ -260,11 +262,12 @@ class Effect:
         context: FieldContext,
         scanned: bool = False,
     ) -> Tensor:
-        """Apply the effect. Numbers become tensors on the array's device; unnamed parameters are off.
+        """Apply the effect. Numbers become tensors on the array's device; parameters that are not given are
+        off.
 
         Args:
-            scanned: apply it as an effect of the microscope, in the scan's frame and direction, with the
-                scan's tip.
+            scanned: apply the effect as one of the microscope: in the frame and direction of the scan, with
+                the tip of the scan.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)

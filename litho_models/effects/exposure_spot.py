@@ -10,12 +10,13 @@ from torch import Tensor
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
-# Up to this difference of variances, the spot is sharpened along one axis as much as it is widened along the
-# other. Above this difference the spot is only widened, to limit amplification.
+# Up to this difference of variances, the spot is narrowed along one axis by as much as it is widened along
+# the other. Above this difference the spot is only widened, so that high frequencies are not amplified
+# further.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
 
-# The spot that cures the slices.
+# Variance and reach of the spot that cures the slices.
 _SLICED_VARIANCE_UM2 = 0.02
 _SLICED_REACH_UM = 0.8
 
@@ -53,7 +54,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose of the neighbourhood within b: D = (M + η G_b * M) / (1 + η)."""
+    """Add the dose that leaks in from the neighbourhood within b: D = (M + η G_b * M) / (1 + η)."""
     weight, length = values["weight"], values["length_um"]
     blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -66,8 +67,8 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise the dose to a power: D = M_ref (M / M_ref)^p, with a foot of 1 % so that the slope at M = 0 stays
-    finite.
+    """Raise the dose to a power: D = M_ref (M / M_ref)^p, where 1 % of M_ref is first added to M, so that the
+    slope at M = 0 stays finite.
     """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
@@ -90,8 +91,8 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Cure slices of height t separately: (1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M.
 
-    The step is logistic about the threshold and maps 0 to 0 and 1 to 1. A slice narrower than the spot is
-    lost, and a gap narrower than the spot is filled.
+    The step is a logistic function about the threshold, scaled to map 0 to 0 and 1 to 1. A slice that is
+    narrower than the spot is lost, and a gap narrower than the spot is filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
@@ -99,7 +100,7 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _exposed_slices(context: FieldContext) -> Tensor:
-    """Return the exposure (slices, 1, y, x) of each slice by the spot; 1 means fully exposed."""
+    """Return the exposure of each slice, blurred by the spot, (slices, 1, y, x); 1 means fully exposed."""
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
     # The dose changes the exposure, not the number of slices.

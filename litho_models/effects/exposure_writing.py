@@ -1,4 +1,4 @@
-"""Effects of the exposure: position and order in the write field, and the writing motion."""
+"""Effects of the exposure that depend on position or order in the write field, or on the writing motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# Frequency of the longest ripple; slower waves look like maps of the field.
+# Frequency of the longest ripple. Longer ripples cannot be told from smooth maps of the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
@@ -83,8 +83,8 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Remove the part written below the substrate H_s: max(H - z, H_s) where H > H_s.
 
-    The lost part shrinks like the rest: z = z0 (1 - k (1 - u)), where u is the relative nominal height
-    nearby.
+    The lost part shrinks as the print does: z = z0 (1 - k (1 - u)), where u is the mean relative nominal
+    height nearby.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -102,7 +102,7 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the beam lag: a one-sided exponential of length l = v τ, without its mean delay."""
+    """Let the beam lag: filter with a one-sided exponential of length l = v τ, without its mean delay."""
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -122,8 +122,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (or lengthen it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula gives the area that an edge loses correctly. The shape of the edge depends on the spot, which
-    is wider than δ.
+    The formula gives the correct area that an edge loses. It does not give the shape of the edge, which
+    depends on the spot, because the spot is wider than δ.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -138,8 +138,8 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), x from the centre of a field of half width r.
 
-    Over the write field of half width R this is c x (1 - x / 2R), without the part that registration
-    removes.
+    Over a write field of half width R, the displacement is c x (1 - x / 2R) without the part that
+    registration removes.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -173,7 +173,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach_um = _TAIL_LENGTHS * float(length.detach())
     starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
-    # A negative dose from another effect is left as it is.
+    # If another effect has made the dose negative, this dose is not changed.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 

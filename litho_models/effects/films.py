@@ -15,15 +15,15 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp, gradient
 from litho_models.models.parts import FLATTEST, etch
 
-# Blurs of a film that define the normals of its edges and the position of a sharp rim, and the range of a
-# diffusion.
+# Standard deviation of the blur that defines the normals of a film's edges; of the blur that locates a sharp
+# rim; and the range of a diffusion.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
 
 _of_films = partial(entry, role="process", of_films=True)
 
 
 @_of_films(
-    "electrons that come back from the substrate",
+    "electrons scattered back from the substrate",
     {
         "weight": Parameter("1", 0.0, 1.5, 0.1),
         "length_px": Parameter("px", 8.0, 280.0, 25.0, "shape", tried=(14.0, 28.0, 56.0, 112.0)),
@@ -34,7 +34,7 @@ _of_films = partial(entry, role="process", of_films=True)
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Return part of the dose from the substrate to the film within b: D = (M + η G_b * M) / (1 + η)."""
+    """Add the dose that the substrate scatters back into the film within b: D = (M + η G_b * M) / (1 + η)."""
     weight, length = values["weight"], values["length_px"]
     blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -46,7 +46,7 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     stage="resist",
     acts_on="height",
     source="acid or reactants that diffuse in a resist of high contrast, then a threshold at one half",
-    separating="write necks and islands of five widths, bake for two times",
+    separating="write necks and islands of five widths, at two baking times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Blur the film by a Gaussian of variance s², and place its edge where the blurred film is one half."""
@@ -66,11 +66,11 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     {"bias_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))},
     stage="development",
     acts_on="height",
-    source="lateral etching at a rate of its own, the same at every dose and in every surrounding",
+    source="lateral etching at a constant rate, the same at every dose and in every surrounding",
     separating="write one layout at five doses: a bias is the same at each",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by the bias along their normals: the film is evaluated at this distance inwards."""
+    """Move edges outwards along their normals by the bias, by taking the film's value this far inwards."""
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)

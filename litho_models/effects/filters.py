@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext
 
-# Slopes below this are smoothed before a power is taken.
+# Below this slope, the absolute slope is smoothed before it is raised to a power.
 _LEAST_SLOPE = 1e-3
 
 
@@ -28,7 +28,8 @@ def add_filtered(
         field: (b, 1, y, x).
         transfer_minus_one: (fy, fx) in cycles/µm, shapes (y, 1) and (1, x/2 + 1) -> T(f) - 1.
         pitch_um: sampling, µm.
-        reach_um: half the support of the kernel, by which the field is continued as in the base models.
+        reach_um: half the support of the kernel. The field is continued by this length beyond its edges, as
+            in the base models.
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)

@@ -1,8 +1,9 @@
 """Laws: short formulas of height, slopes, surroundings, position and order.
 
 A law is an effect with one strength and fitted shapes: a power, a length, a direction, a position. A law
-states how the height departs from the model, not why. The same code screens, fits, judges and applies all
-laws. A table has many strengths. It follows any dependence on its covariate and explains nothing.
+states how the height departs from the model, but not why. The same code screens, fits, judges and applies all
+laws. A table is an effect with many strengths. It can describe any dependence on its covariate but does not
+explain the dependence.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from torch.nn import functional
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-# Over one micrometre, a wave of any frequency between two of these stays nearly in step with one of them.
+# Over one micrometre, a wave whose frequency lies between two of these frequencies stays nearly in phase with
+# one of the two.
 _WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
 _FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
 _WORDS = ("x", "y", "r²")
@@ -38,10 +40,10 @@ _SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y
 
 @dataclass(frozen=True)
 class Surface:
-    """Compute the quantities in formulas from a field h (b, 1, y, x), µm, its context, and the law's
-    parameters.
+    """Compute the quantities that the formulas contain, from a field h (b, 1, y, x), µm, its context, and the
+    law's parameters.
 
-    ``h`` is the height or, for a law of the exposure, the dose as nominal height.
+    ``h`` is the height or, for a law of the exposure, the dose expressed as nominal height.
     """
 
     h: Tensor
@@ -49,7 +51,9 @@ class Surface:
     values: Values
 
     def along(self, axis: str, y: Tensor, x: Tensor) -> Tensor:
-        """Return the component of a vector along an axis, turned from x towards y if the law has a turn."""
+        """Return the component of a vector along an axis. If the law has a turn, the axis is turned from x
+        towards y.
+        """
         angle = torch.deg2rad(self.values.get("turn_deg", self.h.new_zeros(())))
         sine, cosine = angle.sin(), angle.cos()
         return cosine * x + sine * y if axis == "x" else cosine * y - sine * x
@@ -59,12 +63,14 @@ class Surface:
         return self.along(axis, *gradient(self.h if of is None else of, self.context.pitch_um))
 
     def size(self, *axes: str, power: float | Tensor = 1.0) -> Tensor:
-        """Return a power of the absolute slope along an axis, or of the steepness, smoothed near zero."""
+        """Return a power of the absolute slope along one axis, or of the steepness along two, smoothed near
+        zero.
+        """
         squared = torch.stack([self.slope(one) for one in axes]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return for each pixel x, y, r² or the closeness to the scan's edge, e^(-distance / length)."""
+        """Return x, y, r² or the closeness to the scan's edge, e^(-distance / length), of each pixel."""
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
@@ -73,8 +79,8 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step along an axis of the scan: 0 before the law's position, 1 beyond it, linear within a
-        pixel.
+        """Return a step along an axis of the scan: 0 before the law's position, 1 beyond this position, and
+        linear within one pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
@@ -112,7 +118,7 @@ _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
 _TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0))}
-# Where a place is known, one trial of the length is near enough to start from.
+# If the position is known, one trial value of the length is close enough to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 
@@ -215,7 +221,9 @@ def _law(
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
-    """Make the wave that slices leave in the dose, or standing light in the height; at zero it is zero."""
+    """Make the wave that slices leave in the dose, or standing waves of light in the height. The wave is zero
+    where the field is zero.
+    """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
         phase = 2 * math.pi * values["frequency_per_um"] * field
@@ -224,7 +232,9 @@ def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
     amplitude, (lowest, *_, highest) = Parameter("µm", -0.2, 0.2, 0.02), tried
     frequency = Parameter("1/µm", lowest, highest, 5.0, "shape", tried=tried)
     parameters = {"sine_um": amplitude, "cosine_um": amplitude, "frequency_per_um": frequency}
-    return _nameless(f"{_FIELD[on]}-wave", "a wave of itself, sin(2π f h + phase)", parameters, apply, on)
+    return _nameless(
+        f"{_FIELD[on]}-wave", "a wave in its own value, sin(2π f h + phase)", parameters, apply, on
+    )
 
 
 def _nameless(
@@ -259,7 +269,9 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Return a correction for each of seventeen heights of the layout, linear between these heights."""
+    """Add a correction for each of seventeen heights of the layout, interpolated linearly between these
+    heights.
+    """
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
     share = (smooth / context.full_height_um * _LAST_KNOT).clamp(0, _LAST_KNOT)
@@ -270,7 +282,9 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Weight the height difference to each displaced position; the field is continued beyond its edge."""
+    """Add a weighted sum of the height differences to displaced positions; the field is continued beyond its
+    edge.
+    """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)
     padded = functional.pad(height, (edge,) * 4, mode="replicate")
@@ -283,7 +297,7 @@ def linear_response(height: Tensor, values: Values, context: FieldContext) -> Te
 
 @_table("a gain that depends on the position in the scan", _POWERS, "1")
 def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Return the height times a polynomial of the position in the scan."""
+    """Add the height times a polynomial of the position in the scan."""
     y, x = context.scan_position()
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 

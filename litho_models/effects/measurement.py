@@ -36,7 +36,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
     The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
     If ``rising`` is 1 the probe is a linear filter; below 1 it parachutes off falling edges. The delay is a
-    time, so the length is shorter with smaller pixels.
+    constant time, so smaller pixels make the length shorter.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -122,23 +122,24 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """Dilate rows (..., x) by a parabola; the surface is linear between half pixels.
 
-    On a linear piece of slope s the tip touches at the distance R s from its axis, or at the nearest end of
-    the piece.
+    The tip touches a linear piece of slope s at the distance R s from the tip's axis or, if this point is not
+    on the piece, at the piece's nearest end.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)
-    # Slopes of the pieces to the right of each pixel, then to the right of each middle.
+    # Slopes of the pieces to the right of each pixel, then of the pieces to the right of each mid-point.
     slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
     steepest = max(float(s.detach().abs().max()) for s in slopes)
-    # The tip touches nothing farther away than R s, or where its parabola is below the lowest height.
+    # The tip cannot touch a point that is farther away than R s, or where its parabola lies below the lowest
+    # height.
     tops_um = torch.stack([height, middles]).detach()
     deepest_um = math.sqrt(2 * float(radius_um.detach() * (tops_um.max() - tops_um.min())))
     farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
     reach_px = min(math.ceil(farthest_um / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
     rises = [_continued(part, reach_px, "constant") for part in slopes]
-    # The gradient of a maximum is that of the touched piece. The search needs no gradient, which would keep
-    # all pieces in memory.
+    # The gradient of the maximum is the gradient of the piece that the tip touches. The search itself runs
+    # without gradients, which would keep all pieces in memory.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
         touches = [radius_um * slope for slope in rises]

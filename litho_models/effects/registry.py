@@ -63,7 +63,7 @@ EFFECTS = (
             name: Parameter("µm", -0.5, 0.5, 0.02)
             for name in ("tilt_x_um", "tilt_y_um", "bow_xx_um", "bow_xy_um", "bow_yy_um")
         },
-        source="sample tilt, scanner bow, and what polynomial levelling left or took",
+        source="sample tilt, scanner bow, and errors of polynomial levelling",
         separating=_STEP,
     ),
     _of_microscope(
@@ -83,14 +83,14 @@ EFFECTS = (
 )
 
 
-# Effects of the catalogue that leave no trace in a residual map on the layout's grid.
+# Effects of the catalogue that are not visible in a residual map on the layout's grid.
 UNTESTABLE = {
     "min-to-zero-datum": "an order statistic per scan; datum-offset contains its effect",
     "quantisation": "the raw files are not in the store",
     "scars-and-spikes": "a mask, not a term; the loop looks for it among the outliers",
 }
 
-# Per-scan effects are missing here, because they act in no model.
+# Per-scan effects are not included here, because they are never part of a model.
 _FORWARD_ORDER = (
     *EFFECTS,
     exposure_spot.layer_stacking,
@@ -135,7 +135,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     Args:
         effect: the effect; a per-scan effect (``apply`` is ``of_single_scans``) also needs a scan term, see
             ``litho_models.scan_terms.register_scan_term``.
-        after: the effect after which it acts; by default the last one of its stage.
+        after: the effect after which the new effect acts; by default the last effect of its stage.
 
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
@@ -177,10 +177,10 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Return the effects that screening tests: those with parameters common to all scans.
+    """Return the effects that screening tests, whose parameters are common to all scans.
 
     Args:
-        tip_radius_um: radius of the tip or its upper bound, if the store has one, as a further trial size.
+        tip_radius_um: radius of the tip or its upper bound, if the store states one; it is tried in addition.
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:
@@ -192,7 +192,7 @@ def _tried_at(tip: Effect, radius_um: float) -> Effect:
     limits = tip.parameters["radius_um"]
     radius_um = min(radius_um, limits.upper)
     known = [trial["radius_um"] for trial in tip.trials]
-    # A second trial of nearly the same size would add nothing.
+    # A second trial with nearly the same radius would give no further information.
     if any(abs(radius_um - one) < 0.2 * one for one in known):
         return tip
     return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))

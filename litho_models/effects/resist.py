@@ -39,8 +39,8 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Apply the normalised tanh projection about η: it changes nothing for α² -> 0 and is a step for α² ->
-    inf.
+    """Apply the normalised tanh projection about η, which changes nothing for α² -> 0 and becomes a step for
+    α² -> inf.
 
     With x = H / full height the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
     equals the usual quotient of sums of tanh and is even and analytic in α.
@@ -64,7 +64,7 @@ def threshold_softness(height: Tensor, values: Values, context: FieldContext) ->
     separating="a wide staircase of all levels",
 )
 def height_saturation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Limit the height, because tall structures grow less than in proportion to the dose: H / (1 + q |H|)."""
+    """Reduce the height of tall structures, which grow less than the dose suggests: H / (1 + q |H|)."""
     return height / (1 + values["rate_per_um"] * torch.abs(height))
 
 
@@ -89,8 +89,8 @@ def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) ->
     separating="print the same height inside low and high surroundings; a power sweep",
 )
 def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink more where the surroundings are thin: H (1 - k (1 - u)), u the relative nominal height
-    nearby.
+    """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean relative
+    nominal height nearby.
     """
     return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
 
@@ -104,8 +104,8 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shrink tops inwards more than bases: H(r + s H(r) / full r), r from the centre of the field.
 
-    The mean height causes a magnification, which registration removes: a scan shows at x what lies at r = x /
-    (1 + s mean / full).
+    Shrinkage at the mean height is a change of magnification, which registration removes. A scan therefore
+    shows at x the point at r = x / (1 + s mean / full).
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -125,7 +125,7 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let features narrower than w lose a share of their height above the surroundings: H - φ (H -
+    """Lower features narrower than w by a share of their height above the surroundings: H - φ (H -
     open_w(H)).
     """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
@@ -135,15 +135,15 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     "resist left in narrow trenches",
     _OF_NARROW,
     source="closing of the surface by a square of width w",
-    separating="trenches of five widths, developed for two times",
+    separating="trenches of five widths, at two development times",
 )
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Leave resist in pits narrower than w: H + ρ (close_w(H) - H); tops are unchanged."""
+    """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H); tops are unchanged."""
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Close by a square: pits narrower than the square are filled.
+    """Close the height by a square (morphological closing), which fills pits narrower than the square.
 
     Squares are an odd number of pixels wide; results for other widths are interpolated.
     """
@@ -160,8 +160,8 @@ def _closed_by(height: Tensor, half_px: int) -> Tensor:
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel whose square lies inside, computed axis by
-    axis.
+    """Return the largest value in the square around each pixel whose square lies inside the field, computed
+    axis by axis.
     """
     return _running_maximum(_running_maximum(field, half_px, -2), half_px, -1)
 
@@ -199,13 +199,12 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), with turned axes x',
     y'.
 
-    With cx = cy = c the loss is c |grad H|^p in any direction. With p = 1 each edge is set back by about
-    c.
+    With cx = cy = c the loss is c |grad H|^p in any direction. With p = 1 each edge moves inwards by about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)
     along_x, along_y = turn.cos() * x + turn.sin() * y, turn.cos() * y - turn.sin() * x
-    # Rounding can leave a fitted value below zero, of which a power is not defined.
+    # Rounding can make a fitted value slightly negative, and a power of a negative number is not defined.
     loss_x, loss_y = values["along_x_um"].clamp(min=0), values["along_y_um"].clamp(min=0)
     whole = loss_x + loss_y
     share_x, share_y = ((one / whole.clamp(min=1e-12)) ** (2 / power) for one in (loss_x, loss_y))

@@ -61,26 +61,26 @@ def benchmark(
     Args:
         store: dataset store.
         out: result folder; ``out/cache`` keeps every fit.
-        split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of
-            quadrants over all scans; it leaks and is for comparison with the paper only.
+        split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of quadrants
+            over all scans. The split ``paper`` leaks, so use it only for comparison with the paper.
         models: names of models.
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         first_folds: fit and score only this many folds, to compare seeds or settings; None for all.
         policy: nuisances of ``mae_datum_free_nm``; ``offset`` by default, for films ``none``.
-        background: by default ``training``, for films ``none``. ``training``: each fit's smooth background,
-            learned on its training scans, is added to its predictions; ``shared``: predictions go through the
-            measurement model, learned on the same scans with the fit.
+        background: by default ``training``, for films ``none``. With ``training``, the smooth background that
+            each fit learns on its training scans is added to its predictions. With ``shared``, the
+            measurement model, learned together with the fit, is applied to its predictions.
         noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors. By
             default the floor is estimated from the held-out residuals of the best model.
-        open_lock_box: also train on all development scans and score the locked ones.
+        open_lock_box: also train on all development scans and score this training on the locked scans.
         seed: seed of the split, the nuisance blocks and the training.
         workers: local processes that fit and predict; ``dask``: address of a Dask scheduler instead.
 
     Raises:
-        InputError: no model, an unknown or repeated one, a store that cannot be read or is too small for the
-            split or the lock box, too many first folds, a noise analysis of other data, a damaged cache, or
-            an ``out`` whose benchmark contains more than this one.
+        InputError: no model, an unknown or repeated model, a store that cannot be read or is too small for
+            the split or the lock box, too many first folds, a noise analysis of other data, a damaged cache,
+            or an ``out`` that holds a benchmark with more models or scans than this one.
     """
     require_models(models)
     dataset = open_store(store)
@@ -172,8 +172,8 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
     """Return the fits by model and fold number, each with the predicted heights of its held-out scans."""
     fits: _Fits = {}
     done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-    # Models differ too much for a common estimate of the time, so each model has its own, unless the work
-    # runs elsewhere.
+    # The models' training times differ too much for a common estimate, so the time is estimated for each
+    # model separately, unless the work runs elsewhere.
     of = len(jobs) if places.elsewhere else 0
     first, rest = jobs[0][1], len({job[1].number for job in jobs}) - 1
     started = time.monotonic()
@@ -188,7 +188,9 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored_ids: Sequence[str]) -> None:
-    """Refuse to replace a benchmark that contains more; the same benchmark may be repeated or extended."""
+    """Refuse to replace a benchmark that contains models or scans that this one lacks. The same benchmark may
+    be repeated or extended.
+    """
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)

@@ -1,4 +1,4 @@
-"""Cache a benchmark's fits, with predictions of held-out scans, record and diagnostics.
+"""Cache the fits of a benchmark, each with its predictions of held-out scans, its record and its diagnostics.
 
 Each (model, fold) has its own folder, named by the hash of everything that determines the fit.
 """
@@ -28,13 +28,14 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-# Older results also state the cost of a prediction, and how much it differs in another crop.
+# Older results also state the cost of a prediction, and how much a prediction differs in another crop.
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training scans and on held-out scans.
 
-    All three errors are means over scans of the datum-free error of policy ``offset``, without a background,
-    so that their differences show over-fitting. ``inner_validation_nm`` is None without validation scans.
-    ``measurement`` is the measurement model learned with the fit, if the training scans were freed of it.
+    Each error is the mean over scans of the datum-free error of policy ``offset``, without a background.
+    Differences between the three errors therefore show over-fitting. ``inner_validation_nm`` is None without
+    validation scans. ``measurement`` is the measurement model learned with the fit, if it was removed from
+    the training scans.
     """
 
     background: Background
@@ -48,7 +49,9 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(FitFacts):
-    """The record of one fit: scans, cost and errors in nm (None for a model without training steps)."""
+    """The record of one fit: its scans, cost, and errors in nm. An error is None for a model without training
+    steps.
+    """
 
     model: str
     fold: int
@@ -63,11 +66,12 @@ class FitRecord(FitFacts):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """Return a fit and its heights (ny, nx) of the held-out scans, µm, from the cache or newly fitted.
+    """Return a fit and the heights (ny, nx), µm, that it predicts for the held-out scans, from the cache or
+    newly fitted.
 
     Args:
-        measured: learn the measurement model from a first fit, remove it from the training scans, fit again,
-            and learn the measurement model again.
+        measured: learn the measurement model from a first fit, subtract it from the training scans, repeat
+            the fit, and learn the measurement model again.
 
     Raises:
         InputError: a cached fit that cannot be read.
@@ -86,7 +90,7 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Remove from the training scans the measurement model that is learned from this model's predictions."""
+    """Learn the measurement model from this model's predictions, and remove it from the training scans."""
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -95,7 +99,7 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the expected scan: the print (ny, nx), µm, and what the training scans share."""
+    """Return the expected scan: the print (ny, nx), µm, and the part that the training scans share."""
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)
@@ -110,7 +114,7 @@ def fit_folder(cache: Path, name: str, key: str) -> Path:
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """Read the record of a fit and its heights (ny, nx) of ``held_out_ids``, µm.
+    """Read the record of a fit and the heights (ny, nx), µm, that it predicts for ``held_out_ids``.
 
     Raises:
         InputError: files that are missing or damaged.

@@ -64,13 +64,13 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
 
 
 def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the measured height of one scan and, for each model, measured minus predicted without the scan's
-    terms.
+    """Draw the measured height of one scan and, for each model, the measured minus the predicted height
+    without the scan's terms.
     """
     panels = len(residuals_um) + 1
     columns = min(4, panels)
     rows = -(-panels // columns)
-    # Room for two colour scales beside the panels.
+    # Leave space for two colour scales beside the panels.
     figure = new_figure(2.7 * columns + 1.8, 2.9 * rows)
     first, *others = figure.subplots(rows, columns, squeeze=False).flat
     extent = (0, scan.shape[1] * scan.pitch_um, scan.shape[0] * scan.pitch_um, 0)
@@ -139,7 +139,9 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """Draw a panel for each label and a colour for each model: x, then a solid and perhaps a dashed line."""
+    """Draw one panel for each label, with a solid and perhaps a dashed line against x in the colour of each
+    model.
+    """
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (label, lines) in zip(grid, panels.items(), strict=True):

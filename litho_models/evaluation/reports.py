@@ -54,7 +54,9 @@ def write_benchmark_report(
     predictions_um: Mapping[str, Sequence[np.ndarray]],
     out: str | Path,
 ) -> Path:
-    """Render the result into ``out``; ``predictions_um`` is what each model expects of each scan."""
+    """Render the result into ``out``; ``predictions_um`` contains the map that each model expects for each
+    scan.
+    """
     scores, split = sorted(result.scores, key=lambda s: -s.leading_nm), result.split
     best = scores[-1]
     page = _page(f"Benchmark on {result.dataset.name}", result, {})
@@ -70,7 +72,7 @@ def write_benchmark_report(
     page.heading("Which differences are more than chance?", folded=True)
     page.table(
         result.paired,
-        "Error of one model minus that of another over the same scans, with the same terms fitted.",
+        "Error of one model minus that of another, over the same scans and with the same terms fitted.",
         "pairs.csv",
         digits=3,
     )
@@ -110,7 +112,7 @@ def _errors(
     page.figure(
         plots.error_bars(scores, floor.mae_at(result.nuisance.policy), held_out_on_paper_data), caption
     )
-    page.table(tables.headline_table(scores, result.nuisance, floor), "The same in numbers.", csv_name)
+    page.table(tables.headline_table(scores, result.nuisance, floor), "The values of this plot.", csv_name)
 
 
 def _one_scan(

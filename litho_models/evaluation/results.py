@@ -73,8 +73,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     difference means that the first is better.
 
     Raises:
-        InputError: files that cannot be read; different data, folds, scans or nuisances; or a model that was
-            trained on scored scans, compared with one that was not.
+        InputError: files that cannot be read; results with different data, folds, scans or nuisances; or only
+            one of the models was trained on scored scans.
     """
     import pandas as pd
 
@@ -84,7 +84,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
             raise InputError(
                 f"cannot compare {first} with {second}: {key} differs",
                 got=f"{_short(value)} and {_short(other[key])}",
-                wanted="the same protocol in both",
+                wanted="the same protocol in both results",
             )
     pairs = [(left[name], right[name]) for name in left if name in right]
     if len(left) == len(right) == 1:
@@ -99,7 +99,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Return what two results must share to be compared, and the scores of this result by model."""
+    """Return the facts that must agree if this result is compared with another, and its scores by model."""
     file = Path(path)
     if file.is_dir():
         names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]
@@ -143,6 +143,6 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """Return the first digits of a hash, which are enough to show a difference."""
+    """Shorten a hash to its first digits, which are enough to show a difference."""
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

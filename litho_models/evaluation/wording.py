@@ -11,7 +11,8 @@ _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """State which model predicts best, by how much, whether that is more than chance, and the noise.
+    """State which model predicts best, by how much, whether the difference is more than chance, and the noise
+    floor.
 
     A difference is judged over prints if there are several.
     """
@@ -23,7 +24,9 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """State the error of the model, the part of it that comes from the zero height, and the noise."""
+    """State the error of the model, the part of this error that comes from the zero height, and the noise
+    floor.
+    """
     return _verdict(result, result.scores)
 
 

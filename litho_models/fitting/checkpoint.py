@@ -83,11 +83,11 @@ class CheckpointFolder:
         self._kept = self._kept_history()
 
     def save(self, state: TrainingState) -> None:
-        """Replace the checkpoint as a whole."""
+        """Replace the checkpoint atomically."""
         buffer = BytesIO()
         torch.save((state.model.state_dict(), state.best, state.optimiser.state_dict()), buffer)
         with atomic_folder(self.path) as folder:
-            # torch does not write the file itself, because it raises no OSError on a full disk.
+            # Python writes the file, because torch does not raise an OSError on a full disk.
             (folder / "state.pt").write_bytes(buffer.getvalue())
             record = {"key": self._key, "history": [entry.model_dump() for entry in state.history]}
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -18,7 +18,7 @@ FAST_STEPS = {"pbl": 2000, "fno": 1000}
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # Settings on which a fit by least squares depends.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance"}
-# Upper limit of all counts. No real case needs more, and larger sums lose digits or overflow.
+# Upper limit of all counts. No real case needs larger counts, and with them sums lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
@@ -26,9 +26,9 @@ PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 class TrainingConfig(Record):
     """Settings of one fit. Fits by least squares use only the seed and the nuisances.
 
-    ``nuisance`` names the per-scan terms that are fitted jointly with the model and are never part of it. It
-    excludes the gain, because a part of the gain comes from the layout. The offset is pinned to a mean of
-    zero over the training scans.
+    ``nuisance`` names the per-scan terms that are fitted jointly with the model and are never part of it. The
+    gain is not among them, because a part of the gain comes from the layout. The offset is pinned to a mean
+    of zero over the training scans.
     """
 
     FORMER = frozenset({"free_gain"})

@@ -25,8 +25,8 @@ class Window:
 
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
-    """Cut the window of (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels
-    continue.
+    """Cut the window of a field (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels
+    are repeated.
     """
     (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
     ny, nx = field.shape
@@ -45,8 +45,8 @@ def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: in
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """Choose the windows of one optimiser step, which depend only on seed and step, so that resumed runs are
-    equal.
+    """Choose the windows of one optimiser step. They depend only on seed and step, so that a resumed run
+    gives the same result.
     """
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
@@ -63,8 +63,8 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
     """Group the windows of a step; the groups go through the network one after the other.
 
-    On a CPU a group has at most ``_PASS_PX`` pixels, or one window, which limits the memory and costs no
-    time. Elsewhere all windows form one group.
+    On a CPU a group has at most ``_PASS_PX`` pixels, or one window. This limits the memory and takes no extra
+    time. On other devices all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":

@@ -27,7 +27,8 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# A model in closed form that is close to the data; it gives a network's first scan terms.
+# A model fitted in closed form that is close to the data. A network's first scan terms are estimated from its
+# predictions.
 FIRST_MODEL = "linear"
 
 
@@ -61,7 +62,7 @@ def fit(
         model_name: one of ``litho_models.models.MODELS``.
         scans: scans to learn from, all of one pitch, level height and number of levels.
         config: recipe, variant, seed, nuisances, settings of the model.
-        checkpoint: folder from which a killed run continues.
+        checkpoint: folder of checkpoints, from which an interrupted run continues.
 
     Raises:
         InputError: unknown model, no scans, scans that do not belong together, or a folder with a damaged
@@ -99,7 +100,7 @@ def fit(
         parameters=model.parameter_count,
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
-        # This includes the time before an interruption.
+        # This time includes the part of the training before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
         at_bounds=model.at_bounds,
     )
@@ -109,8 +110,8 @@ def fit(
 def fit_in_cache(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
 ) -> Fitted:
-    """Fit as ``fit`` does, but continue from (and store in) a folder of ``cache`` that is named after the
-    fit's key.
+    """Fit as ``fit`` does, but keep the checkpoints in a folder of ``cache`` that is named after the fit's
+    key.
 
     A benchmark and a loop that train the same model on the same scans thus reuse each other's fits.
     """

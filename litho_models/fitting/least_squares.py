@@ -19,10 +19,10 @@ from litho_data.foundation.kinds import Array
 Loss = Literal["absolute", "squares"]
 Room = tuple[Array, Array]
 
-# Smaller residuals count squared; the limit is far below the noise of a print (16 nm).
+# δ: the loss of smaller residuals is nearly quadratic. This limit is far below the noise of a print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# Below this squared size, a combination of unit columns is rounding error.
+# A combination of unit columns with a smaller squared norm is rounding error.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
@@ -61,12 +61,14 @@ class Rules:
 
     Attributes:
         loss: what is minimised.
-        term_weight: with ``squares``, weight of residuals that scan terms can explain. It is large enough to
-            determine their common part (the datum) and too small for a scan to bias the parameters.
+        term_weight: with ``squares``, the weight of the part of a residual that scan terms can explain. It is
+            large enough to determine the common part of the terms (the datum), and so small that no scan
+            biases the parameters.
         pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
         steps: largest number of steps; ``relative_gain``: a smaller gain of one step ends the fit.
         tries: attempts at one step, each with ten times the damping; ``lowest_damping``: its lower limit.
-        kept_above: derivatives are reused while a step gains this share of the predicted gain; None: never.
+        kept_above: derivatives are reused while the gain of a step is at least this share of the predicted
+            gain; None: never.
     """
 
     loss: Loss
@@ -138,8 +140,8 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """The rows belong first to the parameters, then to the terms of each scan, then to the equations that pin
-    leading terms.
+    """Normal equations. Their rows belong first to the parameters, then to the terms of each scan, and then
+    to the equations that pin leading terms.
 
     With ``squares`` the terms of the scans are eliminated, and only the parameters remain.
     """
@@ -185,7 +187,8 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # These terms are best for the limited step, not for the unlimited one.
+        # These terms are computed for the limited step, because the terms of the unlimited step do not fit
+        # it.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -230,8 +233,8 @@ def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Ar
 
 
 def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
-    """Return the sum of squares of residuals (n,) of these scans; what their own terms explain is weighted
-    down.
+    """Return the sum of squares of the residuals (n,) of these scans. The part that the terms of a scan can
+    explain is weighted down.
     """
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
@@ -240,10 +243,10 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 
 
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
-    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; parameters without effect do no harm.
+    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box. Parameters without effect are allowed.
 
-    If a step were only cut to its bounds afterwards, the other parameters would still fit the uncut step, and
-    fits with an optimum on a bound would converge slowly.
+    If the unlimited step were computed first and then cut to its bounds, the other parameters would still be
+    those of the uncut step, and fits with an optimum on a bound would converge slowly.
 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).
@@ -259,7 +262,7 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
         return step
     factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
     target = np.linalg.solve(factor, right / scale)
-    # lsq_linear needs distinct bounds; a parameter without room stays where it is.
+    # lsq_linear needs distinct bounds; a parameter without room is not changed.
     width = np.maximum(room[1] - room[0], 1e-12)
     box = (room[0] * scale, (room[0] + width) * scale)
     return lsq_linear(factor.T, target, box, method="bvls").x / scale

@@ -15,7 +15,9 @@ from litho_models.fitting.crops import Window, cut
 
 
 class Patch(TypedDict):
-    """One patch: layout with its margin, measured height, which pixels count, its scan and its corner."""
+    """One patch: the layout with its margin, the measured height, the mask of pixels that count, the scan,
+    and the patch's corner.
+    """
 
     layout_um: Tensor
     height_um: Tensor
@@ -26,7 +28,7 @@ class Patch(TypedDict):
 
 
 class PatchDataset(Dataset[Patch]):
-    """Squares drawn from the scans of a store; each depends only on the seed and its index.
+    """Squares drawn from the scans of a store. Each square depends only on the seed and on its index.
 
     ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
     sees what lies beyond its edge. ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid`` (1,
@@ -37,8 +39,8 @@ class PatchDataset(Dataset[Patch]):
         store: dataset store or its path. Locked scans are left out.
         size_px: side s of a patch; ``margin_px``: m.
         per_scan: number of patches from each scan.
-        ids: scans to draw from; all that are not locked by default.
-        seed: decides the places.
+        ids: scans to draw from; by default all that are not locked.
+        seed: decides the positions of the patches.
 
     Raises:
         InputError: unknown or locked ids, or a patch that is larger than a scan.

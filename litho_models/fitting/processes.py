@@ -9,8 +9,8 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Join the processes of torchrun, over gloo for processors and NCCL for GPUs, where each process has its
-    own GPU.
+    """Join the processes of torchrun: by gloo on CPUs, or by NCCL on GPUs, where each process uses a separate
+    GPU.
 
     Returns:
         The number of this process, from 0, and how many processes there are.

@@ -14,7 +14,7 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Relative to the mean square of each feature after the scans' own terms are removed. The ridge affects only
+# Ridge, relative to the mean square of each feature after the terms of the scans are removed. It affects only
 # weights that the scans cannot distinguish. On the measured prints all values from 1e-6 to 1e-4 give the same
 # result.
 RIDGE = 1e-5
@@ -27,7 +27,7 @@ KEPT_BYTES = 2**31
 # The first pass minimises squares; the second reweights them to absolute values, so that blobs have little
 # weight.
 PASSES = 2
-# Weight of the scan terms; it determines the common datum.
+# Weight of the scan terms, which determines the common datum.
 _TERM_WEIGHT = 1e-3
 
 

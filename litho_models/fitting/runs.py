@@ -57,7 +57,7 @@ def train(
     settings: dict[str, Any] | None = None,
     use_lock_box: bool = False,
 ) -> TrainingRun:
-    """Train a model on a store into a run folder; the same call again continues a killed run.
+    """Train a model on a store and write it to a run folder; repeating the call continues an interrupted run.
 
     The scans of the lock box are left out unless ``use_lock_box``. Under ``torchrun`` the processes share
     each step, and the first one writes.

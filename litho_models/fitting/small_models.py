@@ -18,7 +18,7 @@ from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
-# A quarter of each scan is enough for a small model; successive scans use different quadrants.
+# One quadrant of each scan is enough to fit a small model; successive scans use different quadrants.
 WINDOW_PX = 256
 THINNING_PX = 2
 # Largest step of a parameter. Parameters are heights in µm and raw numbers of ranges, for which larger steps
@@ -74,8 +74,8 @@ class ModelProblem:
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
-    """Return the smallest and largest step (p,) of a model's trainable numbers: their ranges and
-    ``STEP_LIMIT``.
+    """Return the smallest and largest step (p,) of a model's trainable numbers, which their ranges and
+    ``STEP_LIMIT`` allow.
     """
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)
@@ -125,7 +125,7 @@ class _Sample:
             return self.predict(model).double().numpy()
 
     def predict(self, model: Simulator) -> Tensor:
-        """Predict the height of the window, (y, x) µm, with its surroundings."""
+        """Predict the height of the window, (y, x) µm, from the layout of the window and its surroundings."""
         if model.reach_px is None:
             return model(stack([self._layout_um], [self._window]))[0, 0]
         return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]

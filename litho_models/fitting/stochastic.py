@@ -3,7 +3,7 @@
 Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
 scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
 and step, so an interrupted run continues to the same result. Processes share the crops of each step and add
-their gradients. Between rounds every process computes the same.
+their gradients. Between rounds every process does the same computations.
 """
 
 import math
@@ -118,7 +118,8 @@ class _Targets:
     """The layouts of the training scans, and their heights without scan terms; unmeasured pixels have no
     weight.
 
-    Around each scan the outermost pixels of its layout continue for ``overhang_px``; their weight is zero.
+    Around each scan the outermost pixels of its layout are repeated for ``overhang_px``; the added pixels
+    have weight zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
@@ -135,7 +136,9 @@ class _Targets:
 def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
-    """Do one step; return (2,): weighted absolute error, µm, and weight. A GPU may still be computing it."""
+    """Do one step; return the weighted absolute error, µm, and the weight as one tensor (2,), which a GPU may
+    still be computing.
+    """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
@@ -143,7 +146,7 @@ def _step(
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    # A process without a crop of its own uses the gradients of a crop with weight 0.
+    # A process without a crop in this step computes the gradients of some crop with weight 0.
     for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
         share = len(some) / len(batch) if own else 0.0
@@ -157,13 +160,13 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows; for the record, also return (2,) their weighted absolute error, µm,
-    and weight.
+    """Return the loss of some windows and, for the record, a tensor (2,) with their weighted absolute error,
+    µm, and their weight.
 
     A random crop includes its surroundings or is one tile of the model; a quadrant is an image of its own.
     """
     tile = model.tile if config.crops == "random" else None
-    # The reach changes in training if a blur learns its width.
+    # The receptive radius changes during training if the width of a blur is learned.
     reach = model.reach_px if config.crops == "random" else None
     predict = model if tile is None and reach is None else model.interior
     layout, height, weight = (
@@ -178,10 +181,11 @@ def _losses(
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # Each pixel has the weight that it has in the blended field.
+        # Each pixel gets the same weight as in the blended field.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # The mean is over all pixels, valid or not, so that crops count equally in groups of any size.
+    # The mean is taken over all pixels, valid or not, so that every crop has the same weight, whatever the
+    # size of its group.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 
@@ -190,7 +194,7 @@ def _crops(
     fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int, device: torch.device
 ) -> Tensor:
     crops = stack(fields, windows, margin_px)
-    # A copy from pinned memory does not wait for the work that the GPU is doing.
+    # A copy from pinned memory runs without waiting for the GPU to finish its current work.
     return crops.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else crops.to(device)
 
 
@@ -209,8 +213,8 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Return the rate of one step: constant, or up along a cosine for a tenth of the steps and down for the
-    rest.
+    """Return the learning rate of one step: constant, or rising along a cosine for a tenth of the steps and
+    falling for the rest.
     """
     if config.schedule == "constant":
         return config.learning_rate

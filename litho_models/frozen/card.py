@@ -23,14 +23,14 @@ EffectValues = dict[str, dict[str, float]]
 # The side to which an effect of undetermined role is attributed.
 Attribution = Literal["printer", "microscope"]
 
-# These lists are looked up in `training` and `split`; everything else there is free-form.
+# Code reads only these lists in `training` and `split`; all other entries there are free-form.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported figure, with its scans, nuisances and background.
+    """One reported error or other figure, with the scans, nuisances and background for which it holds.
 
-    ``ci95`` is its interval over scans.
+    ``ci95`` is the 95 % interval over scans.
     """
 
     name: str
@@ -113,7 +113,7 @@ class ModelCard(RunFacts, Result):
         """Read the card in a folder.
 
         Raises:
-            InputError: no card there, or one that is damaged or of another schema.
+            InputError: no card in the folder, or a card that is damaged or of another schema.
         """
         if not Path(path).exists():
             raise InputError(
@@ -138,6 +138,6 @@ class ModelCard(RunFacts, Result):
 
 
 def bounds_text(at_bounds: dict[str, float]) -> str:
-    """Explain that fitted values lie on their bounds."""
+    """Return a sentence that names the fitted values that lie on their bounds."""
     named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
     return f"On a bound of its range, so that the fit may want more than the model allows: {named}."

@@ -40,8 +40,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
         size_px: side of the layout.
 
     Raises:
-        InputError: another suffix; no ``onnx``; a model whose operations the format does not have, or
-            whose program would predict other heights.
+        InputError: another suffix; ``onnx`` is not installed; the format lacks an operation of the model; or
+            the program would predict other heights.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:
@@ -69,8 +69,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 class _Numbers(TorchDispatchMode):
     """The Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
-    These numbers are the radii of kernels, which follow from widths, and the ends of tables. Radii and ends
-    follow from the weights alone, so a program may contain them as constants.
+    These numbers are the radii of kernels, which follow from the kernels' widths, and the ends of tables.
+    They depend only on the weights, so a program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):

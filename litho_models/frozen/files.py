@@ -1,7 +1,8 @@
-"""Frozen models as folders of weights and a plain card, written once and loaded without running anything.
+"""Write and load frozen models: folders with weights and a plain card, which are loaded without running any
+code.
 
-``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card for people.
-Only numbers and names of known classes are read; nothing is unpickled.
+``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card in readable
+form. Only numbers and names of known classes are read; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -47,9 +48,10 @@ def save_frozen(
         simulator: the fitted model.
         folder: output folder; an older model there is replaced as a whole.
         name: name in reports; the model's own by default.
-        process_effects: effects of the printer that are part of the model, name to parameter values.
-        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); those that follow
-            from the model are derived again.
+        process_effects: effects of the printer that become part of the model: parameter values by the name of
+            the effect.
+        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); fields that
+            follow from the model are always computed from it.
 
     Raises:
         InputError: weights that are not finite or not float32, or unknown card fields.
@@ -86,11 +88,13 @@ def save_frozen(
 def load_frozen(
     source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
-    """Load a frozen model in eval mode, with weights without gradients, including its effects of the printer.
+    """Load a frozen model, including its effects of the printer, in eval mode and without gradients for the
+    weights.
 
     Args:
-        source: what ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for one that ``push`` shared.
-        device: where to put it.
+        source: folder that ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for a model that
+            ``push`` shared.
+        device: device on which the model is placed.
         extrapolate: accept heights beyond the calibrated range.
 
     Raises:
@@ -115,10 +119,11 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
 
     Args:
         source: as for ``load_frozen``.
-        repository: ``owner/name``; made if need be, private or not.
+        repository: ``owner/name``; created if it does not exist, as a private repository if ``private``.
 
     Raises:
-        InputError: what ``load_frozen`` refuses, a repository that refuses, or no huggingface_hub.
+        InputError: a source that ``load_frozen`` refuses, a repository that refuses the upload, or
+            huggingface_hub is not installed.
     """
     load_frozen(source)
     return hub.upload(zoo.model_folder(source), repository, private=private)
@@ -128,7 +133,7 @@ def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
     """Load the base model of a frozen folder without its effects, and check its weights against the card.
 
     Raises:
-        InputError: weights missing, damaged, or of another model than the card says.
+        InputError: weights that are missing, damaged, or not those of the model in the card.
     """
     weights = Path(folder) / WEIGHTS_FILE
     if not weights.is_file():

@@ -26,13 +26,14 @@ def freeze(
     Args:
         source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
         out: folder of the frozen model.
-        attribute: the side to which effects of undetermined role are attributed, one for all or by name.
-            Effects of the printer become part of the model, those of the microscope do not. The card records
-            this. ``scan-axis`` is the part of a base model that acts along the lines of the scan.
+        attribute: the side to which effects of undetermined role are attributed: one side for all effects, or
+            one by name. Effects of the printer become part of the model, those of the microscope do not. The
+            card records the attribution. ``scan-axis`` is the part of a base model that acts along the lines
+            of the scan.
 
     Raises:
-        InputError: no model there, an effect that is not among the undetermined ones, an unknown side, or
-            ``scan-axis`` attributed to the printer in a model that was frozen without it.
+        InputError: ``source`` has no model, an effect is not among the undetermined ones, a side is unknown,
+            or ``scan-axis`` is attributed to the printer in a model that was frozen without it.
     """
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER

@@ -14,13 +14,13 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Return the folder of a model; it is fetched unless the cache of huggingface_hub contains it.
+    """Return the folder of a model, which is downloaded unless the cache of huggingface_hub contains it.
 
     Args:
         address: ``hf://owner/name``, or ``hf://owner/name@revision``.
 
     Raises:
-        InputError: no such address or repository, or no huggingface_hub.
+        InputError: no such address or repository, or huggingface_hub is not installed.
     """
     repository, _, revision = address.removeprefix(ADDRESS).partition("@")
     with _hub(repository) as hub:
@@ -31,7 +31,8 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
     """Make the repository if necessary and put the three files of a frozen model into it; return its address.
 
     Raises:
-        InputError: no such address, a repository that refuses, or no huggingface_hub.
+        InputError: no such address, a repository that refuses the upload, or huggingface_hub is not
+            installed.
     """
     repository = repository.removeprefix(ADDRESS)
     with _hub(repository) as hub:
@@ -52,6 +53,6 @@ def _hub(repository: str) -> Iterator[Any]:
         raise InputError(what, got=f"no {error.name}", hint="pip install 'litholoop[hub]'") from None
     try:
         yield huggingface_hub
-    # These are its own errors, and those of whatever network library it uses.
+    # These are the errors of huggingface_hub, and those of the network library that it uses.
     except Exception as error:
         raise InputError(what, got=str(error).strip().partition("\n")[0]) from error

@@ -52,8 +52,8 @@ def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Return whether a model was made from the prints in a store: the same dataset, or the same locked scans
-    in it.
+    """Return whether a model was made from the prints in a store: from the same dataset, or with the same
+    locked scans.
     """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
@@ -62,9 +62,9 @@ def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
 def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the scans of a store that were locked when the model was made, identified by their raw files.
 
-    Another recipe or registration changes every height of a store, and an added or missing scan changes which
-    scans it locks, but neither changes a raw file. If a card lists no files, the ids of its lock box are
-    locked in a dataset of the same name.
+    Another recipe or registration changes every height of a store, and an added or missing scan changes the
+    choice of locked scans. Neither changes a raw file. If a card lists no raw files, return the ids in its
+    lock box, but only for a dataset of the same name.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

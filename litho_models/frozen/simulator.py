@@ -65,9 +65,9 @@ class FrozenSimulator(nn.Module):
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
-        """Print in ``precision`` inside the block, see ``network_precision``; float32 otherwise.
+        """Predict in ``precision`` inside the block, see ``network_precision``; otherwise in float32.
 
-        One line on stderr says whether that is slower than float32.
+        A line on stderr warns if this precision is slower than float32.
         """
         warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
         before, self._precision = self._precision, precision
@@ -77,7 +77,7 @@ class FrozenSimulator(nn.Module):
             self._precision = before
 
     def train(self, mode: bool = True) -> FrozenSimulator:
-        """Return the frozen models stay in eval mode."""
+        """Return the model unchanged, because frozen models stay in eval mode."""
         return super().train(False)
 
     def forward(
@@ -88,11 +88,12 @@ class FrozenSimulator(nn.Module):
         Args:
             layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
                 ``double()``.
-            pitch_um: sampling of the layout, if the caller wants it checked; so is ``level_height_um``.
+            pitch_um: sampling of the layout, and ``level_height_um`` its level height; each is checked if
+                given.
 
         Raises:
-            InputError: another pitch or level height, no tensor, another shape or dtype, or heights beyond
-                the calibrated range without ``extrapolate``.
+            InputError: another pitch or level height, a layout that is no tensor or has another shape or
+                dtype, or heights beyond the calibrated range without ``extrapolate``.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -100,8 +101,8 @@ class FrozenSimulator(nn.Module):
         return self._in_precision(self.simulator, layout_um)
 
     def predict(self, layout_um: Field, pitch_um: float | None = None) -> Field:
-        """Print a layout of any kind and number of dimensions; return the height in the same kind and shape,
-        µm.
+        """Predict the print of a layout given as any kind of array with any number of dimensions; return the
+        height, µm, as the same kind of array with the same shape.
 
         Args:
             layout_um: nominal height (..., y, x), µm, of any float type: an array of NumPy or xarray (whose
@@ -109,7 +110,8 @@ class FrozenSimulator(nn.Module):
             pitch_um: sampling of the layout, if the caller wants it checked.
 
         Raises:
-            InputError: as ``forward``; whole numbers, which would be levels; fewer than two dimensions.
+            InputError: as ``forward``; also for whole numbers, which would be levels, and for fewer than two
+                dimensions.
         """
         self.check_geometry(pitch_um)
         if isinstance(layout_um, Tensor):
@@ -140,7 +142,7 @@ class FrozenSimulator(nn.Module):
             raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), all larger than 0")
         dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
         fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
-        # Fields are printed one after the other, so that a stack needs no more memory than one field.
+        # Fields are predicted one after the other, so that a stack needs no more memory than one field.
         return torch.cat([self(field) for field in fields]).reshape(layout_um.shape)
 
     def __repr__(self) -> str:
@@ -155,11 +157,12 @@ class FrozenSimulator(nn.Module):
         return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
-        """Print as ``forward`` does, without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border)
-        µm.
+        """Predict as ``forward`` does, but leave out the outermost ``border_px``: (b, 1, y - 2 border, x - 2
+        border) µm.
 
-        With a border at least as wide as the receptive radius, or with a model on tiles, only what the result
-        needs is computed. In the first case nothing is assumed beyond the edge of the layout.
+        If the border is at least as wide as the receptive radius, or if the model runs on tiles, only the
+        pixels that the result needs are computed. In the first case nothing is assumed about the layout
+        beyond its edge.
 
         Raises:
             InputError: as ``forward``, or a border that leaves nothing.
@@ -189,13 +192,13 @@ class FrozenSimulator(nn.Module):
                 "layout",
                 got=f"a {type(layout_um).__name__}",
                 wanted="a tensor of PyTorch",
-                hint="torch.from_numpy makes one of a NumPy array",
+                hint="torch.from_numpy converts a NumPy array",
             )
         if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
             raise InputError(
                 "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), all larger than 0"
             )
-        # A model without weights takes every floating-point layout.
+        # A model without weights accepts a layout of any floating-point type.
         own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
         wanted = next((weight.dtype for weight in self.parameters()), own)
         if layout_um.dtype != wanted:
@@ -239,7 +242,7 @@ def _check_sampling(layout_um: xr.DataArray, pitch_um: float) -> None:
     for name in ("y_um", "x_um"):
         if name in layout_um.coords:
             steps = np.diff(layout_um[name].to_numpy())
-            # A millionth of a pixel allows for rounding of positions across a millimetre.
+            # A tolerance of a millionth of a pixel allows for the rounding of positions across a millimetre.
             if not np.allclose(steps, pitch_um, rtol=1e-6, atol=0):
                 got = f"steps of {steps.min():g} to {steps.max():g} µm"
                 raise InputError(f"{name} of the layout", got=got, wanted=f"{pitch_um:g} µm")

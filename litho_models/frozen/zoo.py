@@ -1,4 +1,4 @@
-"""Names and folders of the frozen models in the package, which are the models of the benchmark's table.
+"""Names and folders of the frozen models in the package. They are the models in the benchmark's table.
 
 ``load_frozen("zoo:pbl")`` opens one of them, and ``load_frozen("zoo:best")`` the one that predicts held-out
 scans best.
@@ -45,7 +45,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
     Args:
         source: what the user typed.
-        other: further names that the caller accepts, for the message.
+        other: further names that the caller accepts, which the error message lists too.
 
     Raises:
         InputError: no such folder, no such model in the zoo, or one that cannot be fetched.

@@ -17,14 +17,14 @@ SUPPORT_SIGMAS = 4.0
 # At this smallest sigma the weight of the next pixel is negligible (exp(-50)), and 1/sigma stays finite.
 _SMALLEST_SIGMA_PX = 0.1
 # Block sizes in pixels for kernels with a radius below 64 px, and for wider ones. Wider blocks multiply more
-# zeros of the band; narrower blocks multiply more slowly.
+# zeros of the band matrix; products of narrower blocks are slower.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 # This radius is wider than any printed field; a larger one would exhaust memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# The radius of a kernel is four sigma, or three sigma cut to whole pixels (the authors' code).
+# The radius of a kernel is four sigma or, as in the authors' code, three sigma rounded down to whole pixels.
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -81,7 +81,8 @@ def gaussian_blur(
 
 
 def kernel_radius_px(sigma_px: float) -> int:
-    """Return a radius, in whole pixels, that contains ``SUPPORT_SIGMAS`` standard deviations; at least 1.
+    """Return the radius, in whole pixels, of a kernel that contains ``SUPPORT_SIGMAS`` standard deviations;
+    at least 1.
 
     Raises:
         InputError: a Gaussian wider than any field, or without a width.
@@ -96,7 +97,7 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Return the radius of a kernel by a model's rule, at most ``cap_px`` if given."""
+    """Return the radius of a kernel by the rule ``support`` of a model, limited to ``cap_px`` if given."""
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 

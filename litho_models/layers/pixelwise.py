@@ -17,9 +17,9 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
     """Evaluate ``function`` at all pixels, (n,); gradients flow to the features.
 
     Args:
-        function: maps features of any number m of pixels, (m, ...) each, to m values, (m,).
+        function: maps the features of m pixels, (m, ...) each, to m values, (m,), for any m.
         features: (n, ...) each.
-        parameters: parameters of the function; gradients flow to trained ones.
+        parameters: parameters of the function; gradients flow to those that are trained.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
@@ -69,8 +69,8 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 
     Args:
         values: where to evaluate.
-        knot_heights: function at ``len(knot_heights)`` equally spaced knots from ``lowest`` to
-            ``highest``; beyond them the outermost segment continues.
+        knot_heights: function values at ``len(knot_heights)`` equally spaced knots from ``lowest`` to
+            ``highest``; beyond the knots the outermost segment is extrapolated.
     """
     last = knot_heights.numel() - 1
     position = (values - lowest) * (last / (highest - lowest))

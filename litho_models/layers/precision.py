@@ -16,7 +16,7 @@ _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
 @contextmanager
 def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
-    """Inside the block, networks multiply in ``precision``; heights and blurs stay in float32."""
+    """Let networks multiply in ``precision`` inside the block; heights and blurs stay in float32."""
     with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
         yield
 
@@ -30,7 +30,7 @@ def warn_where_slower(precision: Precision, device_type: str) -> None:
 def has_bfloat16_unit() -> bool:
     """Return whether this processor multiplies in bfloat16; if not, bfloat16 is emulated in float32."""
     known = getattr(torch.cpu, "get_capabilities", None)
-    # Older versions of PyTorch cannot tell; then we assume that there is such a unit.
+    # Older versions of PyTorch cannot list the features. A bfloat16 unit is then assumed.
     return known is None or any(known().get(unit) for unit in _UNITS)
 
 

@@ -14,7 +14,8 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# At this raw number a sigmoid has 7 % of its largest slope and is 2 % of the range from the bound.
+# At this raw number a sigmoid has 7 % of its largest slope, and its value is 2 % of the range away from the
+# bound.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 

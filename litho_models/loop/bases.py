@@ -1,4 +1,4 @@
-"""Choose the base models that the loop may correct: the one that is asked for, or several small ones."""
+"""Choose the base models that the loop may correct: the requested one, or several small ones."""
 
 from __future__ import annotations
 
@@ -35,15 +35,16 @@ def bases_for(
     """Return the models that may be corrected, by name. A network is trained once without each fold.
 
     Args:
-        base: name of a model, a frozen model (its folder, ``zoo:NAME``), or ``auto``, with which small models
-            compete.
-        study: scans, folds, seed, workers.
-        steps: optimiser steps of a network, None: those of its recipe; ``cache``: folder for its trainings.
+        base: name of a model, a frozen model (its folder, ``zoo:NAME``), or ``auto``, which lets small
+            models compete.
+        study: the scans with their folds, the seed and the workers.
+        steps: number of optimiser steps of a network; None uses the number in its recipe.
+        cache: folder that keeps trained networks.
         fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
-        InputError: an unknown base, a base of another pitch, or settings for a base that is not a small
-            model.
+        InputError: the base is unknown, its pitch differs from that of the scans, or settings are given
+            for a base that is not a small model.
     """
     scans = [scan.stored for scan in study.scans]
     named = _built(base, scans[0], fields) if base in MODELS else None

@@ -1,4 +1,4 @@
-"""Check the name of a cause beside everything else in the model.
+"""Check whether the name of a cause is right when everything else is in the model.
 
 If the name is right, the residual no longer depends on the named change. If the name only resembles the true
 cause, the residual contains variants of the change: scaled with height or position, blurred, displaced or
@@ -36,8 +36,8 @@ class Check:
     Attributes:
         state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all candidates that could
             replace a cause.
-        left_nm2: squared error that features of layout and position still explain beside the model.
-        secants: secants of the laws.
+        left_nm2: part of the squared residual of the model that features of layout and position explain.
+        secants: changes that the laws make in the scans.
     """
 
     state: State
@@ -75,18 +75,19 @@ class Check:
             reason = f"its best length is outside the range of this effect: {', '.join(outgrown)}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
             reason = f"its best strength is beyond the largest possible one: {', '.join(exhausted)}"
-        # If a small part of the causes is still missing, any columns explain some of it, so a small gain
-        # proves nothing.
+        # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
+        # that is small relative to the unexplained error therefore proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             taken = f"variants of its change gain another {100 * share:.0f} %"
             reason = f"only resembles the cause: {taken}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Name a much larger law, or a much larger cause of which a variant takes half of this cause's gain.
+        """Return the name of a much larger law, or of a much larger cause whose variants replace this cause.
 
-        A cause with at most a tenth of another's gain may only correct the other's formula. Laws are
-        approximate anyway. Return an empty name if there is no such law or cause.
+        A cause that gains less than a tenth of a larger one may only correct the formula of the larger one.
+        Every law is approximate, so a larger law is always returned. A larger cause is returned if its
+        variants gain at least half of what this cause gains. Return an empty name if there is neither.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -115,10 +116,10 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Refuse the name of a cause that passed all other checks if it is part of a larger table.
+        """Refuse the name of a cause that passed all other checks if a table explains more.
 
-        The cause is refused if the best table in its place gains over twice as much, and the cause gains
-        nothing in addition to the table.
+        The cause is refused if a table in its place gains over twice as much, and the cause gains nothing in
+        addition to the table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -130,9 +131,7 @@ class Check:
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """Return the law with the largest predicted gain, if that is at least a fair part of the cause's
-        gain.
-        """
+        """Return the law with the largest predicted gain; None if all laws gain much less than the cause."""
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
@@ -156,8 +155,8 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    # Weight of the prior for "no variant", in scans. Without it, so many parameters would fit the noise of a
-    # few scans.
+    # The last number of the block is the weight, in scans, of the prior that no variant is present. Without
+    # this prior, so many parameters would fit the noise of a few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)

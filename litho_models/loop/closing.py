@@ -39,13 +39,13 @@ class Closed:
     """The choices and fits that the loop makes on some of the scans.
 
     Attributes:
-        base_name: name of the chosen base; ``rivals``: results of the same search beside the other bases.
-        plain: the base fitted to the original scans; ``base``: the base fitted to scans freed of what groups
-            share.
+        base_name: name of the chosen base; ``rivals``: results of the same search with the other bases.
+        plain: the base fitted to the original scans; ``base``: the base fitted to the scans after the
+            measurement errors that groups of scans share are subtracted.
         named: result of the search among causes; ``lawful``: result of the search for short laws in addition
             to the causes.
         described: tables over a covariate, which describe the remaining error; they act last in the model.
-        rests: what features of layout and position still explain after each stage.
+        rests: the part of the residual that features of layout and position still explain after each stage.
         untestable: effects that could not be tested, with reasons.
     """
 
@@ -66,7 +66,7 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the scans freed of what the scans of a group share."""
+        """Return the scans without the measurement errors that the scans of a group share."""
         return self.base.study
 
     @property
@@ -85,8 +85,9 @@ class Closed:
         return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether every other base lacks the cause too; bases with more parameters, which may have
-        absorbed it, are ignored.
+        """Return whether the search finds the cause with every other base too.
+
+        Bases with more parameters are ignored, because they may have absorbed the cause.
         """
         base = self.plain.twin.own
         small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
@@ -149,7 +150,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
 
 def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
-    """Name the bases with which a search found the cause, or an effect that looks the same."""
+    """Return the names of the bases with which a search found the cause, or an effect that looks the same."""
     alike = {cause.name, *cause.alike}
     return [
         name
@@ -159,10 +160,10 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 
 
 def _simplest(searches: Mapping[str, Found]) -> str:
-    """Choose a base model among those that do as well as the best.
+    """Choose the simplest base model among those with nearly the smallest error.
 
-    The choice is the base with the fewest causes that are not found with every other base, and among equals
-    the one with the fewest parameters.
+    The choice is the base with the fewest causes that were not found with all other bases. Among equals, it
+    is the base with the fewest parameters.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -183,7 +184,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     A cause that fails is removed, and the search for laws is repeated without it.
 
     Args:
-        start: the base; ``named``: its causes, from which refused ones are removed.
+        start: the base; ``named``: its causes; refused causes are removed from it.
     """
     study = start.study
     # Laws and tables describe heights, not films.
@@ -204,8 +205,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # Causes that may only correct another formula are removed first, so that this formula is judged
-        # without them.
+        # Causes that may only correct another formula are removed first, so that the other formula is
+        # judged without them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -227,9 +228,9 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """Add the largest table to the model if it gains more than all causes together.
+    """Add the table with the largest gain to the model if it gains more than all causes together.
 
-    A table fits almost anything, so it must gain more than all causes together, not just more than one.
+    A table fits almost anything, so to gain more than a single cause is not enough.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

@@ -1,4 +1,4 @@
-"""Compute the errors of a loop's models on held-out scans, each with its own measurement model."""
+"""Compute the errors of a loop's models on held-out scans, each model with its own measurement model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Return the errors of maps (y, x), µm, under each reported policy. Scans of films have no free zero.
+    """Return the errors of predicted maps (y, x), µm, under each reported policy; films get no offset.
 
     Args:
         numbers: number of fitted parameters of printer and measurement;
@@ -88,10 +88,11 @@ class HeldOut:
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Return the errors of all models. Each scan is predicted without its fold; base and final model also
-        predict it without its print.
+        """Return the errors of all models.
 
-        The model with only the causes is listed between base and final model if it differs from both.
+        Each scan is predicted by a fit to the scans outside its fold. The base and the final model also
+        predict it by a fit to the other prints. The model with only the causes is listed between the base and
+        the final model if it differs from both.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
@@ -117,9 +118,9 @@ class HeldOut:
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """Return how much the error (k = 1) grows without each cause or law, after the others are refitted.
+        """Return how much the error (k = 1) grows without each cause or law, after the model is refitted.
 
-        The printer's own parameters stay fixed, and the measurement is learned again.
+        Printer parameters then stay fixed, and the measurement is learned again.
         """
 
         def error_nm(state: State) -> float:
@@ -134,8 +135,9 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return the residual maps (y, x), nm, of all scans before and after, without the offset of each
-        scan.
+        """Return the residual maps (y, x), nm, of all scans before and after the correction.
+
+        The offset of each scan is removed.
         """
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
@@ -158,11 +160,12 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Predict all scans by fits without their part; also return the largest number of parameters of these
-        fits.
+        """Predict each scan by a fit to the scans outside its part.
+
+        Also return the largest number of parameters of these fits.
 
         Args:
-            starts: maps a part of the scans to the start of its fit.
+            starts: model from which the fit without a part starts, by part; ``part_of``: part of each scan.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -194,8 +197,9 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Return the errors of scans under models chosen without them; ``found`` contains these models and their
-    scans.
+    """Return the errors of models on scans that were not used to choose them.
+
+    ``found`` contains pairs of models and the scans that these models did not use.
     """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))

@@ -1,4 +1,4 @@
-"""Fit a model of the printer to all scans, and without each fold, in order to predict that fold.
+"""Fit a model of the printer to all scans, and once without each fold in order to predict that fold.
 
 Per-scan terms are projected out, so they do not bias the parameters of the printer.
 """
@@ -94,20 +94,21 @@ class Study:
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Return the radius of the first scan's tip, or its upper bound, if the store has one."""
+        """Return the tip radius, or its upper bound, of the first scan that has one; otherwise None."""
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
     @property
     def of_films(self) -> bool:
-        """Return whether the scans are micrographs of a film; their edges are scored, and their heights do
-        not drift.
+        """Return whether the scans are micrographs of a film.
+
+        The edges of such scans are scored, and their heights do not drift.
         """
         return self.scans[0].stored.seen_by == "sem"
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
-        """Return the groups of the scans."""
+        """Return the label of each scan in every grouping."""
         return groupings([scan.stored for scan in self.scans])
 
 
@@ -119,7 +120,7 @@ class State:
         twin: the model fitted to all scans; ``per_fold``: the models fitted without each fold.
         linear: residual, derivatives and free terms of each window at ``twin``.
         held_out_um: residual (n,) of each window, predicted without its fold.
-        freed_um: the same residuals without the free terms of each scan.
+        freed_um: ``held_out_um`` after the free terms of each scan are projected out.
     """
 
     study: Study
@@ -133,7 +134,7 @@ class State:
 
     @cached_property
     def freed_nm2(self) -> np.ndarray:
-        """Return the squared error (scans,) per pixel of ``freed_um``."""
+        """Return the mean square of ``freed_um`` for each scan, (scans,), nm²."""
         return np.array([NM_PER_UM**2 * np.mean(left**2) for left in self.freed_um])
 
     @property
@@ -151,15 +152,13 @@ class State:
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predict the prints (y, x) of the scans or their windows, each by the model fitted without its
-        fold.
-        """
+        """Predict the print (y, x) of each scan, or of its window, by the model fitted without its fold."""
         folds = zip(self.study.fold_of, scans, strict=True)
         return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
 
 class TwinProblem:
-    """The least-squares problem of a model on windows of scans, with one-sided difference quotients."""
+    """The least-squares problem of a model on windows of scans; derivatives are difference quotients."""
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin = twin
@@ -192,18 +191,18 @@ class TwinProblem:
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest allowed steps: effects stay in range, and the base parameters change only a
-        little at once.
+        """Return the largest allowed steps. They keep effects in range and change base parameters only a
+        little.
         """
         return self._twin.at(vector).room()
 
 
 def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
-    """Fit a model to all windows of a study, then without each fold.
+    """Fit a model to all windows of a study, then once per fold without the windows of that fold.
 
     Args:
-        from_here: start at the current values; otherwise at these or at the base's default values, whichever
-            are better.
+        from_here: start at the current values. Otherwise, start at these values or at the base's default
+            values, whichever lead to the smaller error.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -224,7 +223,9 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Choose the start of a fit, the current values or the base's default values, by a fit to some scans.
+    """Return the start of a fit: the current values or the base's default values.
+
+    The choice is the start from which a fit to some of the scans leads to the smaller error.
 
     A base that was fitted without an effect has absorbed part of it, and may be stuck in a local optimum when
     the effect is added.
@@ -241,8 +242,9 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Project the free terms of a scan, at its prediction (y, x), µm, out of columns (n, m) at the sampled
-    pixels.
+    """Project the free terms of a scan out of columns (n, m) at its sampled pixels.
+
+    The terms are computed from the prediction (y, x), µm, of the scan.
     """
     basis = window.free_basis(prediction_um, terms)
     return columns - basis @ (basis.T @ columns)
@@ -251,14 +253,14 @@ def without_terms(
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
     """Fit the model to some of the windows, using the derivatives of the common fit.
 
-    The fit starts from the common fit, which has seen all windows, so it must be iterated to convergence.
+    The fit starts from the common fit, which used all windows, so it must be iterated to convergence.
     """
     twin = common.of_fold(fold)
     problem, vector = TwinProblem(twin, windows), twin.vector
     if not len(vector):
         return twin
     if twin is not common:
-        # The common fit has seen every fold, so its predictions are not held out.
+        # The common fit used every fold, so its predictions are not held out.
         linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(6):

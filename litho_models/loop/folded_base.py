@@ -19,7 +19,7 @@ class FoldedBase(nn.Module):
     """One trained model per fold; each scan is predicted by the model that was trained without it.
 
     Args:
-        models: by fold; ``fold_of``: scan id to fold; ``common``: model for all other scans.
+        models: one per fold; ``fold_of``: fold of each scan id; ``common``: model for scans of no fold.
     """
 
     def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
@@ -43,9 +43,9 @@ class FoldedBase(nn.Module):
 def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
-    """Train a model without each fold, and one on all development scans."""
+    """Train one model per fold on the scans outside the fold, and one model on all scans."""
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
-    # The last model belongs to no fold.
+    # The last model is trained on all scans.
     last = max(fold.values()) + 1
     jobs = [(out, trainer, [one for one in scans if fold[one.id] != out]) for out in range(last + 1)]
     done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")

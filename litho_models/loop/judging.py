@@ -1,8 +1,8 @@
 """Decide whether held-out scans confirm a change of the model; scans are the units of the tests.
 
-First, the change must point the right way in the scans: its inner product with the residual before it is
-positive in every scan that has some of the effect. A sign-flip test checks this. Second, the change at its
-common strength must lower the error; the interval of the gain checks this.
+First, the change must have the right sign: its inner product with the residual before the change is positive
+in every scan that contains the effect. A sign-flip test checks this. Second, the change at its common
+strength must lower the error: the confidence interval of the gain must lie above zero.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 FAMILY_P = 0.05
 # Limit of p for a grouping. The limit is strict because every candidate is tried with every grouping.
 EXCHANGED_P = 0.01
-# If seven scans agree, p is 1/128 by chance, so fewer than eight scans confirm nothing.
+# Seven scans agree by chance with a probability of 1/128, which is too high, so eight scans are needed.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# A strength by group has already passed the test with permuted labels, so up to half of the scans may gain
-# nothing.
+# A strength by group has already passed the test with permuted labels, so this limit is looser: up to half
+# of the scans may gain nothing.
 GROUPED_P = 0.05
 # Smallest share of the squared error that justifies a strength by group, or a search. A change of the model
-# must reduce the squared error by twice this share (1 % of the root), because every formula is slightly
+# must reduce the squared error by twice this share (the rms error by 1 %), because every formula is slightly
 # wrong.
 SMALLEST_SHARE = 0.01
 
@@ -37,7 +37,8 @@ class Judgement:
     Attributes:
         before_nm2, gain_nm2: mean squared error before the change, and its decrease.
         gains_nm2: (scans,) gain of each scan.
-        p: one-sided, by sign flips of the scans' evidence; ``low_nm2``: lower end of the gain's interval.
+        p: one-sided p value, by sign flips of the scans' evidence.
+        low_nm2: lower end of the confidence interval of the gain.
     """
 
     before_nm2: float
@@ -80,7 +81,7 @@ def judge(
     """Judge a change by the squared error (scans,) before and after, nm².
 
     Args:
-        evidence_nm2: (scans,) product of the change with the residual before it; by default the gains.
+        evidence_nm2: (scans,) mean product of the change and the residual before it; by default the gains.
     """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)

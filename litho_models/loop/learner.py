@@ -1,7 +1,7 @@
 """Estimate how much of a residual could still be learned, by a cross-validated ridge regression.
 
-The ridge uses features of layout and position. The ridge names no cause and is part of no model. The ridge
-shows whether the residual has structure, and how large this structure is compared with a named cause.
+The ridge uses features of layout and position. It names no cause and is part of no model. It shows whether
+the residual has structure, and how large this structure is compared with the gain of a named cause.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from litho_models.models.features import Features, FeaturesConfig, RandomFeature
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# Largest memory of the feature rows; with more scans, each scan contributes fewer rows.
+# Memory limit for the feature rows; with more scans, fewer pixels of each scan are used.
 _KEPT_BYTES = 512 * 2**20
 # Features whose strength may depend on order or dose: height, |∂y| and |∂x| at 0.3 µm, and surroundings of
 # 1.6 µm.
@@ -37,7 +37,7 @@ class Rest:
 
     Attributes:
         gains_nm2: (scans,) squared error that the ridge removes from each held-out scan.
-        squares_nm2: (scans,) the squared error itself; both without the free terms of the scans.
+        squares_nm2: (scans,) squared error without the ridge. Both exclude the free terms of the scans.
     """
 
     gains_nm2: np.ndarray
@@ -59,15 +59,13 @@ class Rest:
 
     @property
     def most_nm(self) -> float:
-        """Return the root of the interval's upper end, an upper bound of the rms error of the model's
-        form.
-        """
+        """Return the root of the interval's upper end: an upper bound on the rms error of the form."""
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
-        """Return whether the residual can be learned: the share exceeds 1 %, and the interval excludes
+        """Return whether the residual can be learned: the share exceeds 1 %, and the interval is above
         zero.
         """
         low, _ = self.ci95_nm2 or (0.0, None)
@@ -75,7 +73,7 @@ class Rest:
 
 
 class Learner:
-    """The feature rows of the scans of a study, computed once for any number of residuals.
+    """The features of a study's scans, computed once for any number of residuals.
 
     Args:
         study: scans and folds.
@@ -87,8 +85,8 @@ class Learner:
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
-        # Order, and the difference from the nominal dose. A dependence on one of them needs at least three
-        # values.
+        # Writing order, and difference of the dose from nominal. A dependence on either can be learned only
+        # if it takes at least three values.
         facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
@@ -154,7 +152,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # A single scan cannot choose a strength of regularisation, so the largest is used.
+        # With a single scan no strength can be cross-validated, so the largest is used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
@@ -178,10 +176,9 @@ def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
 
 
 def _splines(size: int) -> np.ndarray:
-    """Return the cubic splines (5, size) over the sampled part of an axis; they add up to 1 and are constant
-    beyond it.
+    """Return the cubic splines (5, size) over the sampled part of an axis; they add up to 1.
 
-    Beyond the sampled part no measured pixel would determine a spline.
+    They are constant outside the sampled part, where no measured pixel would determine them.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])

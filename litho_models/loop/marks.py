@@ -1,6 +1,7 @@
 """Find marks directly in single scans, without a model: rounding, scars, short lines, bends.
 
-Marks are reported with evidence but enter no model, because they do not lower errors on held-out scans.
+Marks are reported with evidence but enter no model, because a model of them would not lower errors on
+held-out scans.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from litho_models.scoring.statistics import one_sided_flip_p
 
 # These lags are longer than the resolution of tip and spot, and shorter than a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
-# Smaller amounts exist but do not matter.
+# Smaller rms heights occur but do not matter.
 _SMALLEST_RMS_NM = 0.5
 
 
@@ -80,7 +81,7 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
-    """Report scars: more outliers are elongated along the scan lines than across them."""
+    """Test for scars: more outliers must be elongated along the scan lines than across them."""
     counts = np.array([_drawn_out(scan, own) for scan, own in zip(scans, residuals, strict=True)])
     along, across = counts.T
     p = one_sided_flip_p((along - across).astype(float))
@@ -108,8 +109,8 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
 def _short_lines(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
 ) -> ScanFinding:
-    """Report short lines: in flat places, neighbours along a scan line share the residual, but neighbours
-    across do not.
+    """Test for short lines: in flat places, residuals of pixels on the same scan line must agree more than
+    residuals across scan lines.
 
     Slopes are left out, because model errors there are not noise.
     """
@@ -127,12 +128,12 @@ def _short_lines(
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
-    """Return the mean product of residuals some lags apart, along and across the lines, nm²."""
+    """Return the mean product, nm², of residuals ``_LINE_LAGS_UM`` apart, along and across the scan lines."""
     slope = np.hypot(*np.gradient(prediction))
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
     for line in (scan.line, row_index(flat.shape)):
-        # An error of this correction can only lower the shared part along a line.
+        # The mean of every line is subtracted. An error of this mean can only lower the product along lines.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )

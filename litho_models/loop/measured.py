@@ -1,4 +1,4 @@
-"""Fit printer and measurement together, and free scans of what groups of scans share."""
+"""Fit printer and measurement together, and subtract the measurement errors that groups of scans share."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Fit(NamedTuple):
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """Return the number of fitted parameters of printer and measurement."""
+        """Return the numbers of fitted parameters of the printer and of the measurement."""
         return len(self.twin.vector), self.measurement.numbers
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
@@ -33,10 +33,10 @@ class Fit(NamedTuple):
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
-    """Subtract from each scan what the scans of a group share in addition to their prints.
+    """Subtract from each scan the measurement errors that the scans of its group share.
 
-    What all scans share is not subtracted, because a cause may explain it. The subtracted part is learned
-    without the scan's fold.
+    An error that all scans share is not subtracted, because a cause may explain it. The subtracted part is
+    learned from scans outside the scan's fold.
     """
     study = state.study
     maps = state.maps_um(study.scans)
@@ -53,7 +53,7 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Fit printer and measurement to the same scans in turn, then the strengths of effects again.
+    """Fit the measurement, the printer, and the strengths of the measurement again, to the same scans.
 
     Args:
         twin: start of the printer's fit; ``scans``: original scans.

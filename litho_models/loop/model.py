@@ -68,8 +68,8 @@ class Twin:
     Attributes:
         base: the model of the printer; its parameters are refitted if they are few.
         numbers: fitted parameters of the base.
-        effects: in the order in which they were added.
-        frames: what an effect turns with, if it differs from the catalogue; see ``EffectChain``.
+        effects: the effects by name, in the order in which they were added.
+        frames: frame with which an effect turns, where it differs from the catalogue; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -125,7 +125,7 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """Return the same effects with the base trained without this fold, if there is such a base."""
+        """Return the twin with the base that was trained without this fold, if there is such a base."""
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
@@ -266,13 +266,13 @@ class Twin:
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
-        """Name the amplitudes of an effect that lie on a limit of their range, other than the null, in some
-        group.
+        """Return the amplitudes of an effect that lie, in some group, on a limit of their range other than
+        the null.
         """
         return self._at_limits(name, lambda one, at: one.kind == "amplitude" and at != one.null)
 
     def outgrows(self, name: str) -> list[str]:
-        """Name the fitted lengths, such as ranges and depths, of an effect that lie on a limit."""
+        """Return the fitted lengths of an effect, such as ranges and depths, that lie on a limit."""
         return self._at_limits(name, lambda one, at: one.kind == "shape" and one.is_length)
 
     def _at_limits(self, name: str, counts: Callable[[Parameter, float], bool]) -> list[str]:

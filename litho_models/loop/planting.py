@@ -20,7 +20,7 @@ def parse_planted(text: str) -> tuple[Effect, float]:
     """Parse ``NAME=AMOUNT`` into an effect and an amount, in the unit of the effect's first amplitude.
 
     Raises:
-        InputError: another form, an unknown effect, a per-scan effect, or no number.
+        InputError: the text has another form, the effect is unknown or per-scan, or the amount not a number.
     """
     name, separator, number = text.partition("=")
     effect = get_effect(name.strip())
@@ -39,7 +39,7 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 def plant(
     effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> Planted:
-    """Plant an effect in copies of the scans, run a new loop on the copies, and report what it names.
+    """Plant an effect in copies of the scans, run a new loop on the copies, and return what it finds.
 
     Args:
         effect, amount: from ``parse_planted``; ``closed``: result of the loop on the original scans.

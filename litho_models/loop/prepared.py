@@ -27,7 +27,7 @@ class PreparedScan:
 
     Attributes:
         stored: the scan in the store.
-        context: its position and exposed layout, for the effects.
+        context: the position and exposed layout of the scan, which the effects use.
         sample: flat indices of the pixels for fits and screening, thinned and away from the edge.
         height: measured height at ``sample``, float64 µm.
         line: index of the scan line under each pixel (y, x).
@@ -69,10 +69,10 @@ class PreparedScan:
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
-    """Prepare all scans of a store, with positions in the writing order scaled to these scans.
+    """Prepare all scans of a store. Positions in the writing order are scaled to the range of these scans.
 
     Raises:
-        InputError: no scan.
+        InputError: there is no scan.
     """
     if not scans:
         raise InputError("scans to close the loop on", got="none", wanted="at least one")
@@ -83,7 +83,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, with positions in the writing order of the scans to which a model was fitted."""
+    """Prepare further scans, placed in the writing order of the scans to which a model was fitted."""
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
     def placed(scan: PreparedScan) -> PreparedScan:

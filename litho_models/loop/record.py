@@ -1,4 +1,4 @@
-"""The record of a loop, ``close_loop.json`` (schema 4), from which report and tables are drawn."""
+"""The record of a loop, ``close_loop.json`` (schema 4), from which the report and its tables are made."""
 
 from __future__ import annotations
 
@@ -93,13 +93,15 @@ class FoundEffect(Record):
 
     Attributes:
         by: the grouping in which its strength differs; ``all`` for one strength.
-        strengths: parameter to its numbers.
-        gain_nm2: decrease of the squared error of held-out scans, in addition to everything else in the
-            model, on the fitted pixels, without seven terms and an affine shift per scan.
-        left_out_nm: increase of the mean absolute error if it is left out (k = 1).
-        family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
+        strengths: fitted values of each parameter.
+        gain_nm2: decrease of the squared error of held-out scans when the effect is added to everything else
+            in the model. The error is that of the fitted pixels, after seven terms and an affine shift of
+            each scan are removed.
+        left_out_nm: increase of the mean absolute error if the effect is left out (k = 1).
+        family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping, by
+            permuted labels.
         reshaped_share: further gain that variants of its change have, as a share of its own gain.
-        survives_on: other bases beside which the search also found it.
+        survives_on: other bases with which the search also found the effect.
     """
 
     name: str
@@ -137,8 +139,8 @@ class ScanFinding(Record):
     """A term or mark that differs from scan to scan; it enters no model.
 
     Attributes:
-        seen: whether it was found; ``evidence``: a sentence; ``p``: p of its test.
-        spread: parameter to its standard deviation over scans.
+        seen: whether it was found; ``evidence``: a sentence; ``p``: p value of its test.
+        spread: standard deviation of each parameter over scans.
         confusable_with: effects that look the same in these scans.
     """
 
@@ -163,8 +165,8 @@ class ScanFinding(Record):
 class Planted(Record):
     """An effect planted in copies of the scans, and what the loop found in these copies.
 
-    ``rms_nm`` is the rms of its change without the scans' free terms. ``named`` is the reported set that
-    contains it, or empty. ``found`` is the fitted amount.
+    ``rms_nm`` is the rms of the change it makes, without the scans' free terms. ``named`` is the reported set
+    of effects that contains it, or empty. ``found`` is the fitted amount.
     """
 
     name: str
@@ -176,8 +178,8 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """The squared error (nm²) of held-out scans that features of layout and position still explain;
-    ``matters`` says whether it exceeds chance.
+    """The part of the squared error (nm²) of held-out scans that features of layout and position still
+    explain; ``matters`` says whether this part exceeds chance.
     """
 
     stage: str
@@ -187,11 +189,12 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """Two answers compared on new prints: by how much the first fits better, in nm² and in standard
-    deviations.
+    """A comparison of two answers on new prints.
 
-    ``z`` allows for an error in the model's form; ``difference_nm`` is the rms difference of the two
-    predictions.
+    ``gain_nm2`` and ``z`` say how much better the first answer fits, in nm² and in standard deviations.
+
+    ``z`` allows for an error in the form of the model. ``difference_nm`` is the rms difference of
+    the two predictions.
     """
 
     better: str
@@ -221,7 +224,7 @@ class CloseLoop(Result):
     ``errors``: see ``ErrorRow``. ``gain``: the error of the base minus that of the corrected model, at k = 1
     with the shared measurement, over scans and over prints. ``chosen``: how often nested selections chose
     each effect. ``confounded``: pairs of parameters that these scans cannot determine separately, with their
-    correlation. ``decisions``: answers of further stores to open questions of the first.
+    correlation. ``decisions``: open questions of this store that the prints of further stores decide.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"

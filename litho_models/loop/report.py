@@ -15,12 +15,13 @@ Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 
 
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
-    """Write ``report.html`` and its tables; ``maps`` contains residuals (y, x), nm, by scan, before and
-    after.
+    """Write ``report.html`` and its tables.
+
+    ``maps`` contains the name and the residuals (y, x), nm, of each scan, before and after the correction.
     """
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",
-        "From the residual on held-out scans to causes and laws, to a corrected model.",
+        "From the residual on held-out scans to causes, laws and a corrected model.",
         run=result.run,
         facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
         words=Path(__file__).with_name("words.toml"),
@@ -42,7 +43,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.table(result.effects, "What was added.", "effects.csv", columns=columns)
         page.table(
             [row for one in result.effects for row in _strength_rows(one)],
-            "Strengths with 95 % intervals, by what each print (or scan) asks for.",
+            "Strengths with 95 % intervals, from the scatter over prints (or scans).",
             "strengths.csv",
             digits=3,
         )
@@ -53,13 +54,13 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     _residuals(page, maps)
     page.table(
         result.explained,
-        "What a ridge over features of layout and place still explains, out of fold.",
+        "What a ridge on features of layout and position still explains on held-out scans.",
         "explained.csv",
     )
     page.heading("All errors")
     page.table(
         [row.model_dump(exclude={"by_scan_nm", "edge_by_scan_nm"}) for row in result.errors],
-        "Each row says which terms it has. Rows of one column are made alike.",
+        "Each row names its model, measurement and terms. All rows are computed in the same way.",
         "errors.csv",
     )
     page.heading("What scans share beside their prints", folded=True)
@@ -67,21 +68,21 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     page.heading("What single scans add", folded=True)
     page.table(
         [one.model_dump() | {"spread": said("spread", one)} for one in result.single_scans],
-        "Each scan its own; no model has it. Spread: standard deviation over scans.",
+        "Terms that differ from scan to scan; no model contains them. Spread: standard deviation over scans.",
         "single_scans.csv",
     )
     if result.planted:
         page.heading("What was planted in copies of the scans")
-        page.table(result.planted, "Is it named?", "planted.csv", digits=3)
+        page.table(result.planted, "Whether the loop names each planted effect.", "planted.csv", digits=3)
     if result.confounded:
-        page.paragraph(f"Known together only: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}.")
+        page.paragraph(f"Known only jointly: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}.")
     page.heading("Every other candidate", folded=True)
     page.table(result.candidates, "Why it was not added.", "candidates.csv")
     return page.write(folder)
 
 
 def said(about: str, one: object) -> str:
-    """Render a macro such as ``verdict`` (of a result), ``effect``, ``decision`` or ``measurement``."""
+    """Return the text of a macro: ``verdict`` (of a result), ``effect``, ``decision``, ``measurement``, …"""
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 

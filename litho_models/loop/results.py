@@ -172,7 +172,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
     """Return the cluster-robust covariance (p, p) of fitted parameters.
 
     Args:
-        linear: each window at the optimum; ``units``: the print or scan of each.
+        linear: derivatives of each window at the optimum; ``units``: print or scan of each window.
     """
     parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
@@ -238,9 +238,9 @@ def _refused(
     if count < FEWEST_SCANS:
         return "too-few-scans", f"{count} scans to choose and confirm on, at least {FEWEST_SCANS} needed"
     if last.beside_base < SMALLEST_RETAINED:
-        return "not-testable", "on these layouts it changes nothing that single scans do not"
+        return "not-testable", "on these layouts its change is the same as that of per-scan terms"
     if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-        return "absorbed", "the base has absorbed it: its own values do the same"
+        return "absorbed", "the base has absorbed it: its parameters make the same change"
     if not last.allowed and named.first[name].family_p <= FAMILY_P:
         return "contradicted", "its best strength has the wrong sign"
     gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"

@@ -58,24 +58,25 @@ def close_loop(
     """Close the loop on a dataset store and write the result to ``out``, which appears only when complete.
 
     Args:
-        store: made by ``litho-data build``.
+        store: a store made by ``litho-data build``.
         base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which lets small
             models compete.
         base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds; each scan is predicted by fits without its fold.
-        nested: also repeat all choices without each fold, or each print, and judge them on it.
+        nested: also repeat all choices without each fold, or each print, and judge them on the part left out.
         inject: effects as ``NAME=AMOUNT``, each planted in copies of the scans to see whether it is found.
         open_lock_box: also score the locked scans.
-        steps: optimiser steps of a network, by default those of its recipe; it is trained without each fold.
-        cache: folder that keeps such trainings, by default beside ``out``.
+        steps: optimiser steps of a network, by default those of its recipe. A network is trained once per
+            fold, without its scans.
+        cache: folder that keeps trained networks, by default beside ``out``.
         seed: seed of folds, calibration blocks and permutations.
         workers: local processes; ``dask``: address of a Dask scheduler instead.
         further: called before anything is written; ``decided_by``: hashes of the further stores that it uses.
         report: gets progress messages.
 
     Raises:
-        InputError: no store, an unknown base, too few usable scans, or a nested selection of a base that is
-            not fitted here.
+        InputError: there is no store, the base is unknown, too few scans are usable, or ``nested`` is set
+            with a base that is not fitted here.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
@@ -146,7 +147,7 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
     """Return development scans, locked scans, and excluded scans with reasons.
 
     Raises:
-        InputError: fewer than two development scans.
+        InputError: there are fewer than two development scans.
     """
     scans = store.scans()
     dropped = [scan.id for scan in scans if np.count_nonzero(scan.usable) < 1024]
@@ -162,8 +163,9 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Repeat all choices without each fold, or print, and judge them on it; also count how often each effect
-    was chosen.
+    """Repeat all choices without each fold, or print, and judge them on the part left out.
+
+    Also count how often each effect was chosen.
     """
     scans = [scan.stored for scan in study.scans]
     ids = [scan.id for scan in scans]

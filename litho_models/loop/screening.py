@@ -24,8 +24,8 @@ from litho_models.scoring.statistics import sign_flips
 
 # Smallest share of a direction's information that the projections must leave for a valid test.
 SMALLEST_RETAINED = 1e-5
-# A candidate is worth fitting at this share of the smallest useful gain, because derivatives predict the gain
-# of a fit only to a factor of three.
+# A candidate is fitted if its predicted gain reaches this share of the smallest useful gain. Derivatives
+# predict the gain of a fit only to within a factor of three.
 WORTH_FITTING = 0.3
 PERMUTATIONS = 199
 
@@ -38,11 +38,11 @@ class Screened:
         trial: the tried parameters; ``by``: the grouping of the strength.
         gains_nm2: (scans,) decrease of the squared error, with strengths fitted without the scan's fold.
         multiples: fitted multiples of the trial's amplitudes by label, from all scans.
-        allowed: whether the strengths have a physical sign; ``retained``: share of the information left after
-            projecting out scan terms and the model's own parameters, ``beside_base``: after the scan terms
-            alone.
+        allowed: whether the strengths have a physical sign.
+        retained: share of the information that remains after scan terms and the model's own parameters are
+            projected out; ``beside_base``: the share after only the scan terms are projected out.
         family_p: share of sign flips of the scans in which any candidate gains at least as much; ``group_p``:
-            share of permutations of the scans, if a grouping was tested.
+            share of permutations of the scans in which a grouping does, if a grouping was tested.
     """
 
     trial: Trial
@@ -78,8 +78,8 @@ class Screening:
 
     Args:
         state: the current model; ``effects``: candidates that it does not contain.
-        secants: taken at a similar model; by default at the state.
-        beside_own: whether candidates are judged beside the model's own parameters, which are projected out.
+        secants: secants at a similar model; by default they are taken at the current model.
+        beside_own: whether the model's own parameters are projected out of the candidates.
     """
 
     def __init__(
@@ -144,8 +144,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Choose the best grouping; return None if it gains no more over a common strength than chance
-        does.
+        """Return the candidate with the best grouping; None if its gain over a common strength may be
+        chance.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
@@ -163,7 +163,7 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _change(self, one: Screened) -> np.ndarray:
-        """Return by how much each column is multiplied, (scans, columns), in the change of a candidate."""
+        """Return the factors (scans, columns) of the columns that add up to the change of a candidate."""
         found = np.zeros(self.freed.shape[:2])
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
@@ -193,7 +193,7 @@ class Screening:
         strengths fitted to all scans.
 
         Args:
-            taken: factor on the strengths.
+            taken: returns a factor for the fitted strengths.
         """
         own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
         scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
@@ -211,7 +211,7 @@ class Screening:
         return gains * NM_PER_UM**2, multiples
 
     def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
-        """Return the share of permutations of the scans after which some grouping gains as much as this one.
+        """Return the share of permutations of the scans after which any grouping gains as much as this one.
 
         Permutations that leave every group with the same scans are not counted.
         """
@@ -232,7 +232,10 @@ def best_grouping(options: Mapping[str, tuple[float, int]]) -> str | None:
     """Choose the grouping with the fewest parameters among those that gain nearly the most.
 
     Args:
-        options: gain and number of parameters by grouping. Returns None if none gains.
+        options: gain and number of parameters by grouping.
+
+    Returns:
+        The grouping; None if no grouping has a gain.
     """
     most = max((gain for gain, _ in options.values()), default=0.0)
     close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

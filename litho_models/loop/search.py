@@ -34,9 +34,9 @@ class Cause:
         name, by: the effect, and the grouping of its strength.
         alike: other effects that look the same in these scans.
         judgement: judgement of its gain on held-out scans, in addition to the rest of the model.
-        family_p: p of its screening over all candidates; ``group_p``: of its grouping, by permuted labels.
+        family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping.
         values: starting values of its parameters by label, for the fit of a table.
-        reshaped_share: further gain by variants of its change, as a share of its gain.
+        reshaped_share: further gain that variants of its change have, as a share of its own gain.
         reason: why its name was refused; empty if it was not.
         corrects: whether it was refused because it may only correct another formula.
     """
@@ -139,7 +139,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
 
 
 def _regroup(found: Found, name: str) -> None:
-    """Let the common strength of a cause differ by group, if held-out scans confirm that.
+    """Let the strength of a cause differ by group if held-out scans confirm the difference.
 
     The derivative at the fitted strength is more reliable than the derivative at zero that screening uses.
     """
@@ -153,7 +153,7 @@ def _regroup(found: Found, name: str) -> None:
         for at, slot in enumerate(twin.slots, twin.own)
         if slot.effect == name and slot.facts.kind == "amplitude"
     }
-    # Common parameters cannot explain a difference between groups.
+    # Common parameters cannot explain a difference between groups, so they are not projected out.
     screening = Screening(found.state, (), beside_own=False)
 
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -191,7 +191,7 @@ def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) 
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """Name the effects that look the same in these scans, by their fits if available, otherwise by
+    """Return the effects that look the same in these scans, judged by their fits if available, otherwise by
     screening.
     """
     own = fitted[one.name]
@@ -276,6 +276,6 @@ def untestable(study: Study) -> dict[str, str]:
 
 
 def separating(names: Sequence[str]) -> str:
-    """Name the experiments that would distinguish the members of a set."""
+    """Return the experiments that would distinguish the members of a set."""
     texts = dict.fromkeys(get_effect(name).separating for name in names)
     return "; ".join(text for text in texts if text)

@@ -38,7 +38,8 @@ class SingleScans:
     """Scans and their expected maps, with terms fitted on pixels that are not scored.
 
     Args:
-        study: seed and folds; ``scans``: original scans; ``maps_um``: held-out maps (y, x) with measurement.
+        study: seed and folds; ``scans``: original scans; ``maps_um``: expected maps (y, x)
+            of held-out scans, including the measurement.
     """
 
     def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
@@ -90,7 +91,7 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """Fit ``own`` terms together with all ``terms``; return (scans, k), displacements in µm."""
+        """Return the coefficients (scans, k) of ``own`` in a fit of all ``terms``; displacements in µm."""
         found = []
         lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):
@@ -108,9 +109,10 @@ class SingleScans:
         return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
-        """Test line offsets along the scan and along the layout, against columns and against each other.
+        """Test line offsets along the rows of the scan and of the layout.
 
-        Scans are slightly rotated against their layouts. Lines that follow the layout's rows come from the
+        The two are compared with each other, and with offsets along columns, which serve as a control. Scans
+        are slightly rotated relative to their layouts. Lines that follow the layout's rows come from the
         printer, and lines that follow the scan's rows come from the microscope. Without rotation they cannot
         be told apart.
         """
@@ -141,7 +143,7 @@ class SingleScans:
             found.append(
                 ScanFinding.of(
                     name,
-                    "; ".join([*reasons, f"offsets take {taken}{self._period(name)}"]),
+                    "; ".join([*reasons, f"offsets explain {taken}{self._period(name)}"]),
                     seen=not reasons,
                     p=excess_p,
                     spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
@@ -196,8 +198,9 @@ class SingleScans:
 
 
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
-    """Judge a per-scan term by the agreement of the halves, because a scan with a term near zero gains
-    nothing.
+    """Judge a per-scan term by the agreement of the two halves of each scan.
+
+    The gain is not a suitable test, because a scan whose term is near zero gains nothing.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)

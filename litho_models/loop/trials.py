@@ -54,8 +54,9 @@ class Trial:
         return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
-        """Return the share of the step that stays within the ranges, because a linear extrapolation may leave
-        them.
+        """Return the largest share of the step that keeps all amplitudes within their ranges.
+
+        A full step may leave the ranges, because it is a linear extrapolation.
         """
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
@@ -79,9 +80,11 @@ def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
 
 
 def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
-    """Make the trials of the effects by shape and size, with columns numbered from ``first``.
+    """Group the parameter sets of the effects into trials by shape and size.
 
-    The same amplitudes at the same shape may be tried at two sizes, because the change by a large effect need
+    Columns are numbered from ``first``.
+
+    The same amplitudes at the same shape may be tried at two sizes, because the change by a large effect may
     not be a multiple of the change by a small one.
     """
     found: list[Trial] = []

@@ -42,7 +42,7 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
     Call it in a plug-in to register the model in every process of a command.
 
     Raises:
-        InputError: a model without its own name, or with a name that is taken.
+        InputError: a model without a name, or with a name that is taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
@@ -65,7 +65,7 @@ def require_models(names: Sequence[str]) -> None:
     """Check a user's list of model names.
 
     Raises:
-        InputError: no name, one twice, or an unknown one.
+        InputError: no name, a repeated name, or an unknown name.
     """
     if isinstance(names, str):
         raise InputError("models", got=repr(names), wanted="a list of names", hint=f"such as [{names!r}]")
@@ -78,8 +78,8 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """Return the parameters that no fit changes: the usual ones and those in ``fix``, without those in
-    ``free``.
+    """Return the parameters that no fit changes: those that are fixed by default and those in ``fix``,
+    without those in ``free``.
 
     Raises:
         InputError: an unknown model, or a parameter to free that is not fixed.

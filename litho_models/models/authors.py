@@ -1,4 +1,4 @@
-"""Load the authors' weights into our models of variant ``authors`` by translating the names.
+"""Load the weights of the paper's authors into our models of variant ``authors``, by translating the names.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """

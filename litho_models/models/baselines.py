@@ -13,7 +13,7 @@ _MOST_KNOTS = 33
 
 
 class Identity(Simulator):
-    """H = M; nothing to fit."""
+    """H = M, a model without parameters."""
 
     name = "identity"
 
@@ -52,7 +52,7 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), T linear between free heights: one per level, or 33 evenly spaced ones."""
+    """H = T(G_σ * M), with T linear between free heights: one per level, or 33 at evenly spaced inputs."""
 
     name = "blur-table"
     Config = BlurTableConfig

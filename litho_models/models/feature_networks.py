@@ -1,4 +1,4 @@
-"""Networks on fixed features of a field: the surroundings of a layout's pixel, or the height along x.
+"""Networks on fixed features of a field: of the surroundings of each layout pixel, or of the height along x.
 
 The features have no parameters, so these networks are fitted to single pixels
 (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
@@ -17,8 +17,8 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# Below this change over σ, relative to the highest level (2 nm), the length of a slope is smoothed so that it
-# has a derivative at 0.
+# Below this change over σ, relative to the highest level (2 nm), the magnitude of a slope is smoothed, so
+# that it has a derivative at 0.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
@@ -92,7 +92,7 @@ class FeatureNetwork(OfField):
         """Compute the contribution to the height, (n,) µm, from features (features, n)."""
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # The weights include the standardisation, which saves a pass over the pixels.
+        # The standardisation is multiplied into the weights, which saves a pass over the pixels.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
@@ -103,10 +103,12 @@ class FeatureNetwork(OfField):
 
     @abstractmethod
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return slope over σ and curvature over σ², from a height with a margin of 1 px."""
+        """Return the height change over σ (slope) and over σ² (curvature), from a height with a margin of 1
+        px.
+        """
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
-        """Return the local means of the slope's size and of its square around each pixel."""
+        """Return the local means of the slope's magnitude and of its square around each pixel."""
         sigma, widths = self.config.slope_blurs_um[0], self.config.steep_um
         margin = self._radius(*widths)
         slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
@@ -136,7 +138,7 @@ class Surroundings(FeatureNetwork):
         return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the length of the slope."""
+        """Return the magnitude of the slope."""
         up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)

@@ -14,7 +14,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# Below this relative height per µm the length of a slope is smoothed, so that it has a derivative at 0.
+# Below this relative height per µm the magnitude of a slope is smoothed, so that it has a derivative at 0.
 _LEAST_SLOPE = 1e-4
 
 
@@ -38,7 +38,9 @@ class FeaturesConfig(SimulatorConfig):
 
 
 class OfField(nn.Module, ABC):
-    """Common parts of features: blurs, displacements, their reach, and the scale of a network's inputs."""
+    """Common methods of models with features: blurs, displacements, their reach, and the scale of a network's
+    inputs.
+    """
 
     config: Any
     pitch_um: float
@@ -51,7 +53,7 @@ class OfField(nn.Module, ABC):
         """Return the receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """Return the smallest field, which gives the features of one pixel."""
+        """Return the smallest field, whose interior is one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -72,7 +74,9 @@ class OfField(nn.Module, ABC):
         self.register_buffer("scale", torch.ones(count))
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
-        """Set the scale from the inputs ``seen`` in each scan (inputs, n): mean over scans, spread within."""
+        """Set the scale of the inputs from those ``seen`` in each scan (inputs, n): the mean over scans and
+        the spread within them.
+        """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
         self.centre.copy_(centre)
@@ -83,9 +87,9 @@ class Features(OfField, Simulator):
     """H = w · φ(M), all heights relative to the highest level.
 
     φ contains blurs with their cubes and the products of each pair; slopes along y and x at several blurs,
-    with their sizes, products and second derivatives; copies displaced to one side, and the sizes of the
-    steps to them; blurs along one axis; and the steepness of the surroundings along each axis. The sizes |∂x|
-    and |∂y| are separate features, because the microscope's lines make the two axes differ.
+    with their sizes, products and second derivatives; copies displaced to one side, and the magnitudes of the
+    height differences to them; blurs along one axis; and the steepness of the surroundings along each axis.
+    The sizes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes differ.
     ``litho_models.fitting.ridge`` finds the weights in closed form.
     """
 
@@ -156,8 +160,8 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Return copies displaced to each side, the sizes of the steps to the copies, and those between
-        opposite copies.
+        """Return copies displaced to each side, the magnitudes of the height differences to the copies, and
+        those between opposite copies.
         """
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])

@@ -2,9 +2,9 @@
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
 24; see arXiv:2309.17343, appendix "Fourier Neural Operator". Each layer adds a product in Fourier space,
-which sees the whole image, to a local convolution. The operator takes the image as periodic, and its modes
-count periods per image, so the result depends on the image size. The variant ``default`` therefore runs the
-operator on tiles of one size.
+which covers the whole image, to a local convolution. The operator treats the image as periodic. Its modes are
+numbers of periods per image, so the result depends on the image size. The variant ``default`` therefore runs
+the operator on tiles of one size.
 """
 
 import math
@@ -29,14 +29,14 @@ class FnoConfig(SimulatorConfig):
     modes: tuple[PositiveInt, PositiveInt] = (12, 12)
     width: int = Field(24, ge=1, le=1024, description="channels of the layers")
     projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
-    # The paper uses 1 x 1, which can map detail beyond the kept modes only pixel by pixel.
+    # The paper uses 1 x 1. Detail finer than the kept modes is then mapped only pixel by pixel.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
     padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
     padding_px: int = Field(0, ge=0, le=4096, description="zeros at bottom and right of an image of any size")
     tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
     overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
-    # Start as the layout and learn the difference; the paper's network starts at random.
+    # The network starts as the layout and learns the difference. The paper's network starts at random.
     starts_as_layout: bool = True
 
     _PUBLISHED: ClassVar[dict[str, Any]] = {
@@ -46,7 +46,7 @@ class FnoConfig(SimulatorConfig):
         "starts_as_layout": False,
     }
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
-        # 9 px of the published quadrants of 256 px.
+        # This is 9 px for the published quadrants of 256 px.
         "paper": {**_PUBLISHED, "padding_fraction": 9 / 256},
         "authors": {**_PUBLISHED, "padding_px": 9, "width": 12},
     }
@@ -98,8 +98,8 @@ class Fno(Simulator):
         """Return the height of a whole image, of the same size, (batch, 1, y, x) µm."""
         config = self.config
         ny, nx = layout_um.shape[-2:]
-        # Heights need full precision where they enter and leave, even under autocast. The channels are the
-        # last axis, so that products over channels are matrix products.
+        # Heights need full precision at the input and the output, even under autocast. Channels are the last
+        # axis, so that products over channels are matrix products.
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
             features = _pointwise(self.lift, inputs.permute(0, 2, 3, 1))
@@ -116,7 +116,7 @@ class Fno(Simulator):
         return layout_um + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
-        """Apply the last layers: a height (n,) from features (n, width)."""
+        """Apply the last layers, which map features (n, width) to a height (n,)."""
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
@@ -157,7 +157,8 @@ class SpectralConvolution(nn.Module):
         """Convolve a field (b, y, x, channels); an image smaller than the modes uses only the modes that it
         has.
 
-        The few kept frequencies make products with their waves cheaper than fast transforms.
+        Only a few frequencies are kept, so products with their waves are cheaper than fast Fourier
+        transforms.
         """
         ny, nx = field.shape[1:3]
         modes_y, modes_x = self.weight.shape[3:5]

@@ -52,8 +52,8 @@ def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
-    """Return the image of a mask (b, 1, y, x), relative to an open mask, without a border as wide as the
-    kernels' reach.
+    """Return the intensity of the image of a mask (b, 1, y, x), relative to an open mask. A border as wide as
+    the kernels' reach is left out.
     """
     reach = kernel_reach_px(optics, pitch_um)
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
@@ -62,8 +62,8 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
 
 def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
     """Image a mask that is not periodic; return the intensity without the outermost ``reach_px``."""
-    # Transforms spread rounding errors over the field. Double precision keeps the result in tiles equal to
-    # that of the whole field.
+    # Fourier transforms spread rounding errors over the field. With double precision the result in tiles
+    # equals that of the whole field.
     image = imaged(transmission.double(), spectra.to(transmission.device))
     return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
@@ -96,7 +96,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
         raise InputError(
             "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
         )
-    # Frequencies that no source point brings into the pupil are 0 in all kernels.
+    # All kernels are 0 at frequencies that no source point brings into the pupil.
     reach = 1 + np.hypot(y[source], x[source]).max() / cutoff
     bright = np.flatnonzero(np.hypot(y, x) / cutoff <= reach + 1e-9)
     shifted = y[source, None] + y[bright], x[source, None] + x[bright]
@@ -132,7 +132,7 @@ def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Return the spectra (``spectra_of``) of a lens's kernels, which are no larger than ``size_px``."""
+    """Return the spectra (``spectra_of``) of a lens's kernels, cut to ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
     return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)
 

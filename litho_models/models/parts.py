@@ -1,6 +1,7 @@
-"""The parts of a printer: functions that turn one field into the next, with parameters and a source.
+"""The parts of a printer: functions that turn one field into the next, each with parameters and a source.
 
-Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by its reach.
+Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by the distance that
+it reaches.
 """
 
 import math
@@ -22,7 +23,7 @@ from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
-# If the resist changes less than this between pixels, it has no edge there.
+# If the resist changes by less than this between neighbouring pixels, there is no edge.
 FLATTEST = 5e-3
 # The upper limit of a length is this multiple of its starting value.
 _WIDEST = 5.0
@@ -38,9 +39,9 @@ class Number:
     """One parameter of a part.
 
     Attributes:
-        start: starting value; ``unit``: ``1`` for none.
+        start: starting value; ``unit``: ``1`` if it has no unit.
         lower, upper: its range; by default the upper limit of a length is five times its start.
-        fitted: whether a fit changes it; otherwise it keeps its value.
+        fitted: whether a fit changes the parameter.
     """
 
     start: float
@@ -60,7 +61,7 @@ class Part:
     """A stage of a printer.
 
     Attributes:
-        numbers: parameters by name, see ``Number``; ``source``: source of the formula.
+        numbers: the parameters by name, see ``Number``; ``source``: source of the formula.
         apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
@@ -73,7 +74,7 @@ class Part:
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
     """Return how many pixels a Gaussian spot reaches."""
-    # Float32 rounds a width, and its last digits must not change the size of the kernel.
+    # Float32 rounds a width, and this rounding must not change the size of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
 
@@ -82,8 +83,8 @@ def illuminate(
 ) -> Tensor:
     """Expose with a spot of several Gaussians, Σ share · G_sigma; the result is cropped by ``reach_px``.
 
-    One Gaussian describes light or a fine beam; a second, wide one describes backscattered electrons (Chang,
-    J. Vac. Sci. Technol. 12, 1271 (1975)); a third lies between these two.
+    One Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered electrons
+    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third has a width between those two.
 
     Args:
         pattern: written pattern, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each
@@ -129,8 +130,8 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
     one pixel.
 
     The edge lies where the resist crosses the threshold, moved outward by the bias. A pixel that the edge
-    crosses is covered in part: a sigmoid, one pixel wide, of the distance (resist - threshold) / |∇ resist| +
-    bias.
+    crosses is partly covered. The coverage is a sigmoid, one pixel wide, of the distance (resist - threshold)
+    / |∇ resist| + bias.
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
@@ -173,7 +174,8 @@ def kernels_part(name: str, file: str | Path) -> Part:
 
     Args:
         name: name of the part.
-        file: real or complex (k, size, size) at the layout's pitch, around the middle pixel of an odd size.
+        file: real or complex array (k, size, size) at the layout's pitch; the size is odd and the middle
+            pixel is the origin.
 
     Raises:
         InputError: the file does not exist, or its array has another shape or type.

@@ -45,12 +45,14 @@ class PblConfig(SimulatorConfig):
     illumination: str | None = Field(None, description="part of a printer in place of this spot: lens, …")
     numbers: dict[str, float] = Field({}, description="values in place of the illumination's own")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
-    # The blur starts wider than the areawise network can see (0.5 µm), where no other part can learn.
+    # The blur starts wider than the reach of the areawise network (0.5 µm), because no other part can learn
+    # at such distances.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
-    # Start as the optically blurred layout and learn the difference; the paper's networks start at random.
+    # The model starts as the optically blurred layout and learns the difference. The paper's networks start
+    # at random.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
     kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
@@ -128,7 +130,7 @@ class Pbl(Simulator):
     The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
     the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
     height along x on the measured map. ``scan_axis`` is fitted together with the chain, so that the chain
-    does not learn this influence. ``scan_axis`` is left out of ``printer()``.
+    does not learn this influence, and is left out of ``printer()``.
     """
 
     name = "pbl"
@@ -159,11 +161,11 @@ class Pbl(Simulator):
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """Copy the paper's chain alone."""
+        """Return the model without its feature networks, which is the paper's chain alone."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
-        """Replace the weights of the chain by those of another."""
+        """Replace the weights of the chain by those of another chain."""
         self.load_state_dict(self.state_dict() | chain.state_dict())
 
     def _without(self, *parts: str) -> Pbl:
@@ -209,7 +211,9 @@ class Pbl(Simulator):
         return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
-        """Apply the paper's chain to a field with nothing beyond its edge, or only to its interior."""
+        """Apply the paper's chain to a field padded by ``edge``, or only to the field's interior if ``edge``
+        is None.
+        """
         optical, diffusion = self._radii_px()
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
         if self.config.illumination is None:

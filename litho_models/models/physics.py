@@ -34,7 +34,8 @@ class PhysicsConfig(SimulatorConfig):
     spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one per axis")
     sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
-    # The start matters: from a steep threshold in mid-range, fits end at a straight projection.
+    # The starting values matter: fits that start from a steep threshold in mid-range end at a straight
+    # projection.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
     alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
     eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
@@ -153,7 +154,8 @@ class Physics(Simulator):
         """Return the height of the field including what lies beyond its edge, or only of its interior."""
         values = self.values
         optical, diffusion = self._radii_px(values)
-        # Beyond the radius of the optical blur, a continued layout stays constant when blurred.
+        # Farther outside the field than the radius of the optical blur, the blurred continued layout is
+        # constant.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
@@ -163,12 +165,12 @@ class Physics(Simulator):
         initial = crop_border(initial, margin if edge else diffusion)
         return self._develop(initial, crop_border(dose, margin), values)
 
-    # The methods below take the values as arguments. They are computed once per pass, because in forward mode
-    # every operation is slow.
+    # The methods below take the values as arguments. The values are computed once per pass, because in
+    # forward mode every operation is slow.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        # Float32 rounds a width, and its last digits must not move the edge of the kernel.
+        # Float32 rounds a width, and this rounding must not move the edge of the kernel.
         widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
         spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (

@@ -51,7 +51,7 @@ class PrinterConfig(SimulatorConfig):
 
 
 class Printer(Simulator):
-    """H = H₀ · (…part₂(part₁(M / H₀))), see ``parts``."""
+    """A printer that applies its parts in order: H = H₀ · (…part₂(part₁(M / H₀))), see ``parts``."""
 
     name = "printer"
     Config = PrinterConfig
@@ -139,7 +139,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A relief that a laser writes, with many levels, into a resist with a contrast curve."""
+    """A relief with many levels that a laser writes into a resist with a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -151,7 +151,7 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A relief that micromirrors expose, with many levels, in a resist that spreads its dose."""
+    """A relief with many levels that micromirrors expose in a resist that spreads its dose."""
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig

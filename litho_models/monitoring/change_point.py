@@ -2,12 +2,12 @@
 
 Each new print is tried as the first after a step that lasts to the last print. Student's t with pooled spread
 compares the figures before the step, including the reference, with those after it. The t distribution holds
-for any number of reference prints, with unknown mean and spread. This is the likelihood ratio for a step in
-the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The comparisons
-share the rate of false alarms, so this rate holds for the whole set, whatever their correlation (Bonferroni).
-A step should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step
-get most of the rate. With three new prints the rule is nearly the t test of their mean, the best possible
-test for an unknown spread.
+for any number of reference prints, with unknown mean and spread. The test is the likelihood ratio for a step
+in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of
+false alarms is divided among the comparisons, so it holds for the whole set, whatever the correlation between
+comparisons (Bonferroni). A step should be noticed within ``SOON`` prints, so comparisons with at least that
+many prints after the step get most of the rate. With three new prints the rule is nearly the t test of their
+mean, which is the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from litho_data.foundation.kinds import Array
 
 # Number of prints within which a step should be noticed.
 SOON = 3
-# Share of the rate for each comparison with fewer than ``SOON`` prints from the step on.
+# Share of the rate of false alarms for each comparison with fewer than ``SOON`` prints after the step.
 _YOUNG = 0.1
 # Steps larger than this, in standard errors, are not searched for.
 _LARGEST = 1e4
@@ -46,7 +46,7 @@ class Step(NamedTuple):
 
     Attributes:
         since: number of the first changed new print, from 0.
-        size: new mean minus old; ``ci95``: its interval.
+        size: new mean minus old mean; ``ci95``: interval of this difference.
     """
 
     since: int
@@ -55,8 +55,8 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Return the share of the rate for each comparison, by its first changed print, (m,); the shares add up
-    to 1.
+    """Return each comparison's share of the rate of false alarms, by its first changed print, (m,). The
+    shares add up to 1.
     """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
@@ -64,12 +64,13 @@ def shares(new_prints: int) -> Array:
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """Return step and standard error for every first changed print, (m, ...) each.
+    """Return the step and its standard error for every possible first changed print, (m, ...) each.
 
-    If nothing has changed, their ratio is a t of n + m - 2 degrees of freedom.
+    If nothing has changed, the ratio of step to standard error follows Student's t with n + m - 2 degrees of
+    freedom.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
-    # Figures are taken relative to a value within the data; otherwise the sums of squares would lose digits.
+    # A value within the data is subtracted first, because sums of squares of large figures would lose digits.
     centre = np.mean(series.reference, axis=-1, keepdims=True)
     values = np.concatenate([series.reference - centre, series.new - centre], axis=-1)
     n, m = series.reference.shape[-1], series.new.shape[-1]
@@ -85,7 +86,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """Find the most significant step, and an upper bound of its p.
+    """Find the most significant step, and an upper bound of its p value.
 
     Args:
         series: values of shape (n,) and (m,), n at least 2, m at least 1.
@@ -100,9 +101,10 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
     """Return the probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if
-    fewer.
+    there are fewer.
 
-    The result is a lower bound, by the noncentral t of the one comparison that starts with the rise.
+    The result is a lower bound. It comes from the noncentral t of a single comparison, the one that starts
+    with the rise.
 
     Args:
         step: in units of the (unknown) spread of a figure whose variance here is 1.
@@ -114,7 +116,9 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
-    """Return the step with this ``chance_to_notice``; infinite beyond ten thousand standard errors."""
+    """Return the step that is noticed with probability ``power``; infinite beyond ten thousand standard
+    errors.
+    """
     error = _comparison(reference_variance, new_variance, rate)[2]
 
     def beyond(errors: float) -> float:
@@ -124,8 +128,8 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
-    """Return limit of t, degrees of freedom and standard error for the last ``SOON`` prints against those
-    before.
+    """Return the limit of t, the degrees of freedom and the standard error for a comparison of the last
+    ``SOON`` prints with all prints before them.
     """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

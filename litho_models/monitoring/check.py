@@ -1,4 +1,4 @@
-"""The function of ``litho-models check``: test whether a printer still behaves as its frozen model says."""
+"""The function of ``litho-models check``: test whether a printer still behaves as its model predicts."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,9 +32,9 @@ def check(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store of the new prints; locked scans of the model's own prints are left out.
         out: result folder.
-        reference: store of unchanged prints; by default those in the model's card.
-        new: names of prints of ``store`` that are new; its others are then the reference.
-        false_alarms: chance that an unchanged data set raises an alarm, over all figures.
+        reference: store of unchanged prints; by default the prints in the model's card.
+        new: names of the prints of ``store`` that are new; the other prints are then the reference.
+        false_alarms: chance that an unchanged data set raises an alarm in any figure.
         tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
 
     Raises:
@@ -51,7 +51,8 @@ def check(
         say(f"checking {len(dataset)} scans of {dataset.name}")
         found = gather(frozen, dataset, reference, new)
         parameters = frozen.card["parameters"]
-        # The error on the model's training prints is too small for a comparison with new prints.
+        # The model's error on its training prints may be too small to be compared with its error on new
+        # prints.
         optimistic = wording.too_optimistic(found.reference, parameters)
         judged = judge(
             found.reference,

@@ -16,7 +16,7 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
-# Heights below half or above twice the predicted heights come from a printer other than the model's.
+# Heights below half or above twice the predicted heights show that the model describes another printer.
 _OWN_GAIN = (0.5, 2.0)
 
 
@@ -36,11 +36,11 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Compute the figures of the new prints and of the reference, for scans of one dose.
+    """Compute the figures of the new prints and of the reference, keeping only scans of one dose.
 
     Raises:
-        InputError: more than one reference or none, unknown prints, stores of another geometry or with scans
-            in common, or too few prints.
+        InputError: no reference or more than one, unknown prints, stores of another geometry, stores with
+            scans in common, or too few prints.
     """
     if reference is not None and new:
         raise InputError("reference", got="both a store and --new", wanted="only one of the two")

@@ -1,4 +1,4 @@
-"""Judge each figure of scans, without files or models."""
+"""Judge each figure of the scans; this module needs neither files nor models."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,7 +28,7 @@ class Trend(NamedTuple):
 
     Attributes:
         per_print: change from print to print, with its 95 % interval.
-        p: two-sided p of the slope.
+        p: two-sided p value of the slope.
         prints_left: number of further prints for which the 95 % bound of the drift stays within the
             tolerance.
     """
@@ -42,13 +42,13 @@ class Trend(NamedTuple):
 def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, tolerance: float) -> Trend:
     """Fit the trend over all prints, and estimate the number of prints until it reaches the tolerance.
 
-    The drift is the change since the middle of the reference, where the model was made: the trend times the
-    number of prints since then. The drift's 95 % bound follows from the faster end of the trend's interval. A
-    steady drift is assumed; the alarm is for steps.
+    The drift is the change since the middle of the reference, when the model was made: the trend times the
+    number of prints since then. The 95 % bound of the drift follows from the end of the trend's interval with
+    the faster change. The forecast assumes a steady drift. Steps are detected by the alarm.
 
     Args:
-        values: one per print in printing order, (n,), three at least; ``variance``: relative, (n,).
-        reference: bool (n,), which prints are of the reference.
+        values: one value per print in printing order, (n,), at least three; ``variance``: relative, (n,).
+        reference: bool (n,), True for prints of the reference.
         tolerance: largest drift, in the unit of ``values``.
     """
     n = len(values)
@@ -58,14 +58,14 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     half = float(student.ppf(0.975, n - 2)) * error
     fastest = max(abs(slope - half), abs(slope + half))
     since_middle = n - 1 - float(place[reference].mean())
-    # Numbers beyond a million prints are meaningless.
+    # A forecast beyond a million prints is meaningless.
     left = int(np.clip(tolerance / fastest - since_middle, 0, 1e6)) if fastest > 0 else 10**6
     p = 2 * float(student.sf(abs(slope) / error, n - 2)) if error > 0 else float(slope == 0)
     return Trend(float(slope), (slope - half, slope + half), p, left)
 
 
 DEFAULT_RATE = 0.005
-# The default tolerance, in spreads between prints.
+# The default tolerance, as a multiple of the spread between prints.
 TOLERANCE_SPREADS = 3.0
 
 
@@ -81,11 +81,11 @@ def judge(
     """Compare every figure of the new prints with the reference.
 
     Args:
-        reference, new: scans of prints, in any order; of three reference prints at least.
-        rate: chance of a false alarm in an unchanged set, which the figures share by their weights.
+        reference, new: scans of the prints, in any order; there must be at least three reference prints.
+        rate: chance of a false alarm in an unchanged set, divided among the figures by their weights.
         tolerance: largest drift that is allowed, relative; three times the spread by default.
-        between: whether new prints were made between reference prints, so that the trend is over the common
-            order. Otherwise they follow the reference.
+        between: whether new prints were made between reference prints. If so, the trend follows the common
+            printing order; otherwise all new prints come after the reference.
     """
     return [
         _judged(figure, reference, new, own, tolerance, between=between)

@@ -17,8 +17,8 @@ _LEAST_GAIN = 0.01
 class Figure(NamedTuple):
     """A figure that is monitored.
 
-    ``of`` is the logarithm of its value for one scan, so that differences are relative: a step of 0.03 is 3
-    %. ``weight`` is its part of the rate of false alarms.
+    ``of`` is the logarithm of the figure for one scan, so that differences are relative: a step of 0.03 is 3
+    %. ``weight`` is the figure's part of the rate of false alarms.
     """
 
     name: str
@@ -51,7 +51,9 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """One value per print in printing order, the mean over its ``counts`` scans; (n,) each."""
+    """One value per print in printing order: the mean over the print's scans, whose number is in ``counts``;
+    (n,) each.
+    """
 
     names: list[str]
     values: np.ndarray
@@ -62,7 +64,7 @@ class Spread(NamedTuple):
     """The variation of unchanged prints.
 
     Attributes:
-        mean: over the prints; ``sd``: between them, with its 95 % interval.
+        mean: mean over the prints; ``sd``: standard deviation between prints, with its 95 % interval.
         between, within: variance of prints, and of scans within a print; ``within`` is None where no print
             has two scans.
     """
@@ -74,8 +76,8 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Return the variance of a print's value by its number of scans, relative to that of a usual print;
-        (n,).
+        """Return the variance of each print's value, which depends on its number of scans, relative to the
+        variance of a usual print; (n,).
         """
         if self.within is None:
             return np.ones(len(counts))
@@ -101,7 +103,7 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute mean and spread over at least two prints, with variance components by one-way analysis of
     variance.
 
-    A print with one scan varies more than a print with four. Prints with several scans show how much of the
+    The mean of one scan varies more than the mean of four. Prints with several scans show how much of the
     variation comes from the scans. A negative variance between prints counts as 0.
     """
     prints = print_values(rows, figure)
@@ -113,7 +115,8 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     for name, value in zip(prints.names, prints.values, strict=True):
         rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
     within = rest / (scans - n) if scans > n else None
-    # The variance of the means of prints is the variance between prints plus the mean part of the scans.
+    # The variance of the prints' means is the variance between prints plus the mean contribution of the
+    # scans.
     between = max(sd**2 - (within or 0.0) * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
@@ -129,8 +132,8 @@ class CheckedModel(Record):
 class Alarm(Record):
     """A step in the mean of a figure, relative; ``since`` is the first changed print.
 
-    ``step`` is the mean from ``since`` on minus the mean before, with an interval that does not allow for the
-    choice of ``since``.
+    ``step`` is the mean from ``since`` on minus the mean before. Its interval does not account for the choice
+    of ``since``.
     """
 
     since: str
@@ -139,15 +142,15 @@ class Alarm(Record):
 
 
 class FigureCheck(Record):
-    """One figure of the new prints against the reference; all values except ``mean`` are relative, 0.01 is 1
-    %.
+    """One figure of the new prints compared with the reference. All values except ``mean`` are relative: 0.01
+    is 1 %.
 
     ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p value of a
     change. An alarm is raised if ``p`` is at most ``alarm_at``, the figure's share of the rate.
     ``noticeable_step`` is the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
-    cases; a fall by r/(1 + r) is noticed equally. ``noticeable_step`` is None beyond a factor of e. ``trend``
-    is the change per print over all prints. ``measure_again_in`` is the number of prints until the 95 % bound
-    of the drift reaches ``tolerance``.
+    cases; a fall by r/(1 + r) is noticed equally often. ``noticeable_step`` is None beyond a factor of e.
+    ``trend`` is the change per print over all prints. ``measure_again_in`` is the number of prints until the
+    95 % bound of the drift reaches ``tolerance``.
     """
 
     name: str

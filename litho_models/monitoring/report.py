@@ -48,8 +48,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
-    """Draw the figure of every print against the reference: dots of prints, small dots of scans, spread,
-    steps.
+    """Draw the figure of every print relative to the reference: large dots for prints, small dots for scans,
+    the spread of the reference, and steps.
     """
     from matplotlib.ticker import MaxNLocator
 

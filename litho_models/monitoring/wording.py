@@ -13,7 +13,8 @@ from litho_models.scoring.printer_state import ScanFigures
 
 # A layout that is this much flatter, higher or steeper than every reference layout is of another kind.
 _OTHER_KIND = 1.1
-# Largest optimism of a fit, in spreads, with which the rate of false alarms still holds.
+# Largest amount, in units of the spread, by which a fit may understate its error without raising the rate of
+# false alarms.
 _BEARABLE_OPTIMISM = 0.25
 
 
@@ -47,8 +48,8 @@ def _sentences(template: str, **values: object) -> list[str]:
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
     """Return whether the reference's errors are too small to be compared with errors on unseen prints.
 
-    On a fit's own scans an error is too small by the ratio of parameters to independent pixels. Neighbours
-    within a correlation length of the residual count once.
+    On the scans that were fitted, the error is too small by the ratio of parameters to independent pixels.
+    Pixels within one correlation length of the residual count as one.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))

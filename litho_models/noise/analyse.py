@@ -33,18 +33,22 @@ def analyse_noise(
     """Analyse the noise of a store; write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store, with or without scans of use substrate, flat and steps, with or without doses.
+        store: dataset store. Scans of use substrate, flat or steps, and doses, are used if the store has
+            them.
         out: result folder.
         residuals: folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
-            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold.
+            ``zoo:NAME``). The analysis then contains σ(x) and its calibration, and the budget if the
+            residuals are out of fold.
         model: which model of the benchmark; its best one by default.
-        seed: seed of drawn pixels.
+        seed: seed that decides which pixels are drawn.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.
     """
     if model is not None and residuals is None:
-        raise InputError("model", got=f"{model} without residuals", wanted="a benchmark to choose it from")
+        raise InputError(
+            "model", got=f"{model} without residuals", wanted="a benchmark from which it can be chosen"
+        )
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
         every = dataset.scans()
@@ -54,8 +58,8 @@ def analyse_noise(
         spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # The dose matrix also uses locked scans, because it judges no model and a dose often has only one
-        # print.
+        # The dose matrix also uses locked scans, because it does not judge a model, and a dose often has only
+        # one print.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
@@ -102,7 +106,7 @@ def analyse_noise_of_files(
     Args:
         out: result folder.
         flat, substrate, steps: scans of a flat print, the bare substrate and a staircase.
-        unit, size_um: unit of the heights and size (y, x) of the field, if the files state none.
+        unit, size_um: unit of the heights and size (y, x) of the field, if the files do not state them.
         level_height_um: nominal step of the staircase.
 
     Raises:

@@ -1,7 +1,7 @@
 """Estimate the noise of ordinary prints from the out-of-fold residuals of a model.
 
-There are two upper estimates: the differences between similar surroundings (``estimated_floor``), and the
-roughness where the layout is flat and model errors are small.
+There are two upper estimates: the differences between residuals in similar surroundings
+(``estimated_floor``), and the roughness where the layout is flat and model errors are small.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ class FlatLevel(Record):
     mae_nm: float
 
 
-# Older results also contain the length of correlation.
+# Older results also contain a correlation length.
 class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 

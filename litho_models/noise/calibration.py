@@ -1,4 +1,4 @@
-"""Test the calibration of a stated spread on prints that its fit has not used."""
+"""Test the calibration of a stated spread on prints that the fit of the spread has not used."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -40,7 +40,7 @@ _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
-# Older results contain further figures: of ensembles, and promises for whole scans.
+# Older results contain further figures: those of ensembles, and stated bounds for whole scans.
 class ScanCalibration(Record, extra="ignore"):
     """One scan: likelihood and CRPS (lower is better), coverage at the stated levels, rms of r/σ.
 
@@ -57,12 +57,14 @@ class ScanCalibration(Record, extra="ignore"):
 
 
 class Calibration(Record, extra="ignore"):
-    """A description of the spread, and its calibration on prints that its fit has not used.
+    """A model of the spread, and its calibration on prints that the fit of the spread has not used.
 
     Args:
-        name: constant, or by covariates.
-        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
-        pit: histogram of the stated probability below r/s, 20 bins, sums to one; flat if the shape is right.
+        name: whether the spread is constant or depends on covariates.
+        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are the coverages that a calibrated
+            spread has.
+        pit: histogram of the stated probability below r/s, in 20 bins that sum to one; flat if the shape is
+            right.
     """
 
     name: str
@@ -99,11 +101,11 @@ class SigmaBin(Record, extra="ignore"):
 
 
 class SpreadAnalysis(Record, extra="ignore"):
-    """The σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, while the model is
-    fitted to all scans.
+    """The σ(x) of one model's residuals and its calibration. ``bins`` are out of fold, while the recorded
+    variance model is fitted to all scans.
 
-    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` are the prints or scans
-    that each fit leaves out in order to be judged on them.
+    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` states whether each fit
+    leaves out prints or scans, on which it is then judged.
     """
 
     model: str
@@ -125,7 +127,8 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit a constant and a covariate-dependent spread without each print, and judge both on that print.
+    """For each print, fit a constant and a covariate-dependent spread to the other prints, and judge both on
+    this print.
 
     With fewer than three prints, scans are left out instead. Tails and scale are fitted together.
 
@@ -214,7 +217,7 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Yield bins of all pixels, of each level, and of equal counts of every other covariate."""
+    """Yield bins: all pixels, each level, and ranges of equal pixel counts of every other covariate."""
     pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
     residual = pool.of(residuals_nm)
     sigma = pool.of([own.tails.sd * own.scale_nm for own in stated])
@@ -248,7 +251,7 @@ def _bins(
 
 
 def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[str, float, float, Array]]:
-    """Yield what a group of pixels has in common, from and to which value, and which pixels it has."""
+    """Yield each group of pixels: the covariate, the limits of its values in the group, and the pixels."""
     level = pool.of([scan.mask_level for scan in pool.scans])
     yield "all", 0, 0, np.ones(level.size, bool)
     for one in np.unique(level).tolist():

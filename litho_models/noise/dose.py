@@ -1,7 +1,8 @@
 """Evaluate the dose matrix: height, roughness and lost steps against dose, and the recommended dose.
 
 This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
-that state a dose, of step ladders or of any layout with areas of one level wider than the printer's blur.
+that state a dose. They show step ladders, or any layout with areas of one level that are wider than the
+printer's blur.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Distance from every change of level: four σ of the optical spot, or two σ of a diffusion of 0.5 µm.
+# Distance kept from every change of level: four σ of the optical spot, or two σ of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
 # A step is lost if its height is less than half the usual height of the steps at this dose.
 LOST_BELOW = 0.5
@@ -38,14 +39,16 @@ class DoseRow(Record, extra="ignore"):
     """One dose.
 
     Args:
-        dose: relative to the nominal one.
+        dose: dose relative to the nominal dose.
         height_gain: printed over nominal height, slope of a straight line through the levels.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation within areas of one level.
         lost_low, lost_high: number of steps at the low and the high end that are, per level, less than half
-            the median step of this dose: from under-exposure (nothing is left) and over-exposure (nothing
-            more reacts). Relative to the dose's own steps, so that shrinkage does not count as exposure.
-        worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
+            the median step of this dose. Low steps are lost to under-exposure (nothing remains), high steps
+            to over-exposure (nothing more reacts). Steps are compared with others of the same dose, so that
+            shrinkage does not count as a wrong exposure.
+        worst_readability: smallest ratio of a step to the σ of its two levels; from 3.92 on, single pixels
+            can be told apart.
     """
 
     dose: float
@@ -60,7 +63,7 @@ class DoseRow(Record, extra="ignore"):
 
 
 class DoseMatrix(Record):
-    """All doses, ascending, with the recommended dose and the reason."""
+    """All doses in ascending order, with the recommended dose and the reason for it."""
 
     rows: list[DoseRow]
     recommended_dose: float
@@ -69,7 +72,7 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge the doses of all scans that state one; notes say which doses are not judged, and why.
+    """Judge the doses of all scans that state a dose. Notes say which doses are not judged, and why.
 
     A dose needs three levels with areas wide enough to measure, and a matrix needs two doses. Among the doses
     that lose the fewest steps, the one with the height nearest to nominal is recommended.
@@ -130,8 +133,8 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
-    """Return mean and sd per level inside areas of one level, after datum, tilt and surroundings of each scan
-    are removed.
+    """Return mean and standard deviation of each level inside areas of one level, after the datum, the tilt
+    and the effect of the surroundings of each scan are removed.
     """
     found: dict[int, list[Array]] = {}
     for scan in scans:
@@ -143,7 +146,7 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
         # The fit has a height per level, one tilt, and an effect of the surroundings. Height differences
-        # within the treads separate these.
+        # within the treads distinguish the tilt and the surroundings from the levels.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
         others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)

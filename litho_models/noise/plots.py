@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Draw each reference scan as a map without its mean; all but steps share a colour scale."""
+    """Draw each reference scan as a map without its mean; all scans except steps share a colour scale."""
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
     grid = figure.subplots(1, len(references), squeeze=False)[0]
     rough = [one for one in references if one.use != "steps"]
@@ -40,7 +40,9 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Draw heights of the levels, and readability against dose, shaded where steps are lost."""
+    """Draw the heights of the levels and the readability against dose; doses at which steps are lost are
+    shaded.
+    """
     figure = new_figure(8.5, 3.2)
     left, right = figure.subplots(1, 2)
     doses = np.array([row.dose for row in found.rows])

@@ -53,7 +53,7 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """Return the substrate, flat and step scans of a store, levelled, in their own frame."""
+    """Return the substrate, flat and step scans of a store, levelled, each in the frame of the scan."""
     pitches = store.recorded_pitches_um()
     return [
         Reference(
@@ -68,8 +68,8 @@ def store_references(store: Store) -> list[Reference]:
 
 
 def reference_prints(references: Sequence[Reference], level_height_um: float) -> ReferencePrints:
-    """Compute the roughness of substrates and flat prints under both backgrounds, of the print alone, and of
-    the steps.
+    """Compute the roughness of substrates and flat prints with each of the two backgrounds removed, the
+    roughness of the print alone, and the results of the steps.
     """
 
     def surfaces(use: str) -> list[SurfaceNoise]:
@@ -123,8 +123,8 @@ class RepeatedPrints(Record):
 def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     """Return half the variance between prints of one layout at one dose; None without repeated prints.
 
-    The mean absolute value is that of the difference divided by √2. This is exact for a Gaussian, and within
-    a few percent for other noise (``estimated_floor``).
+    The mean absolute error is the mean absolute difference divided by √2. This is exact for Gaussian noise,
+    and within a few percent for other noise (``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
-# What each policy fits to a scan before the noise is measured, in words.
+# The terms that each policy fits to a scan before the noise is measured, in words.
 _FREE = {
     "none": "nothing fitted",
     "offset": "the zero of each scan free",
     "offset-gain": "zero and gain of each scan free",
     "full": "zero, gain, tilt and bow of each scan free",
-    "full+rows": "zero, gain, tilt, bow and lines of each scan free",
+    "full+rows": "zero, gain, tilt, bow and line offsets of each scan free",
 }
 
 
@@ -55,7 +55,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
 
 
 def noise_verdict(floor: NoiseFloor) -> str:
-    """Say in one sentence how much of a model's error is noise."""
+    """State in one sentence how much of a model's error is noise."""
     return filled(Path(__file__).with_name("verdict.jinja"), floor=floor).strip()
 
 
@@ -72,13 +72,13 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     if rows:
         page.table(
             rows,
-            "Roughness. MAE is measured about the median.",
+            "Roughness. MAE is the mean absolute deviation from the median.",
             "surfaces.csv",
         )
     if found.print_noise:
         page.table(
             found.print_noise,
-            "What the print adds to substrate and microscope, in quadrature.",
+            "Roughness that the print adds, in quadrature, to that of substrate and microscope.",
             "print_noise.csv",
         )
     for one in found.textures:
@@ -117,7 +117,7 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
         plots.dose(found),
-        "Green: recommended. Shaded: steps are lost. Dashed: single pixels of two levels are told apart.",
+        "Green: recommended. Shaded: steps are lost. Above the dashed line, single pixels tell levels apart.",
     )
     page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
@@ -165,7 +165,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     )
     page.table(
         found.bins,
-        "By level, and in ranges of equal count of what else σ depends on; intervals over prints.",
+        "By level, and by ranges of equal pixel count of the other covariates; intervals over prints.",
         "spread.csv",
         digits=3,
     )

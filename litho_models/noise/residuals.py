@@ -28,7 +28,7 @@ class Residuals(NamedTuple):
     """The residuals of a model on each scan: measured minus predicted, nm; NaN where not scored.
 
     Attributes:
-        maps_um: the map that the model expects of each scan, (ny, nx).
+        maps_um: the map that the model expects for each scan, (ny, nx).
         residuals_nm: residuals without the terms of ``protocol``.
         held_out: whether the model had not seen any of the scans.
     """
@@ -42,7 +42,7 @@ class Residuals(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Pixels of several scans, one after the other; ``used`` marks these pixels in bool maps (ny, nx)."""
+    """Pixels of several scans, concatenated; ``used`` marks them in one bool map (ny, nx) per scan."""
 
     scans: Sequence[PrintedScan]
     used: Sequence[Array]
@@ -52,27 +52,27 @@ class Pool(NamedTuple):
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
-        """Return the interval over prints of the mean of values (n,) at the chosen pixels."""
+        """Return the interval, over prints, of the mean of ``values`` (n,) at the chosen pixels."""
         owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
         return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Return residuals of each scan, measured minus predicted, without its own terms (fitted on other
-    pixels).
+    """Return the residuals of each scan, measured minus predicted, without the scan's terms, which are fitted
+    on other pixels.
 
     The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
     shared background. The mean absolute value of these residuals is therefore the error stated there.
 
     Args:
         store: the store that the source was made from.
-        source: result folder of ``litho-models benchmark``, whose cache holds predictions of scans that the
-            fit has not seen, or a frozen model (a folder, ``zoo:NAME``). The lock box is left out.
-        model: which model of a benchmark; its best one by default.
+        source: frozen model (a folder, ``zoo:NAME``), or result folder of ``litho-models benchmark``, whose
+            cache holds predictions of scans that the fit has not seen. Locked scans are left out.
+        model: which model of a benchmark; by default the best one.
 
     Raises:
-        InputError: a folder that is neither, a benchmark of another dataset or without its cache, a ``model``
-            together with a frozen one, or no scan that was predicted.
+        InputError: a folder that holds neither, a benchmark of another dataset or without its cache, a
+            ``model`` given together with a frozen model, or no predicted scan.
     """
     folder = zoo.model_folder(source, other=["the result of a benchmark"])
     if not (folder / CARD_FILE).exists():
@@ -81,7 +81,9 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     elif model is None:
         name, maps, protocol, held_out = _of_frozen(store, folder)
     else:
-        raise InputError("model", got=f"{model} with a frozen model", wanted="a benchmark to choose it from")
+        raise InputError(
+            "model", got=f"{model} with a frozen model", wanted="a benchmark from which it can be chosen"
+        )
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id in maps]
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")

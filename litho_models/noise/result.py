@@ -1,5 +1,5 @@
-"""The record ``noise.json``: everything known about the noise of a dataset, and the floor that follows from
-it.
+"""The record ``noise.json``: all results about the noise of a dataset, and the noise floor that follows from
+them.
 """
 
 import numpy as np
@@ -35,8 +35,8 @@ class NoiseAnalysis(Result, extra="ignore"):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """Choose the floor: from repeated prints, otherwise from a flat print, otherwise from the residuals of a
-    model.
+    """Choose the source of the noise floor: repeated prints; without these a flat print; without both, the
+    residuals of a model.
     """
     if repeats is not None:
         return NoiseFloor(

@@ -1,4 +1,4 @@
-"""Score a stated spread by closed forms for a Gaussian or Student's t, and by two scores that need no
+"""Score a stated spread by closed-form scores for a Gaussian or Student's t, and by two scores that assume no
 distribution.
 
 The CRPS of a Gaussian follows Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with the
@@ -24,11 +24,13 @@ class Tails:
     freedom: float = float("inf")
 
     def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
-        """Return the log density per pixel; its zero depends on the common unit of residual and scale."""
+        """Return the log density per pixel, up to a constant that depends on the common unit of residual and
+        scale.
+        """
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: Array) -> Array | float:
-        """Return −2 d log density / d z²: how much a squared residual counts, which is 1 for a Gaussian."""
+        """Return −2 d log density / d z², the weight of a squared residual, which is 1 for a Gaussian."""
         return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
 
     @property
@@ -38,17 +40,19 @@ class Tails:
 
     @property
     def sd(self) -> float:
-        """Return the standard deviation over the scale; this requires more than two degrees of freedom."""
+        """Return the ratio of standard deviation to scale; this requires more than two degrees of freedom."""
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Return the probability below z, which is uniform for residuals over their scale if scale and shape
-        are right (PIT).
+        """Return the probability below z (PIT). For residuals divided by their scale it is uniformly
+        distributed if scale and shape are right.
         """
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return the half width, over the scale, of the central interval that contains ``level``."""
+        """Return the half width, in units of the scale, of the central interval with the probability
+        ``level``.
+        """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
@@ -78,11 +82,11 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     """Return ENCE, the mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
     Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels of one σ
-    stay in one bin, so that a constant σ has one bin. By chance the result is about ``1/√(π n)`` for n
-    independent pixels a bin.
+    stay in one bin, so that a constant σ has one bin. Even for a perfect σ the result is about ``1/√(π n)``
+    by chance, with n independent pixels per bin.
 
     Args:
-        residual, sigma: (pixels,), one unit.
+        residual, sigma: (pixels,), both in the same unit.
     """
     number = equal_counts(sigma, _BINS)[1]
     count = np.bincount(number)
@@ -100,13 +104,13 @@ def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
 def sparsification_error(residual: Array, sigma: Array) -> float:
     """Return AUSE, which states how well σ ranks the pixels by error; 0 is perfect.
 
-    Pixels are removed in two orders, largest σ first and largest ``|r|`` first. AUSE is the area between the
-    two curves of the mean ``|r|`` of the rest over the removed share, 0 to 1, in units of the mean ``|r|`` of
-    all pixels. Ilg et al. 2018, arXiv:1802.07095. Pixels with
-    the same σ count with their mean, so that their order does not matter.
+    Pixels are removed in two orders, largest σ first and largest ``|r|`` first. For each order, the mean
+    ``|r|`` of the remaining pixels is a curve over the removed share, 0 to 1. AUSE is the area between the
+    two curves, in units of the mean ``|r|`` of all pixels. Ilg et al. 2018, arXiv:1802.07095. Among pixels
+    with the same σ, each counts with the group's mean, so that their order does not matter.
 
     Args:
-        residual, sigma: (pixels,), one unit; not all residuals zero.
+        residual, sigma: (pixels,), both in the same unit; not all residuals may be zero.
     """
     error = np.abs(residual)
     value, group = np.unique(sigma, return_inverse=True)

@@ -18,7 +18,7 @@ from litho_models.scoring.statistics import rms
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
-# Narrowest tread, as a share of the field.
+# Width of the narrowest tread, as a share of the field.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
@@ -27,8 +27,8 @@ class Step(Record, extra="ignore"):
     """One step of a staircase, nm.
 
     Args:
-        readability: height over the σ of single pixels on its two treads.
-        misread: share of the pixels of both treads nearer to the other one.
+        readability: height divided by the σ of single pixels on its two treads.
+        misread: share of the pixels of both treads that are nearer to the height of the other tread.
     """
 
     height_nm: float
@@ -42,7 +42,7 @@ class StepPrint(Record, extra="ignore"):
     """A print of steps.
 
     Args:
-        tread_sigma_nm: rms deviation within the treads, one plane for all removed.
+        tread_sigma_nm: rms deviation within the treads after one common plane is removed.
         tread_mae_nm: mean absolute deviation from the median of each tread.
         resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
     """
@@ -112,7 +112,8 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
     """Find the axis of a staircase and the pixels at which a new tread starts, ascending.
 
     Constant pieces are fitted to the profile of medians with the least squared error plus a price per edge.
-    The price is the saving by an edge between two treads of the narrowest width that differ by half a level.
+    The price equals the error that an edge saves between two treads of the narrowest width that differ by
+    half a level.
 
     Raises:
         InputError: no edge along either axis.
@@ -161,7 +162,7 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the columns of each tread without a guard at its edges, which is at most a third of its
+    """Return the columns of each tread, leaving out a guard at both edges of at most a third of the tread's
     width.
     """
     ends = pairwise([0, *edges_px, shape[1]])

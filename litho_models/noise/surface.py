@@ -27,8 +27,9 @@ class SurfaceNoise(Record, extra="ignore"):
         background: the removed background: the mean (``offset``) or a polynomial of second degree.
         sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm`` its standard uncertainty from the
             number of independent heights in the field.
-        mae_nm: mean absolute deviation from the median, as measured: no distribution assumed.
-        independent_heights: pixels over the sum of squared autocorrelation.
+        mae_nm: mean absolute deviation from the median, computed from the pixels without assuming a
+            distribution.
+        independent_heights: number of pixels divided by the sum of the squared autocorrelation.
     """
 
     id: str
@@ -67,7 +68,7 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
     if finite.sum() < 64:
         raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
     sigma = NM_PER_UM * rms(deviation[finite])
-    # Unmeasured pixels have no information, so they enter the correlation as the mean.
+    # Unmeasured pixels carry no information, so the mean replaces them in the correlation.
     filled = np.where(finite, deviation, deviation[finite].mean())
     independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
     centred = deviation[finite] - np.median(deviation[finite])
@@ -89,10 +90,12 @@ def without_background(height_um: np.ndarray, background: Background) -> np.ndar
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
-    """Compute the print alone by quadrature, assuming that microscope and substrates add independently.
+    """Compute the roughness of the print alone by subtraction in quadrature, assuming that the roughness of
+    microscope and substrate is independent of the print.
 
     Args:
-        flat: of the flat print; ``substrates``: one or more, freed of the same background.
+        flat: noise of the flat print; ``substrates``: noise of one or more substrates, with the same
+            background removed.
     """
     square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
     if square <= 0:

@@ -20,10 +20,10 @@ class Period(Record, extra="ignore"):
 
     Args:
         period_um: distance at which lines repeat.
-        share: its part of the squares of the lines' means.
-        p: chance of such a peak anywhere in a smooth spectrum.
-        amplitude_nm: root mean square over the surfaces.
-        coherence: 1 if the surfaces have one phase, in the frame that they are given in.
+        share: part of the sum of squares of the lines' means that has this period.
+        p: chance of a peak this high anywhere in a smooth spectrum.
+        amplitude_nm: root mean square of the amplitude over the surfaces.
+        coherence: 1 if the lines have the same phase in all surfaces, in the frame in which these are given.
     """
 
     period_um: float
@@ -38,9 +38,9 @@ class Lines(Record):
 
     Args:
         along: ``x`` (rows) or ``y`` (columns).
-        share: part of the surface's variance in the means of the lines. A surface without lines also has a
-            share, so compare the two axes.
-        period: the strongest one of these means; None below 64 lines.
+        share: part of the surface's variance that is in the means of the lines. It is not zero for a surface
+            without lines either, so compare the two axes.
+        period: the strongest period of these means; None with fewer than 64 lines.
     """
 
     along: str
@@ -53,8 +53,8 @@ class Texture(Record):
 
     Args:
         angle_deg: direction of the lines, 0 along x, positive from x to y.
-        strength: 0 where all directions are alike, 1 for lines of one direction; ``isotropic_p`` the chance
-            of this strength in a surface alike in all directions.
+        strength: 0 if all directions are alike, 1 for lines of one direction; ``isotropic_p``: the chance of
+            such a strength in an isotropic surface.
         lines: along x and along y.
     """
 
@@ -67,7 +67,7 @@ class Texture(Record):
 
     @property
     def verdict(self) -> str:
-        """Say in words whether the texture is directed and periodic, at a chance of 1 in 1,000."""
+        """State whether the texture is directed and periodic, at a significance level of 1 in 1,000."""
         directed = (
             f"line-shaped, along {self.angle_deg:.0f}° from x" if self.isotropic_p < RARE else "no direction"
         )
@@ -81,7 +81,8 @@ class Texture(Record):
 
 
 def texture(name: str, heights_um: Sequence[np.ndarray], pitch_um: float) -> Texture:
-    """Measure the texture of levelled surfaces, (ny, nx) µm each on square pixels; NaN is left out.
+    """Measure the texture of levelled surfaces, (ny, nx) µm each, with square pixels; NaN pixels are left
+    out.
 
     Raises:
         InputError: a surface of fewer than 64 rows or columns.

@@ -1,8 +1,9 @@
 """Fit σ(x), a log-linear model of a residual's spread by layout and position.
 
-The mean is fitted first and then kept. Then ln s² = X β is fitted to its out-of-fold residuals by maximum
-likelihood, with the tails of Student's t. In two stages, a wide spread cannot hide errors of the mean. Tens
-of scans determine only a few covariates (compare Seitzer et al. 2022, arXiv:2203.09168).
+The mean is fitted first and then kept fixed. Then ln s² = X β is fitted to the out-of-fold residuals by
+maximum likelihood, with the tails of Student's t. With these two stages, a wide spread cannot hide errors of
+the mean (compare Seitzer et al. 2022, arXiv:2203.09168). Tens of scans determine the coefficients of only a
+few covariates.
 """
 
 import numpy as np
@@ -16,7 +17,8 @@ from litho_models.scoring.like_layouts import blurred_layout_um
 
 # Maps on which σ may depend; the slope is also taken squared, and the radius also to the fourth power.
 PLACES = ("level", "slope", "edge distance", "radius²")
-# The dependence is linear between the knots: rare levels at both ends are twice as rough as the middle.
+# The dependence on the level is linear between these knots. Rare levels at both ends are twice as rough as
+# those in the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
 COVARIATES = (
     *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
@@ -26,12 +28,13 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# Shapes from tails much heavier than those of prints to a Gaussian.
+# The shapes that are tried, from tails much heavier than those of prints to a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
-# The optical spot, which blurs edges of the layout.
+# Standard deviation of the optical spot, which blurs edges of the layout.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
-# Twice the largest effect seen on noise of 1 to 100 nm, to keep exp() finite during the fit.
+# Limit of a step, which keeps exp() finite during the fit: twice the largest effect seen for noise of 1 to
+# 100 nm.
 _LARGEST_STEP = 2.0
 _STEPS = 60
 
@@ -41,8 +44,8 @@ class VarianceModel(Record):
 
     The covariates are the level on 0 ... 1 of the range, linear between knots; the slope of the blurred
     layout (height over length); the distance to the next change of level, at most 2 µm, in units of this
-    maximum; and the radius from the field's centre in units of half its diagonal. ``freedom`` belongs to
-    Student's t with scale s; None for a Gaussian.
+    maximum; and the radius from the field's centre in units of half its diagonal. ``freedom`` is the degrees
+    of freedom of Student's t with scale s; None for a Gaussian.
     """
 
     covariates: list[str]
@@ -81,7 +84,7 @@ def layout_slope(scan: PrintedScan) -> Array:
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
-    """Find the scale and tails that make the residuals most likely: β of ln s² = X β, and the shape."""
+    """Find the scale and the tails that make the residuals most likely: β in ln s² = X β, and the shape."""
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
         beta = fit_log_scale(covariates, residual, tails)
@@ -97,7 +100,7 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
     The information I of a pixel about ln s² does not depend on s, so one matrix serves all steps.
 
     Args:
-        covariates: X, (pixels, k), some sum of columns constant.
+        covariates: X, (pixels, k), with a sum of columns that is constant.
         residual: r, (pixels,).
         tails: shape of r/s, which sets the weights w.
 

@@ -1,4 +1,4 @@
-"""State for each open question of a plan: difference, power, reason, and the meaning of each outcome."""
+"""For each open question of a plan, state the difference of the rivals, the power and all outcomes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Z_DECIDED = float(norm.isf(CONFIRM_P))
 # If the printer is the cause, this share of a per-scan term's variance differs between prints.
 PRINT_SHARE = 0.9
 ENOUGH = 0.95
-# Below this power no allowed experiment counts as separating the rivals.
+# Below this power, the rivals count as not separated by any allowed experiment.
 HOPELESS = 0.2
 MOST_PRINTS = 12
 
@@ -31,8 +31,8 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     """Return the power with ``prints`` prints like those of the contrast.
 
     The difference of two squared errors has the squared distance as its mean. The variance of this difference
-    comes from the noise along the distance, and from the distance itself, which varies between prints by the
-    question's ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
+    has two sources: the noise along the distance, and the distance itself, which varies between prints by
+    the question's ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -59,8 +59,9 @@ def of_repeats(prints: int, scans: int) -> float:
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
-    """Return the power to distinguish written from scanned lines in a turned scan, where they lie along
-    different axes.
+    """Return the power to distinguish lines made by the printer from lines made by the microscope.
+
+    The scan is turned, so the two kinds of lines run along different axes.
     """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
@@ -71,30 +72,29 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 
 def prints_needed(powers: Sequence[float]) -> int | None:
-    """Return the smallest number of prints with enough power; None if no tested number has it."""
+    """Return the smallest number of prints with enough power; None if no tested number is enough."""
     found = np.flatnonzero(np.array(powers) >= ENOUGH)
     return int(found[0]) + 1 if len(found) else None
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Return the significance of a gain, in standard deviations of noise, after an allowance for the model's
-    own error.
+    """Return by how many noise standard deviations a gain exceeds the allowance for the model's own error.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose A is
     true except for noise n and an error e of the form that both rivals share. Prints then show y = A + e + n,
     and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise
     averages out over prints, but e recurs in every print of similar texture. The angle between e and D is
-    unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), up to 2 |D| |e| of a difference is inconclusive, and
-    no number of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without it the
-    gain would be |D|². A deviation from |D|² beyond noise therefore also counts as an error. The larger of
-    the two allowances is used.
+    unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference up to 2 |D| |e| is inconclusive, and no
+    number of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without e,
+    the gain would be |D|². A deviation from |D|² beyond noise therefore also counts as an error. The larger
+    of the two allowances is used.
 
     Args:
         gain: squared error of one rival minus that of the other; if negative, it favours the other.
         difference: |D|², squared difference of their predictions.
         sd: standard deviation of the gain by noise.
-        form: |e|², squared error of the form; 0 if unknown. All four are sums over the same pixels, in one
-            unit.
+        form: |e|², squared error of the form; 0 if unknown. All four arguments are sums over the same
+            pixels, in the same unit.
     """
     if sd <= 0:
         return 0.0
@@ -106,8 +106,8 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
-# Number of draws of the rivals' parameters within their uncertainty, because a difference may depend on a
-# parameter.
+# Number of random draws of the rivals' parameters within their uncertainty. The power is averaged over the
+# draws, because the difference of two rivals may depend on a parameter.
 DRAWS = 8
 _HOPELESS: Status = "no experiment separates"
 
@@ -129,14 +129,14 @@ def of_rivals(
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
     why = [f"difference of the nearest two rivals on one random print, in standard deviations: {ways}"]
     if question.spread:
-        why.append(f"what a print says varies by {100 * question.spread:.0f} %, beyond noise")
+        why.append(f"the evidence of a print varies by {100 * question.spread:.0f} %, beyond noise")
     if question.form_nm is not None:
         why.append(
             f"the model's own error is {question.form_nm:.1f} nm at most, the two differ by "
             f"{hardest.difference_nm:.1f} nm"
         )
     if _status(hardest.power, prints) == _HOPELESS:
-        why.append(f"no experiment of this plan separates them; not in it: {question.experiment}")
+        why.append(f"no experiment of this plan separates them; one outside it might: {question.experiment}")
     return _planned(
         question,
         hardest.power,
@@ -145,7 +145,7 @@ def of_rivals(
         [
             *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
             "two fit equally well: these two stay a set, the others are excluded",
-            "all leave more than the noise: none of them is the cause",
+            "the residuals of all exceed the noise: none of them is the cause",
         ],
         rivals=names,
         pairs=pairs,
@@ -157,7 +157,7 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Return the unordered pairs, each in the direction with less power, averaged over the draws."""
+    """Return the pairs of rivals, each in the direction with less power, averaged over the draws."""
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
     for _ in range(DRAWS):
@@ -190,7 +190,7 @@ def of_others(
             question,
             [of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS],
             prints,
-            "lines of a turned scan run along the other axis of the layout than written ones",
+            "in a turned scan, scan lines and written lines run along different axes of the layout",
             [
                 "offsets follow the layout's rows in turned scans, too: written",
                 "they follow the scan lines: scanned",
@@ -201,7 +201,7 @@ def of_others(
             question,
             [of_repeats(n, scans) for n in _COUNTS],
             prints,
-            "every print is taken out and scanned again: what belongs to it comes back",
+            "every print is taken out and scanned again, so the printer's part of the term repeats",
             [
                 "scans of one print agree: the printer's, different in every print",
                 "they agree no better than scans of different prints: the microscope's",

@@ -4,7 +4,8 @@ Every rival is fitted to all prints, old and new, and judged only on the new pri
 squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
 standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
 one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
-better with p <= 0.005 and by 1 % of its squared error. A name is given if one rival remains.
+better, with p <= 0.005 and by at least 1 % of the squared error of the better one. The answer is given if
+only one rival remains.
 """
 
 from __future__ import annotations
@@ -46,10 +47,10 @@ def decide(
     new: Sequence[PrintedScan],
     report: Callable[[str], None] = lambda message: None,
 ) -> list[Decision]:
-    """Return the answer every declared question that scans can answer.
+    """Return the decision on every declared question that scans can answer.
 
     Args:
-        closed: the loop with the questions; ``new``: scans that it has not seen.
+        closed: the loop that asked the questions; ``new``: scans that it did not use.
     """
     judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
     kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
@@ -67,7 +68,7 @@ class Judge:
 
     Attributes:
         twin: the corrected model with common strengths; ``study``: the study that it was fitted to.
-        new: scans that no fit has seen.
+        new: scans that were not used in the fits of the study.
     """
 
     twin: Twin
@@ -75,7 +76,7 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Fit every rival, and a model without any of them, to all scans, and judge them on the new scans."""
+        """Fit every rival, and a model without rivals, to all scans, and judge the fits on the new scans."""
         twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
@@ -129,7 +130,7 @@ class Judge:
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """Enter the decisions into the result: a single remaining effect is explained, with its owner."""
+    """Enter the decisions into the result. An effect that remains alone is explained, with its owner."""
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
         rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
@@ -151,7 +152,7 @@ def compared(
 ) -> Decision:
     """Judge the answers to a question by their residuals on the new scans, maps (y, x) in nm."""
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
-    # As in the loop, a smaller difference may come from effects that are not among the rivals.
+    # A smaller gain does not count, as in the loop: it may come from effects that are not among the rivals.
     least = {
         name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
         for name, own in left_nm.items()
@@ -180,7 +181,9 @@ def _compare(
     new: Sequence[PreparedScan],
     question: Question,
 ) -> Comparison:
-    """Compare the squared errors of two rivals, summed over blocks, with their spread within and between
+    """Compare the squared errors of two rivals.
+
+    The errors are summed over blocks, and their difference is compared with its spread within and between
     prints.
     """
     by_print: dict[str, np.ndarray] = {}
@@ -221,7 +224,7 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """Make the decision on a question; by default it is decided if one answer remains."""
+    """Return the decision on a question. By default, the question is decided if one answer remains."""
     return Decision(
         question=question.name,
         kind=question.kind,

@@ -23,7 +23,7 @@ WORDS = {
     Way(pixel_size=0.5): "with pixels of half the size, as much time for each",
 }
 _MOST_EXTRAS = 2
-# A further scan is planned if it separates rivals this many times as well.
+# A further scan is planned if it increases the separation of the rivals at least by this factor.
 _WORTH = 1.3
 # A lower dose keeps every exposure in the range that the models know, unlike a higher dose.
 SECOND_DOSE = 0.8
@@ -35,11 +35,11 @@ _MOST_REPEATING = 0.7
 
 
 class Chosen(NamedTuple):
-    """The ways to print and scan for one question or for all questions.
+    """How prints are made and scanned for one question or for all questions.
 
-    ``ways`` are the scans of each print. ``places`` (in the write field) and ``doses`` belong to the prints
-    in turn. ``tried`` is the separation, in standard deviations, by one plain scan and with each other way
-    added.
+    ``ways`` are the scans of each print. Successive prints take the ``places`` (in the write field) and
+    ``doses`` in turn. ``tried`` is the separation, in standard deviations, with one plain scan and with each
+    other way added.
     """
 
     ways: tuple[Way, ...]
@@ -52,14 +52,15 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     """Choose the ways to print and scan that separate the rivals of a question.
 
     Args:
-        level: a layout to try the ways on; ``can_move``: whether the write field is larger than a print.
+        level: layout on which the ways are tried.
+        can_move: whether the write field is larger than a print.
     """
     ways: tuple[Way, ...] = (Way(),)
     reached = score(rivalry, level, ways)
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
-        # Each way is judged together with one plain scan.
+        # The report gets the separation with only one plain scan and this way, so earlier values are kept.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
@@ -97,7 +98,7 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Optimise tiles for the questions in turn; return soft levels, and the start of each tile.
+    """Optimise tiles for the questions in turn; return their soft levels and the names of their starts.
 
     Args:
         kept: folder of finished tiles; tiles of an interrupted run are reused.
@@ -123,8 +124,9 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return how closely a layout repeats itself, as registration judges it; at 1, another shift fits equally
-    well.
+    """Return how closely a layout repeats itself, as registration measures it.
+
+    At 1, the layout fits equally well at another shift.
     """
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

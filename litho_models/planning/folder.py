@@ -42,13 +42,13 @@ _REFERENCES = {
     "steps": "height against level; the microscope's gain on a step standard",
     "grating": "scales and unevenness of the scanner, and the tip",
 }
-# Descriptions of the references for the printer.
+# Descriptions of the references on the printer's sheet.
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
     "steps": "a stair: height against level",
 }
-# Periods of gratings on the market, µm, and the fewest periods in a field from which the period is found.
+# Periods of commercial gratings, µm, and the smallest number of periods in a field that shows the period.
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 
 
@@ -59,7 +59,7 @@ _LADDER_PX = 5 * _TREAD_PX
 def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
-    """Return the rows of the table, and the layout of each row."""
+    """Return the planned scans, which are the rows of the table, and the layout of each scan."""
     size_px = len(planned[0].level)
     # A stair looks the same when shifted, so it gets a frame if there is room.
     ladder = limits.random(size_px, seed + 13)
@@ -99,14 +99,14 @@ def schedule(
 
 
 def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
-    """Write card, table, layouts and sheets; ``layouts``: the level map of each scan."""
+    """Write card, table, layouts and sheets; ``layouts`` contains the level map of each scan."""
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
     write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
     write_card(
         folder,
         name=f"{plan.dataset.name}-next",
-        title=f"Planned prints that decide what is open on {plan.dataset.name}",
+        title=f"Planned prints that decide the open questions on {plan.dataset.name}",
         pitch_um=printing.pitch_um,
         level_height_um=printing.level_height_um,
         levels=printing.highest + 1,

@@ -1,4 +1,4 @@
-"""Optimise layouts that the rivals print most differently.
+"""Optimise layouts for which the predictions of the rivals differ most.
 
 A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and follows the
 gradient of the rivals' separation. The tile is low-passed and clipped in every step, so it stays similar to
@@ -24,17 +24,17 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Levels that are rarer than this in earlier prints are unknown to the models.
+# The models do not know levels that are rarer than this share in earlier prints.
 _RARE = 1e-3
-# Allowed distance between the mean and spread of the levels and those of earlier prints.
+# Summed distance of the mean and the spread of the levels from those of earlier prints that costs nothing.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of planned layouts: levels, cut-off (cycles/µm), and mean and spread of the levels in
-    earlier prints.
+    """Limits of planned layouts: lowest and highest level, cut-off frequency (cycles/µm), and mean and
+    spread of the levels in earlier prints.
     """
 
     lowest: int
@@ -46,8 +46,8 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Allow levels with a share of at least a thousandth, and structure no finer than in earlier
-        prints.
+        """Allow levels that cover at least a thousandth of earlier prints, and no finer structure than
+        they have.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
@@ -57,7 +57,7 @@ class Limits:
         return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
-        """Return the printable soft levels (y, x) nearest to unrestricted values."""
+        """Low-pass unrestricted values and clip them to soft levels (y, x) that can be printed."""
         y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
@@ -89,7 +89,7 @@ class Limits:
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the layouts to start from, with their names, (size, size) levels.
+    """Yield the names and levels (size, size) of the layouts from which an optimisation may start.
 
     Patterns get a random frame, a fifth of the side wide, because scans of periodic patterns cannot be
     registered.
@@ -118,8 +118,9 @@ def score(
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
 ) -> float:
-    """Return the separation of the nearest pair, in standard deviations, by a print of this layout at each
-    dose.
+    """Return the separation of the nearest pair of rivals, in standard deviations.
+
+    One print of the layout is made at each dose.
     """
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     return float(rivalry.separations(prints, rivalry.refitted(prints)).min())

@@ -1,8 +1,8 @@
 """List the open questions of a closed loop, with everything that is needed to plan an experiment.
 
 Effects that look the same become rivals: each of them in turn is added to the corrected model, which is
-refitted to all scans. An effect of unknown owner becomes two rivals: one turns with the print, the other with
-the scan.
+refitted to all scans. If it is unknown whether printer or microscope causes an effect, the effect becomes two
+rivals: one turns with the print, the other with the scan.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from litho_models.planning.questions import (
 from litho_models.scan_terms import line_terms, terms_of_effect
 from litho_models.scan_terms.grouped import ALL
 
-# Largest number of rivals, because every pair is compared on every layout.
+# Largest number of rivals. It is limited because every pair is compared on every layout.
 _MOST_MEMBERS = 3
 # Smallest layout whose spectrum is measured, and the share of power below the cut-off.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
@@ -80,7 +80,7 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 
 
 class _Asking:
-    """Make the questions with rivals about one closed loop."""
+    """Make the questions of a closed loop that have rivals."""
 
     def __init__(self, closed: Closed, report: Callable[[str], None]):
         self.closed, self.study, self.report = closed, closed.study, report
@@ -90,7 +90,7 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """Ask which effect of a set, or which owner, is right; return None if nothing is open."""
+        """Return the question of which effect of a set, or which owner, is right; None if nothing is open."""
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
@@ -107,7 +107,7 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Ask which of the significant but unconfirmed effects, if any, explains the residual."""
+        """Return the question of which significant but unconfirmed effect, if any, explains the residual."""
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
@@ -121,8 +121,8 @@ class _Asking:
             return None
         twins = [_with(self.twin, one) for one in standing]
         rivals = self._rivals(names, twins)
-        # The loop has estimated the error of the form without these effects, and the estimate applies to them
-        # too.
+        # The loop estimated the error of the model's form without these effects. The estimate also applies
+        # with them.
         learner = Learner(self.study, self.maps)
         fitted = [rival.twin(self.twin.alone()) for rival in rivals]
         rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
@@ -156,8 +156,7 @@ class _Asking:
         return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
 
     def _spread(self, name: str) -> float:
-        """Return the variation of the evidence for an effect over scans beyond noise, relative to the mean
-        evidence.
+        """Return how much the evidence for an effect varies over scans beyond noise, relative to its mean.
 
         Let a be the multiple of the change d that fits a scan best. The difference of the scan's squared
         errors is |d|² (2 a - 1) plus noise, so it varies by twice the spread of a. Differences between groups
@@ -181,8 +180,9 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible owners of an effect: the catalogue's owner, or both if scans of one orientation
-    cannot distinguish them.
+    """Return the possible owners of an effect: the owner in the catalogue, or printer and microscope.
+
+    Both are possible if scans of one orientation cannot distinguish them.
 
     A tip that is sharper along one axis looks like a print with wider flanks along that axis.
     """
@@ -191,7 +191,7 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
 
 
 def _of_single_scans(result: CloseLoop) -> list[Question]:
-    """Ask about per-scan terms of unknown owner, and about line offsets."""
+    """Return the questions about per-scan terms of unknown owner, and about line offsets."""
     return [
         _question(
             "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",

@@ -1,8 +1,8 @@
 """The open questions of a closed loop, ``open_questions.json``, from which experiments are planned.
 
 Rivals are fitted from the same starting points, because the base has more than one optimum: an almost
-straight projection and a steep one are different optima. Two equivalent effects fitted from different starts
-would differ by several nm² on new layouts.
+straight projection and a steep one are different optima. If two equivalent effects were fitted from different
+starts, they would differ by several nm² on new layouts.
 """
 
 from __future__ import annotations
@@ -112,8 +112,9 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """Return the model, whose effect turns with the print or with the scan; ``bare`` is its base
-        alone.
+        """Return the model of this answer; its effect turns with the print or with the scan.
+
+        ``bare`` is the base without effects.
         """
         for name, values in self.effects.items():
             bare = bare.with_effect(name, ALL, {"": values})
@@ -126,7 +127,7 @@ class Question(Record):
     """An open question of a loop.
 
     Attributes:
-        spread: variation between prints of the evidence for the effect, relative to its mean, beyond noise.
+        spread: how much the evidence for the effect varies between prints beyond noise, relative to its mean.
         form_nm: upper bound of the rms error of the model's form, from what could still be learned beside the
             best answer; None if unknown.
         sizes: sizes of per-scan terms, by name and unit.
@@ -143,7 +144,7 @@ class Question(Record):
 
 
 class OpenQuestions(Result):
-    """``open_questions.json``: the open questions, and the noise for their decision.
+    """``open_questions.json``: the open questions, and the noise against which they are decided.
 
     ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` their finest
     structure, cycles/µm.

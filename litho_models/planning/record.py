@@ -47,10 +47,10 @@ class PlannedPair(Record):
 class PlannedQuestion(Record):
     """An open question and how the plan answers it.
 
-    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is the same for
-    random layouts with the same scans, and ``random_difference_nm`` the smallest difference of any pair on
-    them. ``prints_needed`` is the number of prints for a power of 0.95. ``form_nm`` is an upper bound of the
-    error of the model's own form, None if unknown.
+    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is this
+    probability for random layouts with the same scans, and ``random_difference_nm`` is the smallest
+    difference of any pair on them. ``prints_needed`` is the number of prints for a power of 0.95.
+    ``form_nm`` is an upper bound of the error of the model's form, or None if unknown.
     """
 
     name: str
@@ -71,8 +71,8 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan: the prints, the scans, and the questions that they decide; ``settings`` are the settings of the
-    user.
+    """A plan: the prints, the scans, and the questions that they decide; ``settings`` are those that the
+    user gave.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"

@@ -48,7 +48,8 @@ def write_report(
     page.verdict(_verdict(plan))
     first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
-        layouts_figure(first, plan.levels), "Levels of the first prints; each has the tiles in another order."
+        layouts_figure(first, plan.levels),
+        "Levels of the first prints; each has the same tiles in a different order.",
     )
     rows = [
         {
@@ -58,7 +59,7 @@ def write_report(
         }
         for q in plan.questions
     ]
-    page.table(rows, "Open questions, and what the plan says about them.", "questions.csv", columns=_COLUMNS)
+    page.table(rows, "Open questions, and whether the plan decides them.", "questions.csv", columns=_COLUMNS)
     pictured = {rivalry.question.name: rivalry for rivalry in rivalries}
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)

@@ -37,11 +37,11 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made, as the table of the plan states it.
+    """How one scan is made; the fields are columns of the plan's table.
 
     ``turned_deg`` is the angle of the print under the microscope, ``direction`` -1 for the retrace, ``tip`` 2
-    for a second, sharp tip, and ``pixel_size`` the size relative to earlier scans, with the same time per
-    pixel.
+    for a second, sharp tip, and ``pixel_size`` the size of a pixel relative to earlier scans, with the
+    same time per pixel.
     """
 
     turned_deg: int = 0
@@ -110,8 +110,9 @@ class Printing:
 class Contrast:
     """A directed pair of rivals on some prints; each quantity has shape (prints,).
 
-    ``squares_um2`` is the squared distance over all pixels and scans, ``sd_um2`` the standard deviation, by
-    noise, of the difference of the two squared errors, and ``pixels`` the number of pixels of all scans.
+    ``squares_um2`` is the squared distance over all pixels and scans, ``sd_um2`` the standard deviation
+    that noise causes in the difference of the two squared errors, and ``pixels`` the number of pixels of all
+    scans.
     """
 
     squares_um2: Tensor
@@ -120,7 +121,7 @@ class Contrast:
 
     @property
     def rms_nm(self) -> float:
-        """Return the root of the mean squared distance over pixels."""
+        """Return the rms distance over pixels, nm."""
         return NM_PER_UM * float((self.squares_um2.sum() / self.pixels.sum()).sqrt())
 
     @property
@@ -129,7 +130,7 @@ class Contrast:
         return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
 
     def separation(self, spread: float) -> Tensor:
-        """Return the distance in standard deviations, differentiable; ``spread`` is that of a question."""
+        """Return the distance in standard deviations, differentiable; ``spread`` is that of the question."""
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
 
@@ -149,12 +150,12 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # These are the rivals as possible truths; refits start from ``twins``.
+        # Each of these models is assumed to be true in turn; refits start from ``twins``.
         self.true = self.chains = [_chain(twin) for twin in self.twins]
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Return the directed pairs: the true model, and the model refitted to it."""
+        """Return the directed pairs: the model assumed to be true, and the model refitted to it."""
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
@@ -242,7 +243,7 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
-        """Linearise a twin on each scan of the prints, with the residual against zero height."""
+        """Linearise a twin on each scan of the prints; the residual is taken from zero height."""
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)
         moved = [twin.at(twin.vector + one) for one in np.diag(steps)]
@@ -262,7 +263,7 @@ def _chain(twin: Twin) -> EffectChain:
 
 
 def _inner(field: Tensor) -> Tensor:
-    """Cut off the edge, where a model lacks part of the neighbourhood."""
+    """Cut off the edge, where part of the neighbourhood that a model uses is missing."""
     border = sample_border_px(min(field.shape))
     return field[border:-border, border:-border]
 

@@ -32,8 +32,8 @@ def close_loop(
         settings: those of ``loop.run.close_loop``.
 
     Raises:
-        InputError: as ``loop.run.close_loop``; also further stores of another printer, or a turned scan whose
-            card does not state it.
+        InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
+            is turned but its card does not say so.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
@@ -49,10 +49,10 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Read the scans of a further store, and check that printer and orientation match the card.
+    """Return the scans of a further store, after checking that printer and orientation are as stated.
 
     Raises:
-        InputError: another printer, or another orientation.
+        InputError: the store is of another printer, or a scan has another orientation than its card states.
     """
     for name in ("pitch_um", "level_height_um", "levels"):
         if getattr(store, name) != getattr(first, name):
@@ -72,7 +72,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
     scans = store.scans()
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
-        # The sense of a turn is a convention, but registration shows whether a print was turned.
+        # The sign of a turn is a convention, but registration shows whether a print was turned.
         if (stated - scan.quarter_turns) % 2:
             raise InputError(
                 f"scan {scan.id} of {store.path}",

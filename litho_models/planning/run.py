@@ -26,7 +26,7 @@ from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry
 
-# Number of prints for the final comparison of rivals; further prints have the same tiles.
+# Number of prints for the final comparison of rivals; further prints repeat the same tiles.
 _JUDGED = 2
 _FEWEST_PRINTS, _TILES = 2, 4
 _SMALLEST_PX = 64
@@ -48,14 +48,15 @@ def next_print(
 
     Args:
         loop: folder of a closed loop.
-        out: folder of the plan, which appears when complete.
+        out: folder of the plan; it appears when the plan is complete.
         prints: largest number of prints; ``field_um``: side of each.
         seed: seed of random layouts; ``steps``: ascent steps of each tile.
         layouts: ``random`` plans the same scans with random layouts, as a control.
         report: gets progress messages.
 
     Raises:
-        InputError: no closed loop, prints of an impossible size, or a folder with a plan of other settings.
+        InputError: there is no closed loop, the prints have an impossible size, or the folder contains a plan
+            with other settings.
     """
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():

@@ -1,5 +1,5 @@
-"""Predict whole fields of any size in tiles; the result is exact for models with a receptive radius,
-otherwise blended.
+"""Predict whole fields of any size in tiles. For models with a receptive radius the result is exact; for
+others it is blended from overlapping tiles.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,9 @@ TILE_PX = 1024
 def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
     """Predict the height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
 
-    A field larger than ``tile_px`` is computed in tiles, each with the receptive radius around it. The
-    heights are the same as those of the whole field at once. A model without a receptive radius predicts the
-    field in its own way.
+    A field larger than ``tile_px`` is computed in tiles, each with a margin of the receptive radius. The
+    heights equal those of the whole field computed at once. A model without a receptive radius predicts the
+    field by its own ``forward``.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -63,8 +63,9 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     """Predict the height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the
     layout.
 
-    The border is less than half the layout. The result equals that of ``predict_field`` without its border.
-    If the model allows it, only what the result needs is computed: see ``FrozenSimulator.inside``.
+    The border must be less than half the layout. The result equals that of ``predict_field`` without its
+    border. If the model allows it, only the pixels that the result needs are computed: see
+    ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
     if reach is None:
@@ -79,8 +80,8 @@ def blend_tiles(
 ) -> Tensor:
     """Average ``function`` over overlapping tiles with weights that sum to one at each pixel.
 
-    The first tile starts ``overlap_px`` before the field, whose outermost pixels are continued there, so that
-    every pixel of the field lies in its full set of tiles.
+    The first tile starts ``overlap_px`` before the field, whose outermost pixels are repeated there. Every
+    pixel of the field is therefore covered by the same number of overlapping tiles.
 
     Args:
         function: maps tiles (b, 1, T, T) to their heights.
@@ -95,7 +96,7 @@ def blend_tiles(
     size, overlap = tile
     stride = size - overlap
     window = blending_window(tile, layout_um)
-    # All positions are counted from the first tile that a whole field would have.
+    # All positions are counted from the start of the first tile that the whole field would have.
     (top, bottom), (left, right) = (
         (overlap + border_px, overlap + length - border_px) for length in layout_um.shape[-2:]
     )

@@ -1,8 +1,8 @@
 """The smooth background that all scans of one microscope share.
 
 Levelling by planes leaves, for example, a bow in every scan. The part of the bow that is the same in every
-scan is learned from the training scans and added to predictions of *measured* maps. This background does not
-belong to the printer and enters no design.
+scan is learned from the training scans and added to predictions of *measured* maps. This background is not
+part of the printer and is not used in a design.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Background(Record):
     """Mean coefficients of x, y, x², xy and y² over ``scans`` training scans, nm.
 
     x and y run from -1 to 1 over a field of ``field_um`` (y, x). Each term has zero mean, so a background
-    changes no datum.
+    does not change the datum.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

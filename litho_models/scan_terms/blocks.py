@@ -1,9 +1,9 @@
 """Divide the pixels of a scan into those to which terms are fitted and those that are scored.
 
-Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are fitted to one
-half of a checkerboard and subtracted from the other. The offset of a line comes from few pixels, whose
-roughness correlates with that of their neighbours (still by 0.2 at 32 px along x). Line offsets are therefore
-fitted on the other side of the scan, beyond a gap.
+Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
+to one half of a checkerboard and subtracted from the other half. The offset of a line is estimated from few
+pixels, whose roughness correlates with that of their neighbours (still by 0.2 at 32 px along x). Line offsets
+are therefore fitted on the other side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Blocks(NamedTuple):
         block_px: side of a block of the checkerboard.
         buffer_px: fitted pixels are farther than this from every scored pixel; about one correlation length
             of the measured prints' residuals (0.5 at 5 px).
-        line_gap_px: the same along the line, for line offsets.
+        line_gap_px: distance of fitted from scored pixels along the line, for line offsets.
         seed: moves the origin of the checkerboard.
     """
 

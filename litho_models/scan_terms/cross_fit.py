@@ -1,7 +1,7 @@
 """Remove a scan's terms, which are fitted to pixels that are not scored.
 
-A microscope's datum or bow says nothing about the printer, so errors may be stated without these terms.
-``cross_fit`` computes every error in this project from which such terms are removed.
+The datum or bow of a microscope contains no information about the printer, so errors may be stated without
+these terms. In this project ``cross_fit`` computes every error without such terms.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def fitted_terms(
 ) -> tuple[FloatMap, FloatMap]:
     """Fit smooth terms to all used pixels; return coefficients (k,) and the map of the terms, (ny, nx) µm.
 
-    Use the map for training, pictures and defects; reported errors take their terms from ``cross_fit``.
+    Use the map for training, pictures and defects. Reported errors use the terms that ``cross_fit``
+    estimates.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)

@@ -16,7 +16,8 @@ from litho_data.store import PrintedScan
 
 Labels = tuple[str, ...]
 ALL = "all"
-# Fewest scans of a group whose common part can be distinguished from the parts of single scans.
+# Smallest number of scans in a group for which their common part can be distinguished from the parts of
+# single scans.
 FEWEST_IN_GROUP = 2
 _STATED = ("tip", "direction", "turned_deg")
 _ORDER, _CHARACTER = "order", "character"
@@ -37,7 +38,7 @@ def label_of(scan: PrintedScan, by: str) -> str:
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
         last, first = map(int, value.split("-"))
-        # A scan between the two may lie before or after the change.
+        # A scan between these two positions may lie before or after the change.
         return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
     if value and kind == _CHARACTER:
         return scan.id[int(value) - 1 : int(value)]
@@ -50,7 +51,7 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     Groups come from the card (print, field, tip, direction and turn of a scan) and from each varying
     character of the ids. With ``by_order`` they also come from the order: before and after every possible
     time of a change. A grouping needs at least two labels, and at least half of the labels must have two or
-    more scans. Of two identical groupings only the first is used.
+    more scans. If two groupings are identical, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -83,8 +84,8 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Return positions in the order at which something may have changed: between prints, or anywhere with two
-    scans on each side.
+    """Return the positions in the printing order at which a change is possible: between prints, or anywhere
+    with two scans on each side.
     """
     orders = sorted({scan.order for scan in scans})
     if prints is not None:
@@ -105,7 +106,7 @@ class Block:
     """Columns whose strengths are fitted jointly.
 
     Attributes:
-        columns: their indices in the inner products, from 1; 0 is the residual.
+        columns: indices of the columns in the inner products, from 1; 0 is the residual.
         by: name of the grouping; each label has its own strengths.
         shrinking: weight, in scans, of the prior for zero strength; 0: no prior.
     """
@@ -120,7 +121,7 @@ class Products:
     """The inner products of the scans, and their groups.
 
     Attributes:
-        grams: (scans, 1 + m, 1 + m), residual first, per pixel.
+        grams: (scans, 1 + m, 1 + m), per pixel; index 0 is the residual.
         groups: label of each scan by grouping.
     """
 
@@ -171,8 +172,8 @@ class Products:
     def freed_of(self, blocks: Sequence[Block]) -> Products:
         """Project these blocks, fitted to all scans, out of the residual and the other columns.
 
-        The columns of the blocks become zero. Later fits of common strengths then equal a joint fit. Later
-        fits of strengths by group equal a joint fit only if the projected part is the same in all groups.
+        The columns of the blocks become zero. A later fit of common strengths then gives the same result as a
+        joint fit. For strengths by group this holds only if the projected part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -183,7 +184,7 @@ class Products:
         for members, rows in expanded.alike:
             change = np.zeros(self.grams.shape[1:])
             change[rest, rest] = 1.0
-            # Columns of several blocks count for each block.
+            # Columns that occur in several blocks count once for each block.
             np.subtract.at(change, np.ix_(expanded.columns, rest), solved[rows])
             freed[members] = change.T @ self.grams[members] @ change
         return Products(freed, self.groups)

@@ -22,7 +22,7 @@ def scan_line_index(
     Args:
         shape: (ny, nx) of the layout.
         scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan frame to the layout frame.
-        pitch_um: layout pitch; lines are counted in the same steps.
+        pitch_um: layout pitch, which is also the distance between counted lines.
         bend_um: bend of the scan, which ``scan_to_layout`` does not contain.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
@@ -48,9 +48,9 @@ def shrunk_line_offsets(
 ) -> tuple[FloatMap, FloatMap, float]:
     """Estimate line offsets as a variance component: the best linear prediction of s_i ~ N(0, v).
 
-    The scatter of block means within a line gives the noise of the line's mean, including correlation along
-    the line. The remaining variance of the line means is v. If all lines have the same count, this moment
-    estimate equals REML. A line without used pixels gets 0.
+    The scatter of block means within a line gives the noise of the line's mean and includes correlation along
+    the line. The variance of the line means minus this noise is v. If all lines have the same number of
+    blocks, this moment estimate equals REML. A line without used pixels gets 0.
 
     Args:
         residual_um: (ny, nx), µm; ``used``: pixels to use; ``line``: line of each pixel.

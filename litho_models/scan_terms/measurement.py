@@ -1,9 +1,9 @@
 """The measurement model: changes by microscope, registration and levelling that scans share.
 
-A scan shows the print after levelling, displaced by an uneven scanner, multiplied by a gain, and on a
+A scan shows the print after levelling: displaced by an uneven scanner, multiplied by a gain, and added to a
 background. The parts that all scans, or all scans of a group, share are learned from training scans and
-applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model does not
-belong to the printer and enters no design.
+applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model is not part
+of the printer and is not used in a design.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that may have been fitted to whole files and subtracted: which of x, y, x², xy, y², counted from 1.
+# Surfaces that may have been fitted to whole files and subtracted, as the numbers of their terms among x, y,
+# x², xy, y², counted from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -43,8 +44,8 @@ class SharedPart(Record):
     Attributes:
         what: ``background`` and displacements are sums of Legendre polynomials of x and y, -1 to 1 over the
             field, up to the total ``degree``; the gain is one relative number.
-        by: grouping; ``coefficients``: by label, in µm, or 1 for the gain. A part without coefficients adds
-            nothing.
+        by: grouping; ``coefficients``: by label, in µm, or relative for the gain. A part without coefficients
+            adds nothing.
         shrinking: weight, in scans, of the prior for zero in the fit.
     """
 
@@ -70,7 +71,7 @@ class SharedPart(Record):
 
 
 class MeasurementModel(Record):
-    """The changes that scans share in addition to their prints.
+    """The changes that scans share, beyond their prints.
 
     Attributes:
         levelling: surface that was fitted to whole files and subtracted; predictions are treated in the same

@@ -1,4 +1,4 @@
-"""Learn the measurement model: which parts scans share, and how large they are.
+"""Learn the measurement model: find the parts that scans share, and the strengths of these parts.
 
 Parts are chosen by cross-validation within the given scans.
 """
@@ -29,7 +29,8 @@ from litho_models.scan_terms.measurement import (
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# The parts to try, the most likely first. A background of degree 11 varies over 9 µm in a field of 54 µm.
+# The parts to try, starting with the most likely part. A background of degree 11 varies over 9 µm in a field
+# of 54 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -42,13 +43,13 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights, in scans, of the prior for no difference between groups: variance within groups over variance
-# between them.
+# Weights, in scans, of the prior that groups do not differ: the variance within groups divided by the
+# variance between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
 # A part is kept if the held-out squared error falls by this many standard errors and by this share.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
-# Displacements are linearised; the second round linearises at the displaced print.
+# Displacements are linearised. The second round linearises them at the displaced print.
 _ROUNDS = 2
 _INNER_FOLDS = 5
 
@@ -65,7 +66,7 @@ def learn_measurement(
     seed: int = 0,
     like: MeasurementModel | None = None,
 ) -> MeasurementModel:
-    """Choose and fit the parts that these scans share in addition to the predicted prints (ny, nx), µm.
+    """Choose and fit the parts that these scans share, beyond the predicted prints (ny, nx), µm.
 
     Parts are added one at a time while they significantly lower the cross-validated error. If fields differ
     in size, only those of the most frequent size are used. For micrographs of films the model stays empty.
@@ -151,8 +152,8 @@ def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
     """Return the residual and columns (1 + m, n) at thinned pixels, without their means.
 
-    The contribution of the current parts is added back to first order. The strengths are then fitted as a
-    whole and shrunk only once, whatever the number of rounds.
+    The contribution of the current parts is added back to first order. Each round then fits the full
+    strengths, so that they are shrunk only once, whatever the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])

@@ -40,7 +40,7 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """Return the default policy; films have no free zero height."""
+    """Return the default policy, which for films has no free zero height."""
     return "none" if film else "offset"
 
 
@@ -82,22 +82,22 @@ class NuisanceProtocol(Record):
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# The mean over scans of these terms belongs to the process, not to single scans.
+# The mean of these terms over the scans is part of the process and not of single scans.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
 def training_terms(policy: Policy) -> Terms:
     """Return the terms of a policy that are fitted together with a model: all except the gain.
 
-    Part of a scan's gain is a long-range effect of the layout, which a model cannot learn if every scan has a
-    free gain.
+    Part of a scan's gain is a long-range effect of the layout. A model cannot learn this effect if every scan
+    has a free gain.
     """
     return policy_terms(policy) - {"gain"}
 
 
 def smooth_training_terms(policy: Policy) -> Terms:
-    """Return the same terms without line offsets, which average out over a scan and hardly change a small
-    model.
+    """Return the terms of ``training_terms`` without line offsets, which average out over a scan and hardly
+    change a small model.
     """
     terms = training_terms(policy)
     return terms - {term.name for term in line_terms(terms)}
@@ -109,7 +109,7 @@ def estimate_scan_terms(
     """Estimate the terms that each scan adds to the model's height, float32 (ny, nx) µm, from all its valid
     pixels.
 
-    Use the terms only for training; reported errors take their terms from ``cross_fit``.
+    Use these terms only for training. Reported errors use the terms that ``cross_fit`` estimates.
     """
     fitted = [
         fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]

@@ -72,7 +72,7 @@ class ScanTerm:
         name: its name in sets of terms.
         effect: the effect that it represents; several terms may share one. None for a control.
         unit: unit of its coefficients: ``µm`` of height, ``1``, or ``px`` of displacement.
-        labels: description of each map; line offsets have one.
+        labels: description of each map; line offsets have one description.
         maps: function of the pixels, returns (k, n); maps other than the datum have zero mean over the scan.
         lines: for line offsets: (shape, scan line index) to the line index of each pixel.
         frame: for line offsets: the frame of the lines.

@@ -45,8 +45,8 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
     """Compare two films.
 
     Args:
-        measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape, all numbers.
-        edge_um: height of their edge.
+        measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape, without NaN.
+        edge_um: height at which the films have their edges.
     """
     known = np.isfinite(measured_um)
     measured, expected = (known & (one > edge_um) for one in (measured_um, expected_um))
@@ -62,7 +62,7 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """Count for each large enough part of either film the parts of the other film that it touches."""
+    """For each large enough part of either film, count the parts of the other film that it touches."""
     from scipy.ndimage import label
 
     labels = [label(one)[0] for one in (first, second)]
@@ -74,7 +74,7 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
         [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
         for kept in (slice(None), real)
     )
-    # A part that touches only small parts has a partner but merges nothing.
+    # A part that touches only parts below the size limit has a partner but does not count as merging parts.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

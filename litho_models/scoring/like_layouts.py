@@ -1,8 +1,8 @@
 """The gamma test: compare residuals at pixels with similar surroundings.
 
-A model of the layout can still learn residuals that are the same in similar surroundings; differences between
-them are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels
-of other scans, so datum, gain and bow of single scans count as noise.
+Residuals that are the same in similar surroundings can still be learned by a model of the layout; differences
+between such residuals are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
+compared with pixels of other scans, so datum, gain and bow of single scans count as noise.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,8 @@ from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
-# More partners would be less similar; with fewer partners, products of two would be noisier.
+# With more partners, some would be less similar. With fewer, the products of two differences would be
+# noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
@@ -25,7 +26,7 @@ class LikePixels(NamedTuple):
 
     Attributes:
         owner: number of the scan of each pixel, (n,); ``pixel``: its flat index in that scan, (n,).
-        partners: positions in these arrays, (n, m); no two in a row are from one scan.
+        partners: positions in these arrays, (n, m); each row contains at most one pixel of a scan.
     """
 
     owner: Array
@@ -111,7 +112,7 @@ def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
 
 
 def _whitened(feature: Array) -> Array:
-    """Return the scale features to unit covariance, so distances do not depend on their scale."""
+    """Return the features scaled to unit covariance, so that distances do not depend on their units."""
     centred = feature - feature.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov(centred.T))
     kept = values > 1e-9 * values.max()

@@ -74,7 +74,7 @@ _MEASUREMENTS = [
 def register_metric(
     name: str, unit: str, function: MetricFunction, explanation: str, *, over_scans: Summary = "mean"
 ) -> Metric:
-    """Add a metric to every evaluation and benchmark made from now on in this process.
+    """Register a metric, which every later evaluation and benchmark of this process then computes.
 
     ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan``, the predicted map, and
     measured minus predicted heights without the per-scan terms, (ny, nx) in µm, NaN where not scored. The
@@ -91,10 +91,12 @@ def register_metric(
         name: letters, digits and underscores; ``unit``: ``1`` if it has none.
         function: as above.
         explanation: a sentence for the report.
-        over_scans: value for a model: the mean of the known values of its scans, or their sum.
+        over_scans: how the value of a model is computed from its scans: mean of the known values, or their
+            sum.
 
     Raises:
-        InputError: a name or unit that is no identifier, a name that is taken, or another summary.
+        InputError: a name or unit that is no identifier, a name that is taken, or an unknown value of
+            ``over_scans``.
     """
     metric = Metric(name, unit, over_scans)
     if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):

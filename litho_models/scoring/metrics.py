@@ -13,15 +13,15 @@ from litho_models.scan_terms import Blocks, CrossFit, NuisanceProtocol, cross_fi
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
-# Step of the refractive index from air to resist, at the red helium-neon line, for which the elements are
-# made.
+# Difference of the refractive index between resist and air at the red helium-neon line, for which the
+# elements are designed.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
     """The line measured height = slope · prediction + intercept, and the standard error of the slope.
 
-    Values are None if they cannot be known: a constant prediction has no slope, and a single block has no
+    A value is None if it cannot be computed: a constant prediction has no slope, and a single block gives no
     error.
     """
 
@@ -35,12 +35,12 @@ def print_gain(
 ) -> PrintGain:
     """Fit a least-squares line to the used pixels of a scan.
 
-    Neighbouring pixels share their residual, so the variance is that of whole blocks (Liang and Zeger 1986).
-    The sums of residual times regressor over a block are taken as independent between blocks, which holds if
-    blocks are wide compared with the correlation length (7 px on the measured prints).
+    Residuals of neighbouring pixels are correlated, so the variance is computed from whole blocks (Liang and
+    Zeger 1986). The sums of residual times regressor over a block are taken as independent between blocks,
+    which holds if blocks are wide compared with the correlation length (7 px on the measured prints).
 
     Args:
-        height_um, prediction_um: (ny, nx), float; ``used``: (ny, nx) bool, one pixel at least.
+        height_um, prediction_um: (ny, nx), float; ``used``: (ny, nx) bool with at least one pixel.
         block_px: side of a block.
     """
     x, y = (np.asarray(a, np.float64)[used] for a in (prediction_um, height_um))

@@ -84,7 +84,7 @@ def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
     """Read the floor from a noise analysis; without an analysis the floor is unknown.
 
     Args:
-        dataset_name: name of the dataset whose errors are reported.
+        dataset_name: name of the dataset for which errors are reported.
         analysis: ``noise.json``, or its folder, of this dataset or of scans without one.
 
     Raises:
@@ -109,7 +109,7 @@ def estimated_floor(
 
     Args:
         model: its name, for ``source``.
-        scans: held-out scans; ``maps_um``: what the model expects of each, (ny, nx) µm.
+        scans: held-out scans; ``maps_um``: the map that the model expects for each, (ny, nx) µm.
         blocks: which pixels fit terms and which are scored, as for the errors compared with the floor.
         seed: decides which pixels are drawn.
     """
@@ -142,11 +142,12 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """Estimate an upper limit of the floor from the residuals of held-out scans.
 
-    On drawn pixels ``LikePixels`` finds the part of the squared error that similar surroundings do not share.
-    The floor is the error over all scored pixels times the root of this part. For the mean absolute error
-    this assumes that noise and residual have the same shape, E|n|/σ. Noise makes up nearly all of the
-    residual, so no Gaussian is assumed. If a misfit of another shape had half of the squares (Laplace in
-    Gaussian noise or the reverse), the floor would be wrong by up to 6 %.
+    On drawn pixels ``LikePixels`` finds the part of the squared error that pixels with similar surroundings
+    do not share. The floor is the error over all scored pixels times the square root of this part. For the
+    mean absolute error this assumes that noise and residual have the same shape, that is, the same E|n|/σ.
+    The noise need not be Gaussian, because it makes up nearly all of the residual. If a misfit of another
+    shape made up half of the squared error (Laplace in Gaussian noise or the reverse), the floor would be
+    wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.

@@ -19,11 +19,11 @@ _SURFACE = frozenset({"offset", "bow"})
 class ScanFigures(Record):
     """Figures of one scan against a model, without the scan's offset, tilt and bow.
 
-    ``gain`` is measured over predicted height, with its standard error (of blocks, see ``print_gain``; None
-    for a single block). ``error_nm`` is the mean absolute error with the gain free too (policy ``full``, k =
-    7), and terms fitted on other pixels. ``order`` is the position in printing. ``relief_nm`` and
-    ``steepness`` are the standard deviation and rms slope of the predicted height, which characterise the
-    layout. ``held_out`` says that the model was not trained on the scan.
+    ``gain`` is measured over predicted height, with its standard error, which is computed over blocks (see
+    ``print_gain``; None for a single block). ``error_nm`` is the mean absolute error with a free gain too
+    (policy ``full``, k = 7) and with terms fitted on other pixels. ``order`` is the position in printing.
+    ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height, which
+    characterise the layout. ``held_out`` says that the model was not trained on the scan.
     """
 
     scan: str
@@ -83,7 +83,7 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Return the figures of a model's training scans, for its card; none if fields are too small."""
+    """Return the figures of a model's training scans for its card; an empty list if fields are too small."""
     pairs = zip(scans, predictions_um, strict=True)
     try:
         rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]

@@ -27,20 +27,22 @@ LEADING["sem"] = "edge_mean_nm"
 
 
 class Prediction(NamedTuple):
-    """What a model expects of a scan, (ny, nx) µm: the print, and the part that scans share, if known."""
+    """The maps that a model expects for a scan, (ny, nx) µm: the print, and the part that scans share, if
+    known.
+    """
 
     height_um: Array
     background_um: Array | None = None
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """Add a learned background to a print on its field, if there is one."""
+        """Make the prediction of a print with a learned background, if there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
-        """Apply a learned measurement model to a print on the scan's field."""
+        """Make the prediction of a print as seen through a learned measurement model."""
         return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
@@ -83,8 +85,8 @@ class ScanErrors(Record, extra="ignore"):
     """The error of one model on one scan over the scored pixels.
 
     ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free``, terms
-    fitted on other pixels are removed. Slope and intercept are the gain and offset of the print against the
-    prediction (``print_gain``).
+    fitted on other pixels are removed. Slope and intercept are gain and offset of the measured against the
+    predicted height (``print_gain``).
     """
 
     pixels: int
@@ -136,8 +138,8 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_nm(self) -> float:
-        """Return the error that ranks models: of edges for films, of heights otherwise; infinite without an
-        edge.
+        """Return the error by which models are ranked: the error of edges for films, otherwise of heights;
+        infinite if a film has no edge.
         """
         value = getattr(self, LEADING[self.seen_by])
         return math.inf if value is None else float(value)
@@ -149,7 +151,7 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """Return the leading error of every scan by id; NaN without an edge."""
+        """Return the leading error of every scan by id; NaN if a film has no edge."""
         values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
         return {scan: math.nan if value is None else value for scan, value in values.items()}
 

@@ -19,7 +19,7 @@ SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
 _CANDIDATES, _MOST_HEIGHTS = 8, 24
-# Half the longest piece of a contour, the diagonal of a pixel.
+# Half the length of the longest piece of a contour, which is the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
     f"SSIM has a Gaussian window of {SSIM_SIGMA_PX:g} px, {SSIM_WINDOW_PX} px wide, and a data range of "
@@ -51,11 +51,11 @@ class EdgePlacement(NamedTuple):
 
 class _Contour(NamedTuple):
     start: Array  # (n, 2) row, column, px
-    along: Array  # (n, 2), the higher side always on the same hand
+    along: Array  # (n, 2), with the higher side always on the same side
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
-    """Return the SSIM of a scan and its prediction after the per-scan terms are removed (prediction plus
+    """Return the SSIM of the prediction and of the scan without its per-scan terms (prediction plus
     residual).
     """
     return structural_similarity(prediction_um + residual_um, prediction_um)
@@ -135,8 +135,8 @@ def edge_placement(
 
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
-    """Return the heights half way between neighbouring nominal levels, µm; of many levels, 24 evenly
-    spaced ones.
+    """Return the heights half way between neighbouring nominal levels, µm; if there are many levels, only 24
+    evenly spaced ones.
     """
     steps = min(levels - 1, _MOST_HEIGHTS)
     return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)
@@ -153,8 +153,8 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
 
 
 def _distance_px(of: _Contour, to: _Contour, search_px: float) -> Array:
-    """Return the distance of the middle of each piece from the nearest piece that rises to the same side;
-    otherwise inf.
+    """Return the distance of the middle of each piece from the nearest piece that rises to the same side; inf
+    if there is none.
     """
     from scipy.spatial import KDTree
 

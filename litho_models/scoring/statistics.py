@@ -1,5 +1,6 @@
-"""Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are drawn
-and change sign. If scans of one print share its day and batch, whole prints are drawn instead.
+"""Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are
+resampled, and whole scans change sign. If the scans of a print share its day and batch, whole prints are used
+instead.
 """
 
 from collections.abc import Hashable, Sequence
@@ -13,17 +14,17 @@ from litho_data.foundation.results import Record
 
 # None with fewer than ``FEWEST_FOR_INTERVAL`` units.
 Interval = tuple[float, float] | None
-# Fewest units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
+# Smallest number of units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
 PERMUTATIONS = 1999
 # The ends of a 95 % interval are written in this way because 0.025 differs in its last bits.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
-# Up to this many scans every combination of signs is used. A screening tests all directions at once and stops
-# one scan earlier than a comparison of two models, which halves its table.
+# Up to this many scans every combination of signs is used. Screening tests all directions at once, so its
+# limit is one scan lower than in a comparison of two models, which halves its table.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
-# The flips include the observed signs, whose sum must not fall below itself by rounding.
+# The flips include the observed signs. Rounding must not place their sum below the observed sum.
 _ROUNDING = 1 - 1e-12
 
 
@@ -45,7 +46,7 @@ def bootstrap_interval(
     A single scan or group cannot be resampled, so both ends are NaN.
 
     Args:
-        values: one per scan; ``groups``: the print of each scan, if prints are what is resampled.
+        values: one per scan; ``groups``: the print of each scan, if prints are resampled instead of scans.
     """
     sums, counts = _by_group(values, groups)
     if sums.size < 2:
@@ -54,9 +55,10 @@ def bootstrap_interval(
 
 
 def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
-    """Return the interval of a mean over pixels, by resampling prints, each of which counts with its pixels.
+    """Return the interval of a mean over pixels, by resampling prints; each print is weighted by its number
+    of pixels.
 
-    Return None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
+    Return None if the pixels come from fewer than ``FEWEST_FOR_INTERVAL`` prints.
 
     Args:
         values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
@@ -87,13 +89,13 @@ def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Arr
 
 
 def interval(values: Sequence[float]) -> Interval:
-    """Return what ``bootstrap_interval`` does, but None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
+    """Return the result of ``bootstrap_interval``, or None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
-    """Return signs (draws, count), the observed ones first: all combinations up to ``exact_scans``, 10,000
-    beyond.
+    """Return signs (draws, count), the observed signs first: all combinations for up to ``exact_scans``
+    scans, otherwise 10,000 draws.
     """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
@@ -107,10 +109,10 @@ def one_sided_flip_p(values: Array) -> float:
 
 
 def smallest_flip_p(count: int) -> float:
-    """Return the smallest two-sided sign-flip p of this many scans or prints: two of all combinations of
-    signs.
+    """Return the smallest two-sided sign-flip p that this many scans or prints allow: 2 divided by the number
+    of combinations of signs.
 
-    With six prints it is 2 / 2^6 = 0.031, however large the difference.
+    With six prints p is at least 2 / 2^6 = 0.031, however large the difference.
     """
     return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
 
@@ -162,9 +164,10 @@ class ByPrint(Record):
     """A one-way analysis of variance of one estimate per scan, with prints as groups.
 
     Args:
-        f: mean square between prints over that within, on ``degrees`` of freedom (between, within).
-        icc: share of the variance that scans of one print have in common; below 0 it is 0.
-        p: share of permutations of the scans, the observed one included, with an ``f`` as large.
+        f: mean square between prints divided by the mean square within prints, with ``degrees`` of freedom
+            (between, within).
+        icc: share of the variance that scans of one print have in common; a negative estimate is set to 0.
+        p: share of permutations of the scans, including the observed order, whose ``f`` is at least as large.
     """
 
     f: float
@@ -177,11 +180,12 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     """Test whether scans of one print are more similar than scans of different prints.
 
     Args:
-        values: (scans,) or (scans, k) estimates; columns count alike, each in units of its spread.
+        values: (scans,) or (scans, k) estimates; each column is divided by its spread, so that all columns
+            have equal weight.
         prints: print of each scan.
 
     Returns:
-        None for a single print, without a print of two scans, or for constant estimates.
+        None for a single print, if no print has two scans, or for constant estimates.
     """
     names, members = np.unique(np.asarray(prints, str), return_inverse=True)
     columns = np.reshape(values, (len(members), -1)).astype(np.float64)
@@ -201,6 +205,6 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     f = float(ratios[0])
     size = (len(members) - float((counts**2).sum()) / len(members)) / between
     icc = max((f - 1) / (f + size - 1), 0.0)
-    # Rounding must not place the observed order below itself.
+    # Rounding must not place the statistic of the observed order below the observed statistic.
     p = float((ratios >= f * (1 - 1e-12)).mean())
     return ByPrint(f=f, degrees=(between, within), icc=icc, p=p)

@@ -16,7 +16,7 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """The error at the pixels printed with one level, nm; a scan counts if the level occurs in it."""
+    """The error at the pixels printed with one level, nm. A scan is counted if the level occurs in it."""
 
     level: int
     pixels: int
@@ -26,7 +26,7 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """Prediction against measurement per frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
+    """Prediction compared with measurement at each frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
 
     ``error_psd`` is the one-sided power density of the error along lines, nm² per cycle/µm, with line means
     removed.

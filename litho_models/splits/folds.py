@@ -60,7 +60,9 @@ class Crop:
 
 @dataclass(frozen=True)
 class Fold:
-    """The scans to learn from and the scans to predict; ``locked`` marks the opening of the lock box."""
+    """The scans to learn from and the scans to predict. ``locked`` is True if the predicted scans are those
+    of the lock box.
+    """
 
     number: int
     training: list[PrintedScan]
@@ -118,10 +120,10 @@ def plan_folds(
 
 
 def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
-    """Deal the scans into ``k`` folds; each fold lists the ids held out of its training.
+    """Divide the scans into ``k`` folds. Each fold lists the ids that its training leaves out.
 
     Raises:
-        InputError: ids that repeat, fewer than two, or ``k`` outside 2 ... number of scans.
+        InputError: repeated ids, fewer than two ids, or ``k`` outside 2 ... number of scans.
     """
     require_unique(ids)
     if len(ids) < 2:

@@ -1,8 +1,8 @@
-"""Axes in all rooms, on the grids of ``tests/grids.py``: what is exchanged before is exchanged after.
+"""Check in all rooms, on the grids of ``tests/grids.py``, that exchanged axes give exchanged results.
 
-What knows y from x only by their order makes of a transposed field its transposed result. A pitch, a size or
-a place of the other axis breaks that on grids that are nowhere square. Where things lie is in the room's own
-tests, and here for what resamples.
+A function that treats both axes alike gives for a transposed field the transposed result. If it uses a pitch,
+a size or a position of the wrong axis, this fails on grids without square fields or pixels. Positions are
+checked by each room's own tests, and here for functions that resample.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ WAVELENGTH_UM = 0.5
 
 
 def exchanged(grid: PixelGrid) -> PixelGrid:
-    """With y for x."""
+    """Return the grid with y and x exchanged."""
     (ny, nx), (py, px), (y, x) = grid.shape, grid.pitch_um, grid.origin_um
     return PixelGrid((nx, ny), (px, py), (x, y))
 
 
 def relief(grid: PixelGrid) -> Array:
-    """Heights (ny, nx), µm, unlike along the two axes, with a steep part out of the middle."""
+    """Return heights (ny, nx), µm, that differ between the axes, with a steep part outside the middle."""
     y, x = (grid.y_um - grid.y_um.mean())[:, None], (grid.x_um - grid.x_um.mean())[None, :]
     wave = 0.3 + 0.1 * np.sin(2.1 * y + 0.4) * np.cos(1.3 * x - 0.2) + 0.03 * y - 0.05 * x
-    # Its flank is smooth on any of the grids: at half a wave in a pixel an axis has one sign only.
+    # The flank is smooth on all grids, as half a wave to a pixel has no defined sign along an axis.
     return np.asarray(wave + 0.12 * np.tanh((0.7 - np.hypot(y - 0.6, 1.5 * (x + 0.4))) / 0.25))
 
 
@@ -62,7 +62,7 @@ def by_torch(run: Callable[[torch.Tensor], torch.Tensor]) -> Made:
 
 
 def light(propagator: Any, distance_um: float) -> Made:
-    """The light of a relief on its grid at another one, which is finer and lies elsewhere."""
+    """Return a function that propagates light of a relief to a finer, displaced grid and back."""
 
     def made(height: Array, grid: PixelGrid) -> Array:
         (ny, nx), (py, px), (y, x) = grid.shape, grid.pitch_um, grid.origin_um
@@ -76,7 +76,7 @@ def light(propagator: Any, distance_um: float) -> Made:
 
 
 def printed(height: Array, grid: PixelGrid) -> Array:
-    """In tiles, the last of which are narrower."""
+    """Predict a print in tiles, of which the last ones are narrower."""
     facts = {"pitch_um": 0.1, "level_height_um": 0.1, "levels": 13}
     model = build_model("affine-mtf", sigmas_um=(0.25,), **facts)
     layout = torch.from_numpy(height).float()[None, None]
@@ -84,7 +84,7 @@ def printed(height: Array, grid: PixelGrid) -> Array:
 
 
 def imaged(height: Array, grid: PixelGrid) -> Array:
-    """By a spot that is as long along either axis as its grid is fine."""
+    """Blur with a spot whose samples have the pitch of each axis."""
     rows, columns = (np.arange(-k, k + 1) * pitch for k, pitch in zip((4, 4), grid.pitch_um, strict=True))
     spot = np.exp(-(rows[:, None] ** 2 + columns[None, :] ** 2) / 0.1)
     blur = Blur(torch.from_numpy(spot), grid.shape)
@@ -123,7 +123,7 @@ def test_a_map_of_the_exchanged_field_is_the_exchanged_map(made: str, name: str)
     height = relief(grid)
     here = MAPS[made](height, grid)
     there = MAPS[made](np.ascontiguousarray(height.T), exchanged(grid))
-    # Sums in another order, in float32 at worst.
+    # The sums have another order, at worst in float32.
     np.testing.assert_allclose(there, here.T, rtol=1e-4, atol=1e-5 * np.nanmax(np.abs(here)))
 
 
@@ -176,7 +176,7 @@ def test_edges_of_exchanged_prints_are_as_far_apart(name: str) -> None:
     assert (other.mean_nm, other.p95_nm) == (pytest.approx(one.mean_nm), pytest.approx(one.p95_nm))
 
 
-# Formulas of the microscope, whose lines lie along x whatever the printer does.
+# Effects of the microscope, whose lines lie along x for any direction of the printer.
 SCANNED = {"feedback-lag", "piezo-nonlinearity", "tip-dilation"}
 EFFECTS = [name for name, one in CATALOGUE.items() if not one.per_scan and name not in SCANNED]
 
@@ -191,17 +191,17 @@ def of_other_axis(parameter: str) -> str:
 @pytest.mark.parametrize("name", UNEQUAL)
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_of_the_exchanged_print_is_the_exchanged_effect(effect: str, name: str) -> None:
-    """Also in a part of a scan, out of the middle of the write field, its lines along the other axis."""
+    """This also holds for a part of a scan off the middle of the write field, with its lines along y."""
     grid, one = UNEQUAL[name], get_effect(effect)
     numbers = {
         parameter: facts.typical * (1 + 0.2 * number)
         for number, (parameter, facts) in enumerate(one.parameters.items())
-        # In a whole transform half a wave to a pixel has no direction, which a shear needs.
+        # At half a wave to a pixel a Fourier transform has no direction, which a shear needs.
         if facts.kind == "amplitude" and parameter != "shear_um2"
     }
     field = torch.from_numpy(relief(grid))[None, None]
     if one.of_films:
-        # A film is there or not.
+        # A film is either present or absent.
         field = 1.2 * (field > field.mean()).to(field)
     (ny, nx), place, corner = grid.shape, (11.0, -23.0), (5, 9)
     here = FieldContext(field, 0.1, 1.2, 0.1, place, 60.0, "y", 0.3, (ny + 30, nx + 17), corner)
@@ -210,7 +210,7 @@ def test_an_effect_of_the_exchanged_print_is_the_exchanged_effect(effect: str, n
     )
     turned = {of_other_axis(parameter): value for parameter, value in numbers.items()}
     if "stretch_um2" in turned:
-        # What is added along x is taken along y.
+        # The effect adds along x what it subtracts along y.
         turned["stretch_um2"] *= -1
     changed = one(field, numbers, here)
     assert not torch.allclose(changed, field, rtol=0, atol=1e-6)
@@ -224,7 +224,7 @@ def test_a_resampled_height_is_that_at_the_pixel_s_place(name: str) -> None:
     def height(y: Array, x: Array) -> Array:
         return np.asarray(0.2 * np.sin(1.1 * y)[:, None] + 0.3 * np.cos(0.8 * x)[None, :])
 
-    # In its own frame a scan begins at its corner.
+    # In the frame of a scan the origin is its corner.
     own = PixelGrid(grid.shape, grid.pitch_um)
     matrix = np.array([[1, 0, shift_um[1]], [0, 1, shift_um[0]], [0, 0, 1.0]])
     found, valid = resample_to_layout(
@@ -232,8 +232,8 @@ def test_a_resampled_height_is_that_at_the_pixel_s_place(name: str) -> None:
     )
     layout = PixelGrid.square(shape, pitch_um)
     wanted = height(layout.y_um - shift_um[0], layout.x_um - shift_um[1])
-    # A scan that is finer than the layout is averaged over its pixel, and mirrored beyond its edge.
+    # A scan finer than the layout is averaged over the layout's pixel, and mirrored beyond its edge.
     inside = binary_erosion(valid, iterations=6)
     assert inside.sum() > 100
-    # Cubic splines at 60 pixels to a wave; the average takes (k σ)² / 2 of the wave.
+    # Cubic splines at 60 pixels per wave. Averaging lowers the wave by (k σ)² / 2.
     np.testing.assert_allclose(found[inside], wanted[inside], atol=5e-4)

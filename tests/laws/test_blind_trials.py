@@ -1,4 +1,4 @@
-"""The blind trials: draws, sizes, judging, how a campaign survives, and a trial end to end."""
+"""The blind trials: draws, sizes, judgements, interrupted campaigns, and whole trials."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_singles_follow_from_their_seed_and_have_what_was_promised():
     assert Counter(draw.kind for draw in draws) == SINGLES
     assert all(len(draw.causes) == (draw.kind != "empty") for draw in draws)
     rms_nm = np.array([cause.wanted_rms_nm for draw in draws for cause in draw.causes])
-    # All that is drawn is to count: above 8 nm with room for what the search on four scans is off by.
+    # All drawn causes must count: above 8 nm, with room for the error of the search on four scans.
     assert SINGLES_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= SINGLES_RMS_NM[1]
     assert 0.87 * SINGLES_RMS_NM[0] > 8
     assert len({tuple(draw.printer.items()) for draw in draws}) == 48
@@ -95,7 +95,7 @@ def test_singles_follow_from_their_seed_and_have_what_was_promised():
 
 @pytest.mark.parametrize("seed", range(20267, 20271))
 def test_the_published_boards_are_drawn_as_they_were(seed):
-    """The board of single causes is the earlier one, made again."""
+    """The board of single causes repeats the earlier one."""
     was = EARLIER[EARLIER.board == seed]
     drawn = draw_board("singles", seed)
     assert [draw.seed for draw in drawn] == was.seed.tolist()
@@ -107,7 +107,7 @@ def test_mixtures_have_what_was_promised(seed):
     draws = draw_board("mixtures", seed)
     assert draws == draw_board("mixtures", seed) != draw_board("mixtures", seed + 1)
     assert Counter(draw.kind for draw in draws) == MIXTURES
-    # A fifth is empty.
+    # A fifth of the trials has no cause.
     assert len(draws) >= 40
     assert 0.18 < MIXTURES["empty"] / len(draws) < 0.22
     causes = [cause for draw in draws for cause in draw.causes]
@@ -138,7 +138,7 @@ def test_the_page_lists_all_forms():
 
 
 def test_the_drawing_reads_no_catalogue():
-    """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
+    """In a fresh interpreter, drawing and sizing a board loads neither the effects nor the loop."""
     rooms = ("litho_models.effects", "litho_models.loop")
     code = (
         "import sys, litho_models.boards.draws, litho_models.boards.planting\n"
@@ -208,16 +208,16 @@ def test_a_form_does_nothing_at_strength_zero_and_the_same_twice(name):
     for strength, differs in ((0.0, False), (0.3 * FORMS[name].limit, True)):
         once, again = (noise_free_um(draw, [set_to(cause(name), strength)], jobs) for _ in range(2))
         np.testing.assert_array_equal(once, again)
-        # The last field in the order of printing has every step behind it.
+        # The last field that is printed comes after every step.
         assert np.array_equal(once[-1], plain[-1]) != differs
 
 
 def test_a_full_hill_response_replaces_the_logistic():
-    """Without shrinkage and base layer the print is a Hill curve of the dose."""
+    """Without shrinkage and base layer the print follows a Hill curve of the dose."""
     draw = drawn(printer={"loose_retention": 1.0, "base_um": 0.0})
     (job,) = trial_jobs(draw, 1, 64)
     fab = fab_of(draw, [], job, noise=Noise.off(), microscope=Microscope.aligned())
-    # At steepness 1e-4 the logistic is straight to 1e-5: the print shows the dose.
+    # At steepness 1e-4 the logistic is straight to 1e-5, so the print is proportional to the dose.
     straight = replace(fab, printer=replace(fab.printer, threshold_steepness=1e-4))
     dose = scan_job(straight, job).clean_um / fab.printer.full_height_um
     hill = scan_job(replace(fab, cause=FormCause({"hill-response": 1.0}, 9)), job)
@@ -241,12 +241,12 @@ def test_a_full_hill_response_replaces_the_logistic():
     ],
 )
 def test_a_planted_form_has_the_size_that_it_claims(name):
-    """It counts, and it is no more than what the plain fab and the scans' own terms leave."""
-    # A network of short reach, for speed.
+    """The size is that of the residual after the plain fab and scan terms, and is large enough to count."""
+    # A short reach of the polymer network saves time.
     draw = drawn(cause(name, 9.0), printer={"network_reach_um": 0.3})
     jobs = trial_jobs(draw, 2, 96)
     (planted,) = plant(draw, jobs)
-    # Sought to 3 % on these same two fields.
+    # The strength was searched to 3 % on these two fields.
     assert planted.at_limit or planted.rms_nm == pytest.approx(9.0, rel=0.031)
     pairs = zip(noise_free_um(draw, [planted], jobs), noise_free_um(draw, [], jobs), strict=True)
     squares = []
@@ -254,18 +254,18 @@ def test_a_planted_form_has_the_size_that_it_claims(name):
         basis = term_maps(TermPixels(plain), POLICIES["full"] | {"warp"})
         change = (height - plain).ravel()
         squares.append(np.mean((change - least_squares(basis, change) @ basis) ** 2))
-    # A refit of the base can only take more; pixels are thinned in one and not in the other (5 %).
+    # A refit of the base can only explain more. Only one of the two sizes uses all pixels (5 %).
     assert 8.0 < planted.rms_nm < 1.05e3 * np.sqrt(np.mean(squares))
 
 
 @pytest.mark.long
 def test_what_the_base_can_imitate_does_not_count():
-    """The plain fab at other parameters is the Physics model: nothing is left, wherever a fit starts."""
+    """A plain fab with other parameters is still the Physics model: a fit leaves nothing from any start."""
     other = {"threshold_steepness": 2.2, "loose_retention": 0.45, "network_reach_um": 1.6}
     draw = drawn(printer=other)
     jobs = trial_jobs(draw, 4, 96)
     heights = [1.02 * height + 0.03 for height in noise_free_um(draw, [], jobs)]
-    # Kernels cut at 4 σ leave 0.001 nm of a change of more than 25 nm.
+    # The change is more than 25 nm. Kernels that are cut at 4 σ leave 0.001 nm of it.
     assert refitted_rms_nm(heights, jobs, Printer()) < 0.01
     assert refitted_rms_nm(heights, jobs, printer_of(draw)) < 0.01
 
@@ -275,7 +275,7 @@ def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
     draw = drawn(cause("dose-exponent"), kind="alias")
     (planted,) = plant(draw, trial_jobs(draw, 4, 96))
     assert not planted.at_limit
-    # A refit of the plain model leaves 6 % of it.
+    # A refit of the plain model leaves 6 % of the cause.
     assert planted.rms_nm < 0.2 * 12.0
 
 
@@ -300,7 +300,7 @@ def test_what_is_injected_into_a_store_is_what_the_fab_makes_of_its_layouts(tmp_
     changed = open_store(tmp_path / "injected.zarr")
     for job in jobs:
         step_nm = 1e3 * (changed.scan(job.id).height_um - store.scan(job.id).height_um)
-        # Either nothing or the whole step; float32 of a height of some µm.
+        # The change is zero or the whole step, in float32 at heights of some µm.
         sides = np.unique(np.round(step_nm[np.isfinite(step_nm)], 2))
         np.testing.assert_allclose(sides, [0.0, 50.0], atol=0.02)
     assert [job.level.shape for job in middle(jobs, 32)] == [(32, 32)] * 2
@@ -332,7 +332,7 @@ def said(
     seen: Sequence[str] = (),
     **more: str,
 ) -> Answer:
-    """What the loop would say; ``seen`` in single scans, ``more``: verdicts of candidates (_ for -)."""
+    """Return a loop's result with ``seen`` in single scans and verdicts ``more`` of candidates (_ for -)."""
     result = CloseLoop.model_construct(
         base_model="",
         errors=[],
@@ -366,7 +366,7 @@ LAW, TABLE = found("height-power-2", knowledge="law"), found("level-table", know
         (["vignetting"], said(verdict="nothing-missing", matters=True), ["noticed"], []),
         (["quantisation"], said(seen=["quantisation"]), ["right"], []),
         (["far-copy"], said(TABLE), ["noticed"], []),
-        # The larger cause first: a law, or a set, counts once.
+        # The larger cause is judged first. A law or a set counts once.
         (["vignetting", "far-copy"], said(LAW), ["noticed", "lawful"], []),
         (["vignetting", "far-copy"], said(found("vignetting"), LAW), ["right", "lawful"], []),
         (["galvo-lag", "tip-dilation"], said(found("galvo-lag", "tip-dilation")), SHARED, []),
@@ -377,7 +377,7 @@ LAW, TABLE = found("height-power-2", knowledge="law"), found("level-table", know
         (["cubic-slope-loss"], said(found("slope-thinning")), ["noticed"], THINNING),
         ([], said(verdict="nothing-missing"), ["clean"], []),
         ([], said(TABLE), ["false-positive"], []),
-        # The fab's default noise has offsets of lines; it has no rounding.
+        # The fab's default noise has offsets of lines, but no rounding.
         ([], said(verdict="nothing-missing", seen=["scan-line-stripes"]), ["clean"], []),
         ([], said(verdict="nothing-missing", seen=["quantisation"]), ["false-positive"], ["quantisation"]),
         (["periodic-lines"], said(verdict="nothing-missing", seen=["scan-line-stripes"]), ["noticed"], []),
@@ -447,9 +447,9 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
                 height_um=made.height_um.astype(np.float32), usable=np.ones(shape, bool),
             )
         )  # fmt: skip
-    # Mean absolute value of a normal of sd 5 nm, from 2 × 10⁴ pixels: 0.6 % for one standard error.
+    # The mean absolute value of normal noise, sd 5 nm, from 2 × 10⁴ pixels has a standard error of 0.6 %.
     assert true_floor(draw, planted, jobs, scans, 0) == pytest.approx(5 * np.sqrt(2 / np.pi), rel=0.02)
-    # A cause in the wrong scans is seen.
+    # A cause in the wrong scans shows in the error.
     swapped = [set_to(cause("galvo-lag", by="field", place="24", weak=0.5), 0.4)]
     assert true_floor(draw, swapped, jobs, scans, 0) > 6
 
@@ -457,13 +457,13 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
 def test_the_bias_is_that_of_the_base_and_only_where_it_can_be_right():
     draw = drawn(cause("vignetting"), printer={"threshold_dose": 0.25})
     own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14, "spot_um": 0.2}
-    # A logistic of steepness 1.6 is a tanh of 0.8; the fab has no gain.
+    # A logistic of steepness 1.6 is a tanh of steepness 0.8. The fab has no gain.
     true = {"alpha": 0.8, "gain": 1.0, **own}
     answer = Answer(
         base_values={name: 1.3 * own for name, own in true.items()},
         corrected_values={name: 0.9 * own for name, own in true.items()},
     )
-    # float32 of the model's values.
+    # The model keeps its values in float32.
     assert bias_of(draw, answer) == pytest.approx((0.3, 0.1), rel=1e-5)
     assert bias_of(draw.model_copy(update={"base": cause("hill-response")}), answer) is None
     assert bias_of(draw, Answer()) is None
@@ -510,13 +510,13 @@ def test_the_figures_count_failures_as_not_found_and_leave_out_small_causes():
     draws, trials = board_of_mixtures()
     values = [figure.value for figure in figures_of(make_scoreboard(draws, trials, ""))]
     assert [value.split(" (")[0] for value in values] == [
-        "1 of 2",  # of the catalogue: vignetting; not tip-dilation, and galvo-lag is too small
-        "2 of 3",  # of another form: far-copy by a law and linear-slope-loss, not fringes
+        "1 of 2",  # of the catalogue: vignetting is found, tip-dilation is not, and galvo-lag is too small
+        "2 of 3",  # of another form: far-copy (by a law) and linear-slope-loss are found, fringes is not
         "3 of 5",
         "3 of 5",
         "1 of 1",
         "none of 0",
-        "1 of 4",  # false names, the measured prints aside
+        "1 of 4",  # false names, without those on the measured prints
         "1 of 3",
         "0 of 1",
         "1 of 1",
@@ -569,7 +569,7 @@ def test_the_published_table_is_the_committed_scoreboard():
 
 
 def earlier_row(seed: int, rows: pd.DataFrame) -> str:
-    """By the words and rules of their day: error after at most 1.05 × the floor, another form 1.3 ×."""
+    """Return a row by the rules of that time: final error at most 1.05 × the floor, other forms 1.3 ×."""
     other, empty = ("other-form", "off-catalogue"), ("empty", "none")
     large = rows[pd.to_numeric(rows.rms_nm, errors="coerce") > 8]
     in_form, unnamed = large[~large.kind.isin(other)], large[large.kind.isin(other)]
@@ -644,7 +644,7 @@ def test_measured_prints_that_are_not_given_are_asked_for_before_the_first_trial
 
 
 def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
-    # 8 px cannot be printed.
+    # A field of 8 px cannot be printed.
     draw = drawn(cause("vignetting"))
     trial = run_trial(draw, small_board().model_copy(update={"size_px": 8}), tmp_path)
     assert trial == Trial.read(trial_folder(tmp_path, draw))
@@ -670,6 +670,6 @@ def test_one_cause_is_found_or_in_the_set(tmp_path: Path):
 def test_nothing_is_reported_where_there_is_nothing(tmp_path: Path):
     trial = run_trial(drawn(kind="empty"), small_board(size_px=192), tmp_path)
     assert not trial.failure
-    # Each scan has a zero of its own.
+    # Each scan has its own datum.
     assert {one.by for one in trial.found} <= {"scan"}
     assert trial.outcomes[0].verdict == "clean"

@@ -1,4 +1,4 @@
-"""What runs on a Dask cluster is what runs here, to the bit, even where a worker dies half-way."""
+"""Results from a Dask cluster equal local results bit for bit, even if a worker dies half-way."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """A cluster of two workers with one thread each; a job may cost one of them, not two."""
+    """Start a cluster of two workers with one thread each. A job may kill one worker, but not two."""
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, scheduler_kwargs={"allowed_failures": 1}
     ) as cluster:
@@ -62,13 +62,13 @@ def test_jobs_know_command_folder_and_large_objects(
     for job, (whole, entry, facts) in done:
         assert whole is job[1]
         assert entry == job[0]
-        # Dask gives its workers one thread unless the environment says otherwise.
+        # Dask gives its workers one thread unless an environment variable sets another number.
         assert facts == ("litho-data build card.toml", str(tmp_path), os.environ.get("OMP_NUM_THREADS", "1"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="settings of the C library of Linux")
 def test_a_worker_uses_freed_memory_again() -> None:
-    """Dask has its workers give it back at once, so that an array of 1 MiB is 256 new pages every time."""
+    """By default Dask's workers return freed memory at once, so each array of 1 MiB takes 256 new pages."""
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
@@ -76,10 +76,10 @@ def test_a_worker_uses_freed_memory_again() -> None:
         before = client.submit(new_pages, 1, pure=False).result()
         after = [pages for _, pages in run_jobs(new_pages, [1] * 3, Workers(dask=cluster.scheduler_address))]
     assert before >= 20 * 250
-    assert max(after) <= 2 * 256  # where the first array grew the memory, and something else beside
+    assert max(after) <= 2 * 256  # new pages for the first array, and some for other objects
 
 
-def test_what_is_bad_there_is_said_here(address: str) -> None:
+def test_a_refusal_on_a_worker_is_the_message_here(address: str) -> None:
     with pytest.raises(InputError, match=r"^job \d, got nothing, wanted something$"):
         list(run_jobs(refuse, range(3), Workers(dask=address)))
 
@@ -197,14 +197,14 @@ def test_designs_are_the_same_to_the_bit(
     for arm in arms:
         one, other = (Design.read(design_folder(tmp_path / name, arm, 0)) for name in "ab")
         assert one.fingerprint == other.fingerprint
-        # Hashes of levels, height, image, target.
+        # Hashes of levels, height, image and target.
         assert one.files == other.files != {}
         assert one.predicted == other.predicted
 
 
 @pytest.mark.long
 def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    # Smaller fields cannot be registered.
+    # Fields smaller than these cannot be registered.
     draws = make_draws(board="singles", seed=0, n_scans=12, size_px=128, base="physics")
     records = []
     for name, dask in (("a", None), ("b", address)):
@@ -214,7 +214,7 @@ def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> N
         campaign.run_campaign(tmp_path / name, draws, numbers=[1, 3], **settings)
         trials = campaign.finished(tmp_path / name, draws)
         assert not any(trial.failure for trial in trials)
-        # Seconds are the machine's; everything else is the trial's.
+        # Only the seconds depend on the machine.
         records.append([trial.model_dump(exclude={"dataset_cpu_s"}) for trial in trials])
     assert records[0] == records[1]
 
@@ -222,7 +222,7 @@ def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> N
 def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
     draws = make_draws(board="singles", seed=0, n_scans=12, size_px=64, base="physics")
     campaign.open_campaign(tmp_path, draws)
-    # Long enough for a process to start, too short for a trial.
+    # The time is long enough for a process to start, and too short for a trial.
     settings = {"workers": Workers(dask=address), "timeout_s": 0.3}
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **settings)
     assert [trial.failure for trial in campaign.finished(tmp_path, draws)] == ["not finished after 0.3 s"] * 2

@@ -1,4 +1,4 @@
-"""The plain fab is printable by the Physics model: two independent implementations of one process."""
+"""The Physics model can reproduce the plain fab: both implement the same process independently."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_models.boards.planting import plain_model
 
 @pytest.fixture(scope="module")
 def prints() -> list[tuple[torch.Tensor, np.ndarray, np.ndarray]]:
-    """(layout µm, clean print µm, default noise µm) of three fields on the layout grid."""
+    """Return (layout µm, clean print µm, default noise µm) of three fields on the layout grid."""
     fab = Fab(Printer(), Microscope.aligned(), Noise(), KnobBoard((), 6), 6)
     found = []
     for job in random_jobs(Plan(count=3, size_px=(192, 192), fields_per_print=1), Printer(), 6):
@@ -30,8 +30,8 @@ def test_physics_at_the_fabs_own_values_is_the_clean_print(prints):
     for layout_um, clean_um, noise_um in prints:
         with torch.no_grad():
             difference_nm = 1e3 * (model(layout_um)[0, 0].numpy() - clean_um)
-        # Kernels cut at 4 σ lose 6e-5 of their weight, and a blur of ±0.3 in conversion moves by 0.02 nm.
+        # Kernels cut at 4 σ lose 6e-5 of their weight. This moves a blurred conversion of ±0.3 by 0.02 nm.
         assert np.abs(difference_nm).max() < 0.2
-        # The fab promises 1.05 × its floor; at the hidden parameters nothing but the floor is left.
+        # The fab promises 1.05 × its floor. At the hidden parameters the residual is the floor.
         with_model = np.std(1e3 * noise_um - difference_nm)
         assert with_model < 1.001 * np.std(1e3 * noise_um)

@@ -1,4 +1,4 @@
-"""The faults of ``tests/faults.py`` can still be put in: what they change is there, and their tests are."""
+"""Each fault of ``tests/faults.py`` can still be put in: its text and its test files exist."""
 
 from __future__ import annotations
 

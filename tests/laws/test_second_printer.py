@@ -1,4 +1,4 @@
-"""Another machine from card to export: pitch, levels, field and microscope unlike the first in everything."""
+"""Run from card to export with a second machine of other pitch, levels, field and microscope."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LAYOUT = ("--pitch-um", 0.2, "--level-height-um", 0.02, "--levels", 64, "--set",
 
 
 def run(command, *words):
-    """Run one command as a user would; returns what it printed."""
+    """Run one command as a user would, and return what it printed."""
     app = importlib.import_module(f"{command.replace('-', '_')}.cli.app").app
     done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
@@ -27,7 +27,7 @@ def run(command, *words):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A folder with the prints, their dataset, a model of it, a design and its files for the printer."""
+    """Make a folder with prints, their dataset, a model, a design and its files for the printer."""
     folder = tmp_path_factory.mktemp("second")
     run("litho-data", "simulate", "--preset", "second-printer", "--count", 3, "--out", folder / "fab")
     run("litho-data", "build", folder / "fab" / "raw" / "card.toml", "--out", folder / "prints.zarr")
@@ -56,11 +56,11 @@ def test_the_model_is_calibrated_for_it_and_beats_the_nominal_heights(made):
     assert model.card["calibrated_range_um"][1] == pytest.approx(MACHINE.full_height_um)
     scan = litho_data.open_store(made / "prints.zarr").scans()[0]
     errors = [
-        # Free of the datum, of which the scan knows nothing.
+        # Errors without the datum, which a scan does not show.
         np.nanstd(np.where(scan.valid, scan.height_um - height, np.nan))
         for height in (model.predict(scan.layout_um), scan.layout_um)
     ]
-    # The blur of the spot and the threshold are most of what nominal heights miss.
+    # Nominal heights mainly lack the blur of the spot and the threshold.
     assert errors[0] < 0.5 * errors[1]
 
 

@@ -1,4 +1,4 @@
-"""Stop a command after any of its writes and give it again: the same result, and nothing else is left.
+"""A command that is stopped after any write and given again has the same result, with nothing else left.
 
 ``python -m tests.stopped_commands NAME FOLDER every`` stops it after each.
 """
@@ -21,16 +21,16 @@ from litho_models.cli.app import app as models
 from tests.stopped_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
-# One of each way to write a folder: a store, parts that grow, a whole folder, a plan from kept tiles, a file.
+# One command for each way to write: a store, growing parts, a whole folder, a plan from kept tiles, a file.
 QUICK = ("build", "train-network", "freeze", "next-print", "export-design")
-# So short that they are stopped after each of their writes here too.
+# These are so short that the test stops them after each of their writes.
 EVERY = {"freeze", "export-design"}
-# One file, or a folder whose parts are those of other commands.
+# These write one file, or a folder whose parts are written by other commands.
 ELSEWHERE = {"level", "predict", "sheet-read"}
 
 
 def test_every_command_that_writes_a_folder_is_stopped() -> None:
-    """Of one name in several packages each has its own."""
+    """Every command that takes ``out`` has an entry, which may have a suffix where packages share a name."""
     for app in (data, models, design):
         for name, command in _commands(get_command(app)):
             if name not in ELSEWHERE and any(one.name == "out" for one in command.params):

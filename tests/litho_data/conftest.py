@@ -1,4 +1,4 @@
-"""One small built store for all tests of the store; tests that change it work on a copy."""
+"""Provide one small built store for all tests of the store. Tests that change it work on a copy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from tests.litho_data.campaigns import write_campaign
 
 @pytest.fixture(scope="session")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``card.toml``, three scans, and ``prints.zarr`` built from them; not to be changed."""
+    """Return a folder with ``card.toml``, three scans, and the built ``prints.zarr``.
+
+    It must not be changed.
+    """
     folder = tmp_path_factory.mktemp("campaign")
     build_dataset(write_campaign(folder), folder / "prints.zarr")
     return folder

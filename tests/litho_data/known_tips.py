@@ -13,7 +13,7 @@ OVER = 4
 def print_under_tip(
     kind: str, radius_um: float, height_um: float, seed: int = 11, size_px: int = SIZE_PX
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The image (size, size), µm, under a paraboloid, and per pixel the share that the tip touched."""
+    """Return the image (size, size) under a paraboloid, µm, and the share of each pixel that is touched."""
     fine_um = PITCH_UM[0] / OVER
     reach = int(np.ceil(np.sqrt(2 * radius_um * height_um) / fine_um)) + 1
     parabola = -((np.arange(-reach, reach + 1) * fine_um) ** 2) / (2 * radius_um)
@@ -25,14 +25,15 @@ def print_under_tip(
 
     surface = fine_surface(kind, height_um, seed, size_px)
     image = dilated(surface)
-    # A contact between two points of the fine grid leaves the surface by up to fine²/2R there.
+    # A contact may lie between two points of the fine grid. There the image misses the surface by up to
+    # fine²/2R.
     touched = -dilated(-image) - surface < 2 * fine_um**2 / radius_um
     share = touched.reshape(size_px, OVER, size_px, OVER).mean(axis=(1, 3))
     return image[OVER // 2 :: OVER, OVER // 2 :: OVER], share
 
 
 def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX) -> np.ndarray:
-    """Pillars of one height, spikes or bumps of several, µm, OVER times as fine as the scan."""
+    """Return pillars of one height, or spikes or bumps of several, µm, OVER times as fine as the scan."""
     rng, size = np.random.default_rng(seed), size_px * OVER
     surface = np.zeros((size, size))
     for _ in range(size_px**2 // 2000):
@@ -50,5 +51,5 @@ def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX)
 
 
 def noise_of_snr(shape: tuple[int, ...], height_um: float, snr: float, seed: int) -> np.ndarray:
-    """White noise, µm."""
+    """Return white noise, µm, whose standard deviation is ``height_um / snr``."""
     return np.random.default_rng(seed + 1).standard_normal(shape) * height_um / snr

@@ -1,4 +1,4 @@
-"""Height maps as other programs write them: known maps in many containers, units, axes, marks, channels."""
+"""Write height maps as other programs do: known maps in many containers, units, axes, marks, channels."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.litho_data import afm_files
 
 @dataclass
 class MapFile:
-    """A written map: heights in µm with NaN where missing, and what a caller has to add to read it.
+    """A written map: heights in µm with NaN where missing, and the arguments that a reader needs.
 
-    ``says_size`` and ``asks`` are facts of the format: whether the size stands in the file, and whether it
-    cannot be read without the arguments. ``atol_um`` is half a step of the numbers that were written.
+    ``says_size`` and ``asks`` are facts of the format: whether the file states the size, and whether it
+    cannot be read without the arguments. ``atol_um`` is half a step of the written numbers.
     """
 
     height_um: np.ndarray
@@ -36,7 +36,7 @@ class MapFile:
     atol_um: float = 1e-9
 
     def in_unit(self) -> np.ndarray:
-        """Heights in the file's unit, the mark in place of NaN."""
+        """Return the heights in the file's unit, with the mark in place of NaN."""
         values = self.height_um / um_per(self.unit)
         return (
             values
@@ -45,17 +45,20 @@ class MapFile:
         )
 
     def needs(self, **arguments: Any) -> None:
-        """The file cannot be read without these."""
+        """Record that the file cannot be read without these arguments."""
         self.arguments |= arguments
         self.asks = True
 
     def needs_mark(self) -> None:
-        """The file does not say that its mark means a missing pixel."""
+        """Record that the reader must be told the mark.
+
+        The file does not say that the mark means a missing pixel.
+        """
         if self.mark is not None and np.isnan(self.height_um).any():
             self.needs(missing=[self.mark])
 
     def rows(self, separator: str = "\t", decimal: str = ".") -> list[str]:
-        """Lines of numbers with ten digits."""
+        """Return lines of numbers with ten digits."""
 
         def cell(value: float) -> str:
             if np.isnan(value):
@@ -66,12 +69,12 @@ class MapFile:
 
     @property
     def size_um(self) -> tuple[float, float]:
-        """(y, x) from edge to edge."""
+        """Size (y, x) from edge to edge, µm."""
         return self.height_um.shape[0] * self.pitch_um, self.height_um.shape[1] * self.pitch_um
 
 
 def random_map(rng: np.random.Generator) -> np.ndarray:
-    """Heights of 0.1 to 1 µm without any symmetry, in steps of 0.1 nm."""
+    """Return heights of 0.1 to 1 µm without any symmetry, in steps of 0.1 nm."""
     ny, nx = rng.choice(np.arange(9, 24), 2, replace=False)
     y, x = np.mgrid[0:ny, 0:nx]
     height = 0.1 + 0.4 * rng.random((ny, nx)) + 0.01 * y + 0.005 * x
@@ -83,7 +86,7 @@ Writer = Callable[[Path, MapFile, np.random.Generator], None]
 
 
 def text(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """A matrix, with or without a header, in one of the spellings that occur."""
+    """Write a matrix, with or without a header, in one of the spellings that occur."""
     separator, decimal = [("\t", "."), (" ", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")][
         rng.integers(6)
     ]
@@ -107,7 +110,7 @@ def text(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Gwyddion's export of two channels, apart by a blank line or by headers."""
+    """Write Gwyddion's export of two channels, separated by a blank line or by headers."""
     rows = one.rows()
     other = ["\t".join(f"{value:.3f}" for value in row) for row in np.nan_to_num(one.height_um) * 30]
     if rng.random() < 0.5:
@@ -128,7 +131,7 @@ def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> 
 
 
 def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """A matrix below a row and beside a column of coordinates in µm, as spreadsheets have it."""
+    """Write a matrix as spreadsheets do: coordinates in µm fill its first row and its first column."""
     separator, decimal = [(",", "."), (";", ","), ("\t", ".")][rng.integers(3)]
     rows = one.rows(separator, decimal)
     nx = one.height_um.shape[1]
@@ -146,7 +149,7 @@ def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def frame(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """A data frame as pandas writes it, with its index and its header."""
+    """Write a data frame as pandas does, with its index and its header."""
     import pandas as pd
 
     names = None if rng.random() < 0.5 else [f"c{k}" for k in range(one.height_um.shape[1])]
@@ -159,7 +162,7 @@ def frame(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def points(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Points x, y, z of the whole grid, one a line; where nothing was measured there may be no point."""
+    """Write the points x, y, z of the whole grid, one per line. Missing pixels may have no point."""
     ny, nx = one.height_um.shape
     y, x = (axis.ravel() * one.pitch_um / um_per(one.unit) for axis in np.mgrid[0:ny, 0:nx])
     table = np.column_stack([x, y, one.height_um.ravel() / um_per(one.unit)])
@@ -171,7 +174,7 @@ def points(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def surfer(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """A Surfer grid of one of the three kinds, coordinates in µm."""
+    """Write a Surfer grid of one of the three kinds, coordinates in µm."""
     ny, nx = one.height_um.shape
     blank, upward = 1.70141e38, one.height_um[::-1] / um_per(one.unit)
     values = np.where(np.isnan(upward), blank, upward)
@@ -194,7 +197,7 @@ def surfer(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def esri(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """An ESRI grid, which names its mark."""
+    """Write an ESRI grid, which states its mark of missing pixels."""
     one.mark = mark = one.mark if isinstance(one.mark, float) else -9999.0
     ny, nx = one.height_um.shape
     head = [
@@ -210,7 +213,7 @@ def esri(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def wyko(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Wyko ASCII: columns from the bottom, in nm or in waves."""
+    """Write Wyko ASCII: columns from the bottom up, in nm or in waves."""
     ny, nx = one.height_um.shape
     real = rng.integers(2)
     values = one.height_um * 1e3 / (1 if real else 632.8)
@@ -225,7 +228,7 @@ def wyko(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def tiff(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Real numbers, or counts with a calibration by ImageJ or GDAL."""
+    """Write a TIFF of real numbers, or of counts with a calibration by ImageJ or GDAL."""
     kind = rng.integers(3)
     values = one.in_unit()
     if kind == 0:
@@ -249,7 +252,7 @@ def tiff(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def hdf5(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """HDF5 of any program: counts with the attributes of the CF conventions."""
+    """Write HDF5 that follows no program: counts with the attributes of the CF conventions."""
     counts = np.where(np.isnan(one.height_um), -1, np.round(one.height_um * 1e4)).astype(np.int32)
     with h5py.File(path, "w") as file:
         data = file.create_dataset("scan/height", data=counts)
@@ -260,7 +263,7 @@ def hdf5(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def netcdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """NetCDF 3 or 4 written by xarray, dimensions in either order, coordinates in µm."""
+    """Write NetCDF 3 or 4 with xarray: dimensions in either order, coordinates in µm."""
     import xarray as xr
 
     ny, nx = one.height_um.shape
@@ -280,7 +283,7 @@ def netcdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def matlab(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """MATLAB 5, or 7.3: HDF5 behind a header, its arrays column by column."""
+    """Write MATLAB 5, or MATLAB 7.3: HDF5 behind a header, arrays column by column."""
     from scipy.io import savemat
 
     if rng.random() < 0.5:
@@ -295,7 +298,7 @@ def matlab(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Nanosurf: counts over the whole range of int32, two signals, the image flat or in lines."""
+    """Write a Nanosurf file: counts over the range of int32, two signals, the image flat or in lines."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     counts = np.round(one.height_um * 1e-6 / 2e-6 * (2**31 - 1)).astype(np.int32)
@@ -314,7 +317,7 @@ def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Digital Surf, as it is or compressed in two streams."""
+    """Write a Digital Surf file, uncompressed or compressed in two streams."""
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     afm_files.write_sur(path, np.round(one.height_um * 1e4).astype(int), height_per_count_um=1e-4)
     if rng.random() < 0.6:
@@ -331,7 +334,10 @@ def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def park(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Park Systems: a picture in the page, counts and their scale in private tags, the last row first."""
+    """Write a Park Systems file: a picture in the page, counts and their scale in private tags.
+
+    The last row comes first.
+    """
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     counts = np.round(one.height_um[::-1] * 1e4).astype("<i2")
@@ -362,7 +368,7 @@ def park(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def sdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """ISO 25178-71 as text: heights times Zscale are metres."""
+    """Write ISO 25178-71 as text: heights times Zscale are metres."""
     ny, nx = one.height_um.shape
     head = {
         "ManufacID": "TEST", "CreateDate": "010120200000", "ModDate": "010120200000", "NumPoints": nx,
@@ -377,7 +383,7 @@ def sdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def bcr(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """BCR: a text header of 2048 bytes, counts of 16 bits, lengths in nm."""
+    """Write a BCR file: a text header of 2048 bytes, counts of 16 bits, lengths in nm."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     says = {
@@ -390,7 +396,7 @@ def bcr(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def gsf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Gwyddion Simple Field."""
+    """Write a Gwyddion Simple Field."""
     size_y, size_x = one.size_um
     header = {"XReal": f"{size_x * 1e-6!r}", "YReal": f"{size_y * 1e-6!r}", "XYUnits": "m", "ZUnits": "m"}
     afm_files.write_gsf(path, one.height_um * 1e-6, header)
@@ -398,7 +404,7 @@ def gsf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def numpy_archive(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """NPY, or NPZ with two maps."""
+    """Write NPY, or NPZ with two maps."""
     stream = io.BytesIO()
     if rng.random() < 0.5:
         np.save(stream, one.in_unit())

@@ -1,4 +1,4 @@
-"""Printed and scanned phantoms whose warp is known: clean, with defects, and creeping."""
+"""Make phantoms: scans of prints whose warp is known, clean, with defects, or with creep of the scanner."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Seen = Callable[[np.ndarray], np.ndarray]
 
 
 def random_layout(shape: tuple[int, int], seed: int, blob_px: float = 8.0, levels: int = 13) -> np.ndarray:
-    """Low-passed noise stretched over the levels."""
+    """Return low-passed noise, stretched over the levels."""
     noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), blob_px, mode="wrap")
     noise = (noise - noise.min()) / np.ptp(noise)
     return np.minimum(noise * levels, levels - 1).astype(np.uint8)
@@ -45,7 +45,7 @@ def warp_about_centre(
     margin_px: tuple[float, float] = (14.0, 14.0),
     perspective: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Layout index to scan index: scale and rotation about the layout's middle; pairs are (x, y)."""
+    """Return the map from layout index to scan index, about the middle of the layout. Pairs are (x, y)."""
     angle = np.radians(rotation_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     middle = centre(shape)
@@ -68,10 +68,10 @@ def scan_of(
     orientation: str = "identity",
     polarity: int = 1,
 ) -> np.ndarray:
-    """Heights, µm, of the blurred print seen through a warp, then noise, turn and sign.
+    """Return the heights, µm, of the blurred print seen through a warp, with noise, turned and signed.
 
-    ``snr`` is the standard deviation of the print over that of white noise. The result is turned so that
-    ``orient(result, orientation)`` is upright again.
+    ``snr`` is the standard deviation of the print over that of white noise. ``orient(result, orientation)``
+    turns the result upright again.
     """
     height = LEVEL_HEIGHT_UM * gaussian_filter(layout_level.astype(float), PRINT_BLUR_PX, mode="constant")
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan_shape)
@@ -86,7 +86,7 @@ def scan_of(
 def true_scan_to_layout(
     layout_to_scan: np.ndarray, orientation: str, scan_shape: tuple[int, int]
 ) -> np.ndarray:
-    """The truth in µm for the scan that ``scan_of`` returns; ``scan_shape`` is that of the upright one."""
+    """Return the true map, µm, for a scan of ``scan_of``. ``scan_shape`` is the shape of the upright scan."""
     back = INVERSE.get(orientation, orientation)
     frame = index_to_um((PITCH_UM, PITCH_UM))
     to_turned = orientation_matrix(back, scan_shape) @ layout_to_scan
@@ -94,7 +94,7 @@ def true_scan_to_layout(
 
 
 def warp_error_px(found: np.ndarray, true: np.ndarray, layout_shape: tuple[int, int]) -> float:
-    """Largest distance between two ``scan_to_layout`` over the layout, in layout pixels."""
+    """Return the largest distance between two ``scan_to_layout`` maps over the layout, in layout pixels."""
     ny, nx = layout_shape
     y, x = np.meshgrid(np.linspace(0, ny, 9), np.linspace(0, nx, 9), indexing="ij")
     points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
@@ -103,12 +103,12 @@ def warp_error_px(found: np.ndarray, true: np.ndarray, layout_shape: tuple[int, 
 
 
 def register(scan: np.ndarray, layout: np.ndarray, **options: Any) -> Registration:
-    """A phantom as a build registers it."""
+    """Register a phantom as a build does."""
     return register_scan(scan, layout, scan_pitch_um=(PITCH_UM,) * 2, layout_pitch_um=PITCH_UM, **options)
 
 
 def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A layout, and where it lies in its scan."""
+    """Return a layout, and the map from its indices to those of its scan."""
     layout = random_layout(SHAPE, seed, blob_px=7.0)
     warp = warp_about_centre(
         SHAPE, rotation_deg=0.6, scale=(1.015, 0.99), shift_px=(3.3, -2.2), margin_px=(28.0, 28.0)
@@ -117,7 +117,10 @@ def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rms_error_px(found: Registration, warp: np.ndarray, seen: Seen | None = None) -> float:
-    """Over the layout, 8 px from its border; ``seen`` takes true points of the scan to where they appear."""
+    """Return the rms error of a registration over the layout, 8 px from its border, in layout pixels.
+
+    ``seen`` maps true points of the scan to the points where they appear.
+    """
     truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
     y, x = np.meshgrid(*(np.linspace(8, n - 8, 33) for n in SHAPE), indexing="ij")
     points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
@@ -129,7 +132,7 @@ def rms_error_px(found: Registration, warp: np.ndarray, seen: Seen | None = None
 
 
 def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Eight particles of 0.5 to 1.6 µm radius, 1 to 4 µm high."""
+    """Add eight particles of 0.5 to 1.6 µm radius, 1 to 4 µm high."""
     y, x = np.mgrid[: scan.shape[0], : scan.shape[1]]
     for _ in range(8):
         middle, radius = rng.uniform(0.08, 0.92, 2) * scan.shape, rng.uniform(5, 16)
@@ -139,14 +142,14 @@ def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def missing_corner(scan: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
-    """Bare substrate over a share of both sides of the print."""
+    """Put bare substrate in a corner that takes this share of both sides of the print."""
     scan, side = scan.copy(), 28 + round(share * SHAPE[0])
     scan[:side, :side] = BARE_UM * rng.standard_normal((side, side))
     return scan
 
 
 def delaminated(scan: np.ndarray, rng: np.random.Generator, lift_um: float) -> np.ndarray:
-    """A tenth of the print lifted, or gone."""
+    """Lift a tenth of the print, or remove it where ``lift_um`` is 0."""
     smooth = gaussian_filter(rng.standard_normal(scan.shape), 25)
     off = smooth > np.quantile(smooth, 0.9)
     return np.where(off, scan + lift_um if lift_um else BARE_UM * rng.standard_normal(scan.shape), scan)
@@ -165,7 +168,10 @@ DEFECTS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 def creeping(
     layout: np.ndarray, warp: np.ndarray, creep_um: float, slow: int, constant: float = 0.25
 ) -> tuple[np.ndarray, Seen]:
-    """A scan whose scanner settles with a time constant, and where its true points appear (µm)."""
+    """Return a scan whose scanner settles with a time constant, and the map of its distortion.
+
+    The map takes true points to the points where they appear, µm.
+    """
     place = np.arange(SCAN_SHAPE[0])
     settling_px = creep_um / PITCH_UM * np.exp(-place / (constant * SCAN_SHAPE[0]))
     amount = (1.0, 0.4)  # along x and y

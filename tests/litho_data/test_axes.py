@@ -1,4 +1,4 @@
-"""Axes, signs and half pixels, on grids where every one of them shows."""
+"""Test axes, signs and half pixels on grids where an error in any of them is noticed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.grids import SHAPES, UNEQUAL
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_canvas_lies_around_its_layout_and_the_layout_around_its_place(shape: tuple[int, int]) -> None:
+def test_a_canvas_surrounds_its_layout_and_the_layout_is_centred_on_its_place(shape: tuple[int, int]) -> None:
     pitch_um, place_um = 0.13, (7.0, -3.0)
     layout = np.arange(np.prod(shape)).reshape(shape) % 13
     canvas = Canvas(frame_layout(layout), pitch_um, place_um, 100.0)
@@ -36,13 +36,13 @@ def test_a_canvas_lies_around_its_layout_and_the_layout_around_its_place(shape: 
     np.testing.assert_allclose(canvas.x_um[0, inside], grid.x_um, atol=1e-12)
     for axis, offset in enumerate(canvas.field_offset_um()):
         along = np.ravel(offset)[inside]
-        # Pixel centres on both sides of the layout's centre, which lies at its place.
+        # The pixel centres lie on both sides of the centre of the layout, and that centre lies at its place.
         assert along.mean() == pytest.approx(place_um[axis], abs=1e-12)
         assert along[-1] - along[0] == pytest.approx((shape[axis] - 1) * pitch_um)
 
 
 @pytest.mark.parametrize("name", UNEQUAL)
-def test_a_grid_ends_where_its_pixels_do(name: str) -> None:
+def test_a_grid_ends_at_the_outer_edges_of_its_pixels(name: str) -> None:
     grid = UNEQUAL[name]
     for centres, axis in ((grid.y_um, 0), (grid.x_um, 1)):
         edges = centres[[0, -1]] + np.array([-0.5, 0.5]) * grid.pitch_um[axis]
@@ -78,16 +78,19 @@ def test_the_matrix_of_an_orientation_says_where_each_pixel_goes(
 @pytest.mark.parametrize(
     ("shape", "pitch_um"), [((40, 75), (0.13, 0.08)), ((75, 40), (0.08, 0.13)), ((90, 41), (0.11, 0.2))]
 )
-def test_a_bend_that_is_read_from_the_store_is_the_one_that_was_found(
+def test_a_bend_read_from_the_store_equals_the_one_that_registration_found(
     orientation: str, shape: tuple[int, int], pitch_um: tuple[float, float]
 ) -> None:
-    """Registration works on indices of the turned scan; the store keeps amounts in the scan's own frame."""
+    """Registration finds the bend on indices of the turned scan.
+
+    The store keeps it in the frame of the raw scan.
+    """
     layout_pitch_um = 0.1
     case = _Case(np.zeros(shape), np.zeros((50, 62), int), pitch_um, layout_pitch_um, 0, None, {})
     ny, nx = (round(n * p / layout_pitch_um) for n, p in zip(shape, pitch_um, strict=True))
     turned = orient(np.zeros((ny, nx)), orientation).shape
     bend = Bend.none_yet((turned[0], turned[1]))
-    # A few pixels at the rim, other amounts along x and y.
+    # The bend is a few pixels at the rim, with different amounts along x and y.
     bend = Bend(np.array([[2.0, 0.7, -1.1], [-0.4, 1.3, 0.9]]), bend.middle, bend.half)
     layout_to_oriented = np.array([[1.02, 0.01, 3.0], [-0.02, 0.97, -5.0], [0, 0, 1]])
     found = SimpleNamespace(layout_to_scan=layout_to_oriented, bend=bend)
@@ -105,7 +108,7 @@ def test_a_bend_that_is_read_from_the_store_is_the_one_that_was_found(
     )
     wanted = apply_transform(frame @ np.linalg.inv(layout_to_oriented), bend.straighten(oriented))
     got = apply_transform(np.linalg.inv(layout_to_scan), stored.straighten(points_um))
-    # Amounts are rounded to a millionth of a micrometre, six of them, at most 2/3 or 1 each.
+    # Each of six amounts is rounded to a millionth of a micrometre and weighted by 2/3 or 1 at most.
     np.testing.assert_allclose(got, wanted, atol=6e-6)
 
 

@@ -1,4 +1,4 @@
-"""One notion of begun: stop a command after any write and give it again, and its result is the same."""
+"""Stop a command after any of its writes and repeat it: the result is the same."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FACTS = {"dataset": {"name": "prints"}, "settings": {"seed": 0}}
 
 
 def grow(out: Path, facts: dict[str, object] = FACTS) -> None:
-    """A command that keeps its parts: a folder, a file, and last the record."""
+    """Run a command that keeps its finished parts: a folder, a file, and last the record."""
     with growing_folder(out, "sums.json", facts) as begun:
         if not (begun.folder / "part").exists():
             with atomic_folder(begun.folder / "part") as part:
@@ -30,14 +30,14 @@ def grow(out: Path, facts: dict[str, object] = FACTS) -> None:
 
 
 def replace(out: Path) -> None:
-    """A command whose result appears as a whole."""
+    """Run a command whose result appears as a whole."""
     with whole_folder(out, "*.txt", "sums.json", record="sums.json", facts=FACTS) as folder:
         (folder / "a.txt").write_text("1")
         (folder / "sums.json").write_text(json.dumps(FACTS))
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Everything below a folder, hidden files too."""
+    """Return everything below a folder: the text of each file, hidden ones too."""
     return {
         str(path.relative_to(folder)): path.read_text() if path.is_file() else ""
         for path in folder.rglob("*")
@@ -46,7 +46,7 @@ def tree(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize("older", [False, True], ids=["new", "again"])
 @pytest.mark.parametrize("command", [grow, replace])
-def test_stopped_after_any_write_and_given_again_the_result_is_the_same(
+def test_a_command_stopped_after_any_write_and_repeated_gives_the_same_result(
     command: Callable[[Path], None], older: bool, tmp_path: Path
 ) -> None:
     if older:
@@ -88,8 +88,8 @@ def test_a_begun_folder_is_continued_by_the_same_command_only(tmp_path: Path) ->
             pass
 
 
-def test_what_is_continued_is_not_said_anew(tmp_path: Path) -> None:
-    """A process stopped while it writes the mark again would leave parts that nobody has begun."""
+def test_continuing_a_folder_does_not_rewrite_its_mark(tmp_path: Path) -> None:
+    """A process that is stopped while it rewrites the mark would leave parts without a valid mark."""
     assert stopped_after(5, lambda: grow(tmp_path), tmp_path)
     os.utime(tmp_path / BEGUN, (0, 0))
     with growing_folder(tmp_path, "sums.json", FACTS) as begun:
@@ -98,13 +98,13 @@ def test_what_is_continued_is_not_said_anew(tmp_path: Path) -> None:
         assert json.loads((tmp_path / BEGUN).read_text()) == {"record": "sums.json", **FACTS}
 
 
-def test_what_had_begun_nothing_leaves_nothing(tmp_path: Path) -> None:
+def test_a_command_that_fails_before_its_first_part_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name, stays in (("new", False), ("empty", True)):
         with pytest.raises(ZeroDivisionError), growing_folder(tmp_path / name, "sums.json"):
             raise ZeroDivisionError
         assert (tmp_path / name).exists() is stays
-    # Stopped before it had said what it begins.
+    # A command was stopped after it created the mark and before it wrote to it.
     (tmp_path / "empty" / BEGUN).touch()
     grow(tmp_path / "empty")
     (tmp_path / "empty" / "sums.json").unlink()
@@ -113,7 +113,7 @@ def test_what_had_begun_nothing_leaves_nothing(tmp_path: Path) -> None:
         grow(tmp_path / "empty")
 
 
-def test_a_folder_that_cannot_be_written_is_found_before_the_work(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported_before_the_work_begins(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     for begin in (
         growing_folder(tmp_path / "file" / "out", "a.json"),

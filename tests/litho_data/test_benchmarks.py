@@ -1,4 +1,4 @@
-"""What all benchmarks share: where a page takes their text, and what a record says of its making."""
+"""Test what all benchmarks share: where their text goes on a page, and what their records state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
 
 
-def test_publishing_replaces_what_stands_between_the_marks(tmp_path):
+def test_publishing_replaces_the_text_between_the_marks(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("top\n<!-- a: written by the benchmark -->\nold\n<!-- end of a -->\nbottom\n")
     publish(page, "a", "| new |")
@@ -27,7 +27,7 @@ def test_publishing_replaces_what_stands_between_the_marks(tmp_path):
         publish(page, "b", "x")
 
 
-def test_a_record_says_by_which_command_and_commit_it_was_made(tmp_path, monkeypatch):
+def test_a_record_states_the_command_and_commit_that_made_it(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["speed.py", "--repeats", "1"])
     record = origin()
     assert record["command"].endswith("--repeats 1")

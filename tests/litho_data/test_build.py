@@ -1,4 +1,4 @@
-"""A build keeps what is good, names what is not, repeats itself, and never leaves half a store."""
+"""A build keeps good scans, names bad ones, is repeatable, and never leaves half a store."""
 
 from __future__ import annotations
 
@@ -43,13 +43,15 @@ def test_heights_come_back_on_the_layout(campaign: Path) -> None:
         truth = height_of(layout, index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
         assert scan.valid.all()
         # The scan lies on the layout's grid, shifted by whole pixels. Resampling keeps 0.76 of the noise
-        # variance, so noise differs by less than twice its sd; 0.02 px of registration add about 2 nm.
+        # variance, so the difference of two noises has less than twice the sd of one. A registration error of
+        # 0.02 px adds about 2 nm.
         assert np.std(scan.height_um - truth) < 2 * NOISE_UM
         assert scan.print_id == scan.id[1]
         assert scan.order == index
         assert scan.layout_um[5, 7] == pytest.approx(layout[5, 7] * LEVEL_HEIGHT_UM)
         corner = scan.scan_to_layout @ [MARGIN_PX * 0.1, MARGIN_PX * 0.1, 1]
-        # Held-out registration error of these scans is below 0.05 px = 0.005 µm, tripled for the corner.
+        # The held-out registration error of these scans is below 0.05 px = 0.005 µm. The corner may be off by
+        # three times that.
         np.testing.assert_allclose(corner, [0, 0, 1], atol=0.015)
 
 
@@ -72,7 +74,7 @@ def test_building_again_with_other_workers_gives_the_same(own_campaign: Path) ->
     assert not list(own_campaign.glob(".*"))
 
 
-def test_no_scheduler_is_bad_input(campaign: Path, tmp_path: Path) -> None:
+def test_an_address_without_dask_scheduler_is_bad_input(campaign: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="Dask scheduler"):
         build_dataset(campaign / "card.toml", tmp_path / "prints.zarr", dask="nonsense://")
@@ -88,7 +90,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
         "P33": "\n".join(good.splitlines()[:125]),  # readable, but rows are missing
         "P34": "\x00\x01 no heights",
         "P35": good,  # its layout has too many levels
-        "P37": "\n".join(good.splitlines()[:64]),  # half the rows: no longer to be registered
+        "P37": "\n".join(good.splitlines()[:64]),  # half the rows: cannot be registered
     }
     for scan_id, text in bad.items():
         shutil.copy(tmp_path / "layouts" / "P11.tif", tmp_path / "layouts" / f"{scan_id}.tif")
@@ -149,12 +151,13 @@ def test_isolated_gaps_are_not_valid(tmp_path: Path) -> None:
     build_dataset(card, tmp_path / "prints.zarr")
     scan = open_store(tmp_path / "prints.zarr").scan("P11")
     assert not scan.valid[row, column]
-    # The gap and the pixels whose interpolation reaches it: at most 6 x 6, never the rest of the field.
+    # Invalid are the gap and the pixels whose interpolation uses it: at most 6 x 6, never the rest of the
+    # field.
     assert 0 < (~scan.valid).sum() <= 36
     np.testing.assert_array_equal(np.isnan(scan.height_um), ~scan.valid)
 
 
-def test_no_good_scan_leaves_nothing(tmp_path: Path) -> None:
+def test_a_build_without_a_good_scan_leaves_nothing(tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=1)
     (tmp_path / "scans" / "P11.txt").write_text("1\t2\n3")
     before = {path.name for path in tmp_path.iterdir()}
@@ -167,7 +170,7 @@ def test_smaller_layouts_are_padded_and_cut_again(tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=1, shape=(144, 144))
     small = layout_of(5, (144, 128))
     tifffile.imwrite(tmp_path / "layouts" / "P12.tif", small)
-    # Both files state one size; a wider margin of the smaller field keeps the scan's shape.
+    # Both files state the same size. A wider margin around the smaller field keeps the shape of the scan.
     margin = MARGIN_PX + 8
     height = np.pad(height_of(small, 5)[:, MARGIN_PX:-MARGIN_PX], ((0, 0), (margin, margin)), mode="edge")
     write_scan(tmp_path / "scans" / "P12.txt", height)
@@ -232,7 +235,7 @@ def test_a_levelling_recipe_is_applied_and_recorded(tmp_path: Path) -> None:
     assert store.manifest["recipe"]["step"][0]["op"] == "plane"
 
 
-def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> None:
+def test_layout_aware_levelling_locates_the_layout_first(tmp_path: Path) -> None:
     recipe = '[[step]]\nop = "layout-aware"\nblur_px = 1.0\n'
     (tmp_path / "recipe.toml").write_text(recipe, encoding="utf-8")
     card = write_campaign(tmp_path, count=1, more='[process]\nlevel = "recipe.toml"')
@@ -241,14 +244,15 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
     write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
     build_dataset(card, tmp_path / "prints.zarr")
     removed = open_store(tmp_path / "prints.zarr").scan_frame("P11", "removed_um").astype(float)
-    # The margin has no layout and the response is piecewise linear: 5 % of the tilt is left to them.
+    # The margin has no layout, and the response is piecewise linear. Together they may take up to 5 % of the
+    # tilt.
     np.testing.assert_allclose(np.polyfit(np.arange(128), removed.mean(axis=0), 1)[0] * 128, 0.3, rtol=0.05)
     steps = [step.op for _, step in read_steps(open_store(tmp_path / "prints.zarr"))["P11"]]
     assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample", "uncertainty"]
     assert replay(tmp_path / "prints.zarr")["same_hash"].all()
 
 
-def test_a_full_disk_loses_neither_the_older_store_nor_the_scans_that_are_done(
+def test_a_full_disk_loses_neither_the_older_store_nor_the_finished_scans(
     campaign: Path, own_campaign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, card = own_campaign / "prints.zarr", own_campaign / "card.toml"
@@ -284,7 +288,7 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
         content = bytearray(damaged.read_bytes())
         content[len(content) // 2] ^= 1
         damaged.write_bytes(content)
-        # What a write of Zarr leaves that was stopped.
+        # Zarr leaves such a file when a write is interrupted.
         (partial.store / "scans" / "zarr.0123.partial").write_text("{")
     text = (own_campaign / "scans" / "P12.txt").read_text()
     (own_campaign / "scans" / "P12.txt").write_text(text.replace("\t", " ", 1))
@@ -294,7 +298,7 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
     assert not list(out.rglob("*.partial"))
 
 
-def test_a_changed_card_is_another_piece(campaign: Path) -> None:
+def test_a_changed_card_changes_the_key_of_a_piece(campaign: Path) -> None:
     listing = list_fields(campaign / "card.toml")
     job = field_jobs(listing, no_recipe())[0]
     levels = listing.card.layout.model_copy(update={"levels": 14})

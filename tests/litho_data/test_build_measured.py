@@ -1,4 +1,4 @@
-"""The measured prints: all 24 build, the same with one and two workers, in bounded memory."""
+"""All 24 measured prints build in bounded memory, with the same result for one and two workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ if __name__ == "__main__":
 
 
 def _built(out: Path, workers: int) -> tuple[str, int, float, float]:
-    """Hash, scans, seconds, MiB: the peak of the process plus, per worker, that of the largest worker."""
+    """Return hash, scans, seconds and peak memory, MiB.
+
+    The peak is that of the process plus, for each worker, that of the largest worker.
+    """
     script = out.with_suffix(".py")
     script.write_text(_BUILD, encoding="utf-8")
     command = [sys.executable, str(script), str(find_card("neural-lithography")), str(out), str(workers)]
@@ -46,14 +49,14 @@ def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_p
     sha256, scans, seconds, peak_mib = _built(tmp_path / "prints.zarr", workers=2)
     print(f"{scans} scans, 2 workers: {seconds:.1f} s, peak at most {peak_mib:.0f} MiB")
     assert scans == 24
-    # 309 + 2 x 250 MiB were measured.
+    # Measured: 309 + 2 x 250 MiB.
     assert peak_mib < 1024
     store = open_store(tmp_path / "prints.zarr")
     assert store.sha256 == sha256
     assert store.quality["passed"].all()
     assert verify(tmp_path / "prints.zarr").findings == ()
 
-    # Two scans alone, in one process: other company, other order, the same arrays.
+    # Two scans built alone, in another order and in one process, have the same arrays.
     for name in ("afm_ug/FOV42.txt", "afm_ug/FOV72.txt", "mask_ug/FOV42.tif", "mask_ug/FOV72.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(measured_prints / name, tmp_path / name)

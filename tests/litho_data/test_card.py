@@ -1,4 +1,4 @@
-"""A card is read strictly: every wrong key or value is named together with what was expected."""
+"""A card is read strictly: every wrong key or value is named together with the expected one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GOOD: dict[str, Any] = tomllib.loads(card_text())
 
 
 def changed(key: str, value: object) -> dict[str, Any]:
-    """The good card with one key set, or removed where the value is None."""
+    """Return the good card with one key set, or removed where the value is None."""
     card = copy.deepcopy(GOOD)
     *tables, last = key.split(".")
     table = card
@@ -95,7 +95,7 @@ def test_a_wrong_card_is_named(key: str, value: object, expected: str) -> None:
         check_card(changed(key, value), "card")
 
 
-def test_no_card_and_no_toml(tmp_path: Path) -> None:
+def test_a_missing_card_and_a_card_that_is_not_toml_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read"):
         load_card(tmp_path / "absent.toml")
     (tmp_path / "bad.toml").write_text("name = ", encoding="utf-8")

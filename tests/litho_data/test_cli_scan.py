@@ -1,4 +1,4 @@
-"""`level` and `inspect` on files: what they write, what they print, how they fail."""
+"""Test `level` and `inspect` on files: what they write, what they print, how they fail."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
     assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
 
 
-def test_what_a_step_warns_of_is_said_on_stderr(app, tmp_path: Path) -> None:
-    """A block over half of the lines that it crosses moves them."""
+def test_warnings_of_a_levelling_step_go_to_stderr(app, tmp_path: Path) -> None:
+    """A block covers half of some lines, so that row alignment shifts them."""
     height = 0.003 * np.random.default_rng(0).standard_normal((128, 128))
     height[30:90, 20:90] += 0.8
     np.savetxt(tmp_path / "scan.txt", height * 1e-6)

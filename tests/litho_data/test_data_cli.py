@@ -1,4 +1,4 @@
-"""The command line: one clear line and code 2 for bad input, 1 for a store that has changed, 0 else."""
+"""The command line: one clear line and code 2 for bad input, code 1 for a changed store, else code 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The store's contract at the door, and hashes that see values and nothing else."""
+"""Opening a store checks its contract, and hashes depend on values and nothing else."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from litho_data.store import open_store
 from litho_data.store.access import array_of, values_of
 
 
-def test_array_hash_sees_values_type_shape_unit_and_names() -> None:
+def test_array_hash_depends_on_values_type_shape_unit_and_names() -> None:
     array = np.arange(6, dtype=np.float32).reshape(2, 3)
     known = array_sha256(array, "um", ("y", "x"))
     assert known == array_sha256(np.asfortranarray(array), "um", ("y", "x"))
@@ -32,7 +32,7 @@ def test_array_hash_sees_values_type_shape_unit_and_names() -> None:
     assert len({known, *others}) == 6
 
 
-def test_array_hash_knows_one_nan_only() -> None:
+def test_array_hash_treats_all_nans_alike() -> None:
     quiet = np.array([np.nan, 1.0], dtype=np.float32)
     other = quiet.copy()
     other.view(np.uint32)[0] = 0xFFC01234  # negative, with a payload
@@ -40,12 +40,12 @@ def test_array_hash_knows_one_nan_only() -> None:
     assert array_sha256(quiet, "um", ("x",)) == array_sha256(other, "um", ("x",))
 
 
-def test_record_hash_does_not_see_the_order_of_keys() -> None:
+def test_record_hash_does_not_depend_on_the_order_of_keys() -> None:
     assert record_sha256({"a": 1, "b": [2.5, None]}) == record_sha256({"b": [2.5, None], "a": 1})
     assert record_sha256({"a": 1}) != record_sha256({"a": 2})
 
 
-def test_dataset_hash_does_not_see_chunks_or_codecs(own_campaign: Path) -> None:
+def test_dataset_hash_does_not_depend_on_chunks_or_codecs(own_campaign: Path) -> None:
     path = own_campaign / "prints.zarr"
     known = open_store(path).sha256
     root = zarr.open_group(path, mode="a", use_consolidated=False)
@@ -89,7 +89,7 @@ def test_the_whole_store_opens_as_one_tree(campaign: Path) -> None:
 def test_one_chunk_is_one_scan(campaign: Path) -> None:
     array = array_of(open_store(campaign / "prints.zarr").root, "height_um")
     assert array.chunks == (1, 112, 112)
-    # A shard of several scans keeps other tools from copying a part of them.
+    # With several scans per shard, other tools could not copy single scans.
     assert array.shards is None
 
 
@@ -148,7 +148,7 @@ def test_a_copy_or_a_part_by_xarray_is_a_store_again(campaign: Path, tmp_path: P
     part.to_netcdf(tmp_path / "copy.nc")
     with xarray.open_dataset(tmp_path / "copy.nc") as back:
         np.testing.assert_array_equal(back["height_um"], part["height_um"])
-        # Coordinates of the pixel centres choose by length.
+        # The coordinates of the pixel centres select by length.
         assert float(back.sel(x=5.04, y=1.01, method="nearest")["x_um"]) == pytest.approx(5.05)
 
 
@@ -172,7 +172,7 @@ def test_a_part_with_other_pixels_is_refused(
         open_store(tmp_path / "part.zarr")
 
 
-def test_a_copy_by_xarray_may_lack_what_states_nothing_and_no_more(campaign: Path, tmp_path: Path) -> None:
+def test_a_copy_by_xarray_may_lack_only_the_chunks_of_empty_columns(campaign: Path, tmp_path: Path) -> None:
     import xarray
 
     copy = tmp_path / "copy.zarr"

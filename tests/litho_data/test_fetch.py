@@ -1,4 +1,4 @@
-"""Fetching from a server: what is right is kept, what is wrong is named and never used."""
+"""Fetch from a server: correct files are kept, wrong files are named and never used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A file or a folder is replaced whole or not at all: whatever stops the writing, the older one stays."""
+"""A file or a folder is replaced as a whole or not at all. If the writing stops, the older one stays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from litho_data.foundation.files import atomic_file, atomic_folder, unfinished
 
 @pytest.fixture
 def older(tmp_path: Path) -> Path:
-    """A place with a finished result in it, a folder of two files."""
+    """Return a folder that holds a finished result of two files."""
     folder = tmp_path / "result"
     (folder / "part").mkdir(parents=True)
     (folder / "part" / "a.txt").write_text("weeks of work")
@@ -80,7 +80,7 @@ def test_a_process_killed_while_it_writes_leaves_the_older_folder(older: Path) -
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
-def test_an_older_folder_that_a_killed_process_had_put_aside_comes_back(older: Path) -> None:
+def test_an_older_folder_that_a_killed_process_had_moved_away_is_restored(older: Path) -> None:
     code = (
         "from pathlib import Path\nfrom litho_data.foundation.files import atomic_folder\n"
         "replace = Path.replace\n"
@@ -97,7 +97,7 @@ def test_an_older_folder_that_a_killed_process_had_put_aside_comes_back(older: P
 
 
 def test_writers_of_one_folder_take_turns(tmp_path: Path) -> None:
-    """Two commands that share a cache keep the same fit there, one after the other."""
+    """Two commands that share a cache write the same fit there, one after the other."""
 
     def write(number: int) -> None:
         for turn in range(20):
@@ -120,7 +120,7 @@ def test_an_error_on_the_way_leaves_the_older_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mask", [0, 0o022, 0o077])
-def test_others_may_do_with_a_file_what_the_umask_says(tmp_path: Path, mask: int) -> None:
+def test_the_permissions_of_a_file_follow_the_umask(tmp_path: Path, mask: int) -> None:
     before = os.umask(mask)
     try:
         with atomic_file(tmp_path / "a.txt") as file:

@@ -1,4 +1,4 @@
-"""The fab for films: where edges lie by its knobs, and a run that is built like any other."""
+"""Test the fab for films: its knobs move edges as stated, and its run is built like any other."""
 
 from __future__ import annotations
 
@@ -27,26 +27,27 @@ PLAIN = FilmKnobs()
 
 
 def stripes(width_px: int = 32, size_px: int = 128) -> np.ndarray:
-    """Film and ground in turn, each so wide."""
+    """Return stripes of film and ground in turn, each ``width_px`` wide."""
     return np.tile(np.arange(size_px) // width_px % 2, (size_px, 1))
 
 
 def film_width_px(distance_px: np.ndarray, count: int = 2) -> float:
-    """Mean width of so many stripes of film, in pixels of the layout."""
+    """Return the mean width of ``count`` stripes of film, in pixels of the layout."""
     return float(np.mean(distance_px > 0)) * distance_px.shape[1] / 4 / count
 
 
 @pytest.mark.parametrize("knobs", [PLAIN, FilmKnobs(diffusion_um=0.02), FilmKnobs(backscatter=0.3)])
-def test_half_the_dose_leaves_straight_edges_where_they_are(knobs: FilmKnobs) -> None:
-    # As much film as ground: the symmetry of both keeps the edge, to a quarter of a pixel.
+def test_a_threshold_of_half_the_dose_keeps_straight_edges_in_place(knobs: FilmKnobs) -> None:
+    # Film and ground take equal areas. This symmetry keeps the edges in place, to a quarter of a pixel.
     assert film_width_px(edge_distance_px(stripes(), BEAM, knobs)) == pytest.approx(32, abs=0.26)
 
 
-def test_a_bias_and_a_dose_move_edges_by_what_they_say() -> None:
+def test_a_bias_and_a_dose_move_edges_by_the_stated_amount() -> None:
     wide = edge_distance_px(stripes(), BEAM, FilmKnobs(etch_bias_um=0.008))
-    # Places are a quarter of a pixel apart, on each side.
+    # Each edge is known to a quarter of a pixel.
     assert film_width_px(wide) == pytest.approx(32 + 2 * 2, abs=0.51)
-    # A step blurred by 5 px is 0.5 / 1.2 of its height so far out: that quantile of a Gaussian.
+    # An edge blurred by a Gaussian of 5 px falls to 0.5 / 1.2 of its height at this distance: a Gaussian
+    # quantile.
     dosed = edge_distance_px(stripes(), BEAM, FilmKnobs(dose_error=0.2))
     assert film_width_px(dosed) == pytest.approx(32 + 2 * 5 * 0.2104, abs=0.51)
 
@@ -83,7 +84,8 @@ def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
     for scan in open_store(tmp_path / "films.zarr").scans():
         distance = np.load(tmp_path / "fab" / "truth" / f"{scan.id}.npy")
         share = (distance > 0).reshape(160, 4, 160, 4).mean(axis=(1, 3))
-        # The contour lies a fraction of a pixel off on the flank of its rim: where edges are, some percent.
+        # The contour lies on the flank of the rim, off by a fraction of a pixel. At edges this is some
+        # percent of the height.
         off = np.abs(scan.height_um / BEAM.film_um - share)[scan.usable]
         assert off.mean() < 0.05
         assert scan.usable.mean() > 0.8
@@ -96,13 +98,13 @@ def test_a_field_lies_alone_on_bare_ground(tmp_path: Path) -> None:
     assert not level[:12].any()
     assert level.any()
     wide = edge_distance_px(np.pad(level, 200), BEAM, knobs)[800:-800, 800:-800]
-    # Places are a quarter of a pixel apart; a wider canvas moves edges by no more than one.
+    # Edges are searched in steps of a quarter of a pixel. A wider canvas moves them by at most one step.
     assert np.abs(wide - np.load(tmp_path / "fab" / "truth" / "F00.npy")).max() < 0.3
-    # In a field that repeats itself more electrons come back, so more stays.
+    # If the field repeats itself, more electrons are scattered back, so more film stays.
     assert (edge_distance_px(level, BEAM, knobs) > 0).sum() > 1.05 * (wide > 0).sum()
 
 
-def test_knobs_that_there_are_not_are_refused() -> None:
+def test_unknown_knobs_are_refused() -> None:
     assert film_knobs(["backscatter=0.2"]).backscatter == 0.2
     for word, said in {"tilt=1": "tilt", "backscatter=much": "a number", "backscatter": "a number"}.items():
         with pytest.raises(InputError, match=said):

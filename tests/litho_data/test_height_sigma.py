@@ -1,4 +1,4 @@
-"""The uncertainty of a height: each part by its closed form, all of it on prints whose surface is known."""
+"""Test the uncertainty of a height: each part by its closed form, all parts on prints of known surface."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.litho_data.campaigns import layout_of
 
 
 def _print(seed: int, size: int) -> np.ndarray:
-    """A smooth print of half a micrometre, as finely resolved as a spot of 0.25 µm writes at 0.1 µm, µm."""
+    """Return a smooth print, rms 0.5 µm, as fine as a spot of 0.25 µm writes on a grid of 0.1 µm; in µm."""
     white = np.random.default_rng(seed).standard_normal((size, size))
     return 0.5 * gaussian_filter(white, 2.5) / gaussian_filter(white, 2.5).std()
 
@@ -43,25 +43,25 @@ def test_noise_of_pixels_and_lines_is_told_from_a_print(fast_axis):
         height[100:110, 30:60] = np.nan
         found.append(white_noise(height, fast_axis=fast_axis))
     pixel_nm, line_nm = np.mean(found, axis=0)
-    # Differences of order 8 of n values count as n / 3.63 of them (the sum of their squared correlations),
-    # and the median deviation has 0.37 of the efficiency: 0.7 % per scan of 240 x 240, and 14 % of 240
-    # lines; over six scans 0.3 % and 6 %, three times that allowed. The print leaves less than
-    # 1 % of the pixel noise.
+    # Eighth-order differences of n values count as n / 3.63 independent ones (the sum of their squared
+    # correlations), and the median deviation has an efficiency of 0.37. The standard error is 0.7 % per scan
+    # of 240 x 240 pixels and 14 % for 240 lines. Over six scans it is 0.3 % and 6 %; three times that is
+    # allowed. The print adds less than 1 % of the pixel noise.
     assert pixel_nm == pytest.approx(0.8, rel=0.02)
     assert line_nm == pytest.approx(3.0, rel=0.18)
 
 
-def test_where_gaps_leave_no_fine_differences_the_noise_is_not_known():
+def test_the_noise_is_unknown_where_gaps_leave_too_few_neighbouring_pixels():
     height = _print(0, 64)
     height[::5, ::5] = np.nan
     assert np.isnan(white_noise(height)[0])
 
 
 @pytest.mark.parametrize("frequency", [0.15, 0.3, 0.4])
-def test_the_loss_of_resampling_is_that_of_a_wave(frequency):
+def test_the_stated_loss_of_resampling_is_that_of_a_resampled_wave(frequency):
     x_px = np.arange(400)
     wave = np.broadcast_to(np.cos(2 * np.pi * frequency * x_px), (8, 400)).astype(np.float64)
-    # Scaled by 1 part in 350 about no pixel in particular: all sub-pixel positions occur alike.
+    # The scale differs by 1 part in 350, so that all sub-pixel positions are equally frequent.
     matrix = np.diag([1 + 1 / 350, 1.0, 1.0])
     out, valid = resample_to_layout(wave, matrix, (8, 380), scan_pitch_um=(0.1, 0.1), layout_pitch_um=0.1)
     at_px = (np.arange(380) + 0.5) / (1 + 1 / 350) - 0.5
@@ -73,7 +73,10 @@ def test_the_loss_of_resampling_is_that_of_a_wave(frequency):
 
 
 def test_an_uncertain_warp_moves_a_plane_by_its_slope():
-    """Shift (a, b along x, y), rotation (c) of a plane with slopes p, q: (pa)² + (qb)² + c²(qx − py)²."""
+    """A plane with slopes p, q is shifted by a, b along x, y and rotated by c.
+
+    The variance of its height is (pa)² + (qb)² + c²(qx − py)².
+    """
     shape, (a, b, c), (p, q) = (40, 60), (0.01, 0.02, 0.005), (0.3, -0.2)
     y, x = np.mgrid[:40, :60].astype(float)
     scale = normalisation(shape)[0, 0]
@@ -83,8 +86,8 @@ def test_an_uncertain_warp_moves_a_plane_by_its_slope():
     np.testing.assert_allclose(error.warp_variance(p * x + q * y), known, rtol=1e-9)
 
 
-def test_the_warp_is_as_uncertain_as_it_comes_out():
-    """One layout under independent errors, correlated over 4 px: the spread of the warps is as stated."""
+def test_the_spread_of_fitted_warps_equals_the_stated_uncertainty():
+    """Fit one layout under independent errors that are correlated over 4 px."""
     layout = layout_of(3, (256, 256))
     stated, moved = [], []
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
@@ -95,15 +98,15 @@ def test_the_warp_is_as_uncertain_as_it_comes_out():
         smooth, predicted = gaussian_filter(height, SCAN_BLUR_PX), predicted_topography(layout, 2.0)
         coefficients = solve_gram(aligned_gram(smooth, predicted, LADDER["affine"]).sum(axis=(0, 1)))
         moved.append(coefficients[NUISANCES:] / coefficients[0])
-    # 12 draws of 6 amounts: their squares over the mean of those stated have a mean of 1 ± 0.17 if right. 16
-    # blocks for 13 numbers may be off by a third besides.
+    # There are 12 draws of 6 amounts. If the stated variances are right, the mean of the squared amounts over
+    # their stated mean is 1 ± 0.17. The 16 blocks for 13 numbers may add an error of a third.
     ratio = np.sqrt(np.mean(np.square(moved), axis=0) / np.mean(stated, axis=0))
     assert 0.7 < np.sqrt((ratio**2).mean()) < 1.4
 
 
 @pytest.mark.parametrize(("size", "sees_the_border"), [(416, True), (256, False)])
-def test_a_border_that_pulls_the_magnification_is_part_of_its_error(size, sees_the_border):
-    """The outermost 32 px lie 0.1 px further out, on all sides alike, and nothing else is wrong."""
+def test_the_error_of_the_magnification_includes_the_pull_of_a_displaced_border(size, sees_the_border):
+    """The outermost 32 px are displaced outwards by 0.1 px on all sides. There is no other error."""
     layout = layout_of(3, (size, size))
     topography = predicted_topography(layout, 2.0)
     y, x = np.indices(topography.shape) - (size - 1) / 2
@@ -114,35 +117,39 @@ def test_a_border_that_pulls_the_magnification_is_part_of_its_error(size, sees_t
     height = topography - 0.1 * outwards
     found = solve_gram(aligned_gram(height, topography, LADDER["affine"]).sum(axis=(0, 1)))
     pull, stated = found[NUISANCES + 3] / found[0], warp_error(height, layout, 2.0, "affine").covariance[3, 3]
-    # The inner cells show no displacement but for the smoothing across their edge; the jackknife, which sees
-    # that blocks differ, states less than half of the pull.
+    # Apart from smoothing across their edge, the inner cells show no displacement. The jackknife sees that
+    # blocks differ, but states less than half of the pull.
     assert (stated**0.5 > 0.9 * abs(pull)) == sees_the_border
     assert stated**0.5 < 1.5 * abs(pull)
 
 
-def test_the_error_of_a_fit_is_taken_off_a_surface_or_added_to_what_was_levelled():
+def test_the_variance_of_a_fit_is_subtracted_from_a_seen_surface_and_added_to_a_levelled_one():
     assert WarpError(np.eye(6), 5.0, 3.0, True).surface_variance(levelled=False) == pytest.approx(16)
     assert WarpError(np.eye(6), 5.0, 3.0, False).surface_variance(levelled=True) == pytest.approx(34)
     assert WarpError(np.eye(6), 5.0, 3.0, False).surface_variance(levelled=False) == 0
     assert WarpError(np.eye(6), 3.0, 5.0, True).surface_variance(levelled=False) == 0
 
 
-def test_shapes_alone_scatter_the_share_of_pixels_within_a_known_surface():
-    """Tilt and bow of five equal terms, σ their exact size."""
+def test_random_tilt_and_bow_scatter_the_share_of_pixels_within_one_sigma():
+    """Each error surface is a random sum of five tilt and bow terms of equal rms. Its rms is taken as σ."""
     basis = quadratic_basis((48, 48))[1:].reshape(5, -1)
     basis = (basis - basis.mean(axis=1, keepdims=True)) / basis.std(axis=1, keepdims=True)
     surfaces = np.random.default_rng(0).standard_normal((6000, 5)) @ basis
     errors = np.abs(surfaces / surfaces.std(axis=1, keepdims=True))
     within_1, within_196 = ((errors < limit).mean(axis=1) for limit in (1.0, 1.96))
-    # One scan scatters by 0.048 and 0.012: the means of 6000 by 0.0006 and 0.0002, and the spread of 300
-    # sets of 20, 0.0107, by a twenty-fourth of itself; three times that, and what 48 pixels a side round.
+    # The shares of one scan scatter by 0.048 and 0.012, so the means of 6000 scatter by 0.0006 and 0.0002.
+    # The spread of 300 sets of 20, 0.0107, is known to one part in 24. Three times these errors are allowed,
+    # plus the rounding of 48 pixels a side.
     assert within_1.mean() == pytest.approx(0.696, abs=0.004)
     assert within_196.mean() == pytest.approx(0.946, abs=0.002)
     assert within_1.reshape(300, 20).mean(axis=1).std() == pytest.approx(0.0107, rel=0.13)
 
 
-def test_what_levelling_took_from_a_print_is_as_large_as_stated():
-    """Least squares takes the surface of topography and roughness; after it, only the first can be seen."""
+def test_the_surface_that_levelling_removes_from_a_print_is_as_large_as_stated():
+    """Least squares removes a surface from topography and roughness.
+
+    Afterwards only the topography is known.
+    """
     layout = layout_of(3, (256, 256))
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
     basis = quadratic_basis((256, 256)).reshape(6, -1)
@@ -153,25 +160,26 @@ def test_what_levelling_took_from_a_print_is_as_large_as_stated():
         surface = (np.linalg.lstsq(basis.T, height.ravel(), rcond=None)[0] @ basis).reshape(height.shape)
         stated.append(1e6 * warp_error(height - surface, layout, 2.0, "affine").surface_variance(True))
         taken.append(1e6 * surface.var())
-    # The topography's surface has 76 nm², and noise of 20 nm correlated over 16 pixels adds 30: of single
-    # scans 30 nm² too much or too little, in the mean of 12 so 9, three times that allowed. A jackknife of
-    # 16 blocks may besides be off by a third. Without the error of the fit 35 nm² are missing.
+    # The surface of the topography has a variance of 76 nm², and noise of 20 nm correlated over 16 pixels
+    # adds 30 nm². Single scans are off by 30 nm², the mean of 12 by 9 nm²; three times that is allowed. A
+    # jackknife of 16 blocks may also be off by a third. Without the error of the fit, 35 nm² would be
+    # missing.
     assert np.mean(stated) - np.mean(taken) == pytest.approx(0, abs=30)
 
 
-def test_what_is_printed_around_a_place_is_no_surface():
-    """A print that is higher where much is printed within 2 µm, without tilt or bow."""
+def test_a_height_that_depends_on_the_surroundings_is_not_taken_for_tilt_or_bow():
+    """The print is higher where much is printed within 2 µm. It has no tilt and no bow."""
     layout = layout_of(3, (256, 256))
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
     white = 0.005 * np.random.default_rng(0).standard_normal((256, 256))
     around = gaussian_filter(topography, 20.0, mode="nearest")
     found = warp_error(topography + 0.2 * around + white, layout, 2.0, "affine")
-    # A fit that does not know the surroundings takes them for a surface of 3.1 nm.
+    # A fit without the surroundings would report a surface of 3.1 nm.
     assert 1e3 * found.surface_rms < 1.5
     assert not found.is_clear
 
 
-def test_a_surface_beside_the_print_counts_only_if_it_is_clear_or_levelled():
+def test_an_error_surface_counts_only_if_it_is_significant_or_the_scan_was_levelled():
     layout = layout_of(2, (256, 256))
     x = np.linspace(-1, 1, 256)
     white = 0.02 * np.random.default_rng(0).standard_normal((256, 256))
@@ -189,7 +197,7 @@ def test_a_surface_beside_the_print_counts_only_if_it_is_clear_or_levelled():
 
 
 def test_errors_of_virtual_prints_are_as_large_as_stated(tmp_path):
-    """Stored heights minus the true surface, roughness included, minus the mean of that over the scan."""
+    """The error is the stored height minus the true rough surface, minus its mean over the scan."""
     card = simulate(tmp_path / "fab", count=3, size_px=192, seed=20271, knobs=["scan-line-stripes=8"])
     build_dataset(card, tmp_path / "prints.zarr", workers=1)
     ratios = []
@@ -198,8 +206,8 @@ def test_errors_of_virtual_prints_are_as_large_as_stated(tmp_path):
         error_um = (scan.height_um - surface_um)[scan.valid].astype(np.float64)
         ratios.append((error_um - error_um.mean()) / scan.height_sigma_um[scan.valid])
     pooled = np.concatenate(ratios)
-    # σ is 8 nm of lines: 3 x 200 rows give its square to 13 % if estimated as above, and the warp of a field
-    # of 19 µm is known by few features; together ± 15 % of the ratio.
+    # Most of σ is line noise of 8 nm. Its square is known to 13 % from 3 x 200 rows, estimated as above. Few
+    # features determine the warp of a field of 19 µm. Together the ratio may be off by 15 %.
     assert np.sqrt((pooled**2).mean()) == pytest.approx(1, abs=0.15)
     assert (np.abs(pooled) < 1).mean() == pytest.approx(0.683, abs=0.08)
     assert (np.abs(pooled) < 1.96).mean() == pytest.approx(0.95, abs=0.05)

@@ -1,4 +1,4 @@
-"""Layouts: the paper's equation, calibration patterns, statistics of sets, distance from a set."""
+"""Test layouts: the equation of the paper, calibration patterns, statistics of sets, distance from a set."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from litho_data.readers import read_layout
 
 class TestRandomLayout:
     @pytest.mark.parametrize("passband", ["square", "round"])
-    def test_it_is_the_equation(self, passband):
+    def test_a_random_layout_follows_the_equation(self, passband):
         shape, pitch_um, cutoff_per_um, levels = (48, 61), 0.1, 0.7, 13
         noise = np.random.default_rng(11).random(shape)
         fy, fx = np.meshgrid(np.fft.fftfreq(48, pitch_um), np.fft.fftfreq(61, pitch_um), indexing="ij")
@@ -60,7 +60,7 @@ class TestRandomLayout:
         # Rounding leaves (1e-16)² of the power.
         assert power[stopped].max() < 1e-25 * power[~stopped].max()
 
-    def test_seed_decides(self):
+    def test_the_seed_determines_the_layout(self):
         assert np.array_equal(random_layout((64, 64), seed=5), random_layout((64, 64), seed=5))
         assert not np.array_equal(random_layout((64, 64), seed=5), random_layout((64, 64), seed=6))
 
@@ -110,8 +110,9 @@ class TestRandomLayout:
         }
         assert level_distance(made["floor"], published) <= largest
         assert level_distance(made["round"], published) > largest
-        # The maximum of the field lies inside the cut with a probability of (512/540)² = 0.90: binomially,
-        # 11 of 16 or more in 99.6 % of all sets, and never more than one pixel.
+        # The maximum of the field lies inside the cut with a probability of (512/540)² = 0.90. By the
+        # binomial law, 11 or more of 16 layouts contain it in 99.6 % of all sets. It is never more than one
+        # pixel.
         highest = [int((level == 12).sum()) for level in published]
         assert set(highest) <= {0, 1}
         assert sum(highest) >= 11
@@ -125,8 +126,8 @@ class TestRandomLayout:
             power = np.abs(np.fft.fft2((level - level.mean()) * np.outer(*[np.hanning(512)] * 2))) ** 2
             frequency = np.abs(np.fft.fftfreq(512, 0.1))
             along_x = power.sum(axis=0)[frequency < 1]
-            # Hann leakage reaches 2 bins of 0.02 per µm beyond the edge; quantisation noise,
-            # 1/12 of a level's square against 2.5, is spread over all frequencies.
+            # The leakage of the Hann window reaches 2 bins of 0.02 per µm beyond the edge. The quantisation
+            # noise is spread over all frequencies; its variance is 1/12 of a squared level against 2.5.
             edge = frequency[frequency < 1]
             inside = along_x[edge < cutoff_per_um + 0.04].sum() / along_x.sum()
             below = along_x[edge < cutoff_per_um - 0.06].sum() / along_x.sum()
@@ -135,7 +136,7 @@ class TestRandomLayout:
 
 
 def level_distance(layouts: list[np.ndarray], others: list[np.ndarray]) -> float:
-    """Total-variation distance of the shares of the levels."""
+    """Return the total-variation distance between the shares of the levels."""
     shares = [np.bincount(np.ravel(each), minlength=13) / np.size(each) for each in (layouts, others)]
     return 0.5 * float(np.abs(shares[0] - shares[1]).sum())
 
@@ -151,7 +152,7 @@ class TestPatterns:
         frame = random_layout((100, 200), seed=3)
         layout = framed_ladder(frame, highest=12, tread_px=20)
         inner = layout[20:-20, 40:-40]
-        # 120 px hold six steps of 20 px: six levels from 0 to 12, evenly.
+        # 120 px hold six steps of 20 px, so six evenly spaced levels from 0 to 12.
         assert inner[0].tolist() == np.repeat([0, 2, 5, 7, 10, 12], 20).tolist()
         assert (inner == inner[0]).all()
         outside = np.ones(frame.shape, bool)
@@ -177,16 +178,16 @@ class TestPatterns:
         np.testing.assert_array_equal(star, np.rot90(star))
         y, x = np.indices(star.shape) - 100
         inside = np.hypot(y, x) <= 96
-        # A ragged edge of about one pixel on 8 radii of 96 pixels.
+        # The edges are uncertain by about one pixel along 8 radii of 96 pixels.
         assert star[inside].mean() == pytest.approx(0.5, abs=8 * 96 / inside.sum())
 
-    def test_pillars_and_pits_are_each_other_upside_down(self):
+    def test_pits_are_inverted_pillars(self):
         pillars = isolated_features((96, 96), widths_px=[1, 2, 4, 8], feature=12, ground=0)
         pits = isolated_features((96, 96), widths_px=[1, 2, 4, 8], feature=0, ground=12)
         np.testing.assert_array_equal(pillars, 12 - pits)
         assert (pillars > 0).sum() == 1 + 4 + 16 + 64
 
-    def test_what_does_not_fit_is_an_error(self):
+    def test_a_pattern_that_does_not_fit_its_field_is_an_error(self):
         with pytest.raises(InputError, match="step ladder"):
             step_ladder((4, 5), highest=12)
         with pytest.raises(InputError, match="isolated features"):
@@ -213,7 +214,7 @@ class TestStatistics:
         # Rounding to whole levels adds 1/12 to a variance of 18, 0.5 %.
         assert sum(near) > 0.985
 
-    def test_sets_survive_the_file(self, tmp_path):
+    def test_statistics_written_to_a_file_are_read_back_unchanged(self, tmp_path):
         found = layout_statistics([random_layout((64, 64), seed=0)], levels=13, pitch_um=0.1)
         found.write(tmp_path)
         assert LayoutStatistics.read(tmp_path) == found
@@ -249,7 +250,7 @@ class TestLayoutSets:
         table = read_table(card_path.parent / "scans.csv")
         assert [float(row["dose"]) for row in table.values()] == pytest.approx([0.7, 0.85, 1.0, 1.15, 1.3])
 
-    def test_same_levels_same_bytes(self, tmp_path):
+    def test_equal_levels_are_written_as_equal_bytes(self, tmp_path):
         first, second = (
             write_layout(tmp_path / name, "R1", random_layout((64, 64), seed=4)) for name in "ab"
         )
@@ -261,5 +262,5 @@ class TestLayoutSets:
         assert not list(tmp_path.iterdir())
 
 
-def test_doses_of_a_matrix_are_even_about_that_of_the_recipe():
+def test_doses_of_a_matrix_are_evenly_spaced_about_the_nominal_dose():
     np.testing.assert_allclose(relative_doses(7), [0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3])

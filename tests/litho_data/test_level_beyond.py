@@ -1,4 +1,4 @@
-"""Levelling beyond Gwyddion: robust, layout-aware, mask-and-relevel, scars."""
+"""Test the levelling that Gwyddion does not have: robust, layout-aware, mask-and-relevel, scars."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ NOISE_UM = 0.01
 
 
 def slopes(surface: np.ndarray) -> tuple[float, float]:
-    """(x, y) mean slope per pixel."""
+    """Return the mean slope (x, y) per pixel."""
     return float(np.diff(surface, axis=1).mean()), float(np.diff(surface, axis=0).mean())
 
 
 def tilted_substrate(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Noise on a tilt of (0.002, -0.001) µm per pixel, and the tilt."""
+    """Return noise on a tilt of (0.002, -0.001) µm per pixel, and the tilt."""
     ny, nx = SHAPE
     tilt = 0.002 * np.arange(nx)[None, :] - 0.001 * np.arange(ny)[:, None]
     return tilt + NOISE_UM * np.random.default_rng(seed).normal(size=SHAPE), tilt
@@ -42,8 +42,8 @@ def slope_error(removed: np.ndarray, tilt: np.ndarray) -> float:
     return float(np.abs(np.subtract(slopes(removed), slopes(tilt))).max())
 
 
-# Standard error of a least-squares slope over n pixels spread evenly along N: sigma sqrt(12 / n) / N. Four of
-# them, doubled for the pixels and the efficiency that robust fits give away.
+# The standard error of a least-squares slope over n pixels spread evenly along N is sigma sqrt(12 / n) / N.
+# Four of them are allowed, doubled for masked pixels and the lower efficiency of robust fits.
 SLOPE_TOLERANCE = 2 * 4 * NOISE_UM * np.sqrt(12 / (SHAPE[0] * SHAPE[1])) / SHAPE[0]
 
 
@@ -52,7 +52,7 @@ def test_robust_plane_ignores_a_printed_block() -> None:
     z[20:100, 90:150] += 1.0
     levelled = level_robust(z)
     assert slope_error(levelled.removed, tilt) < SLOPE_TOLERANCE
-    # The main surface comes to lie at zero, to the error of a mean over half the pixels.
+    # The main surface is set to zero, within the error of a mean over half the pixels.
     bare = levelled.height[:, :80]
     assert abs(np.median(bare)) < 5 * NOISE_UM / np.sqrt(bare.size)
     # Least squares follows the block.
@@ -62,7 +62,8 @@ def test_robust_plane_ignores_a_printed_block() -> None:
 def test_robust_agrees_with_least_squares_on_gaussian_noise() -> None:
     z, tilt = tilted_substrate(1)
     robust, plain = level_robust(z).removed, level_polynomial(z, total_degree=1).removed
-    # Both are unbiased with nearly the same variance, so they differ by a fraction of the standard error.
+    # Both fits are unbiased with nearly the same variance, so they differ by a fraction of the standard
+    # error.
     assert slope_error(robust, plain) < SLOPE_TOLERANCE / 4
     assert slope_error(robust, tilt) < SLOPE_TOLERANCE
 
@@ -82,7 +83,7 @@ def test_mask_and_relevel_finds_features_and_slope() -> None:
     z[features] += 0.2
     levelled, mask = mask_and_relevel(z, grow_px=1)
     assert mask[features].all()
-    # Three sigmas leave 0.27 % of the noise outside, and each marked pixel grows to five.
+    # 0.27 % of the noise lies beyond three sigmas, and each marked pixel grows to five.
     assert mask[~ndimage.binary_dilation(features)].mean() < 2 * 5 * 0.0027
     assert slope_error(levelled.removed, tilt) < SLOPE_TOLERANCE
 
@@ -109,7 +110,7 @@ def test_features_are_marked_on_the_asked_side(side: str) -> None:
 
 
 def printed(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A layout whose level rises to the right on the whole, and its blurred print (µm)."""
+    """Return a layout whose level rises to the right on average, and its blurred print, µm."""
     rng = np.random.default_rng(seed)
     level = ndimage.gaussian_filter(rng.normal(size=SHAPE), 4)
     level = 6 + 3 * level / level.std() + np.linspace(-3, 3, SHAPE[1])[None, :]
@@ -122,16 +123,16 @@ def test_layout_aware_levelling_leaves_the_structure_its_own_slope() -> None:
     noise, tilt = tilted_substrate(6)
     z = noise + structure
     aware = level_layout_aware(z, layout_level=level, blur_px=2.0)
-    # The response is piecewise linear in the blurred level as the print is, so nothing but noise is left;
-    # sharing it with the response costs less than half of the precision.
+    # Like the print, the response is piecewise linear in the blurred level, so only noise is left. Fitting it
+    # together with the tilt costs less than half of the precision.
     assert slope_error(aware.removed, tilt) < SLOPE_TOLERANCE
-    # A plane takes the slope of the structure, 0.6 µm across the field, for tilt.
+    # A plane fit takes the slope of the structure, 0.6 µm across the field, for tilt.
     assert slope_error(level_plane(z).removed, tilt) > 100 * slope_error(aware.removed, tilt)
-    # The datum stays with the data.
+    # The mean height does not change.
     assert aware.height.mean() == pytest.approx(z.mean(), abs=1e-12)
 
 
-def test_layout_aware_levelling_bears_a_response_that_is_not_linear() -> None:
+def test_layout_aware_levelling_works_for_a_response_that_is_not_linear() -> None:
     level, _ = printed(7)
     noise, tilt = tilted_substrate(8)
     response = np.sqrt(np.arange(13)) + 0.3 * (np.arange(13) > 7)
@@ -149,7 +150,7 @@ def test_layout_aware_levelling_with_gaps_and_mask() -> None:
     z[dirt] += 5.0
     level[:10] = np.nan
     aware = level_layout_aware(z, layout_level=level, blur_px=2.0, mask=dirt)
-    # Blurring next to the unknown rows is not that of the print: its few rows add some nm.
+    # Next to the unknown rows the blurred layout differs from the print. These few rows add some nm.
     assert slope_error(aware.removed, tilt) < 2 * SLOPE_TOLERANCE
     assert np.isfinite(aware.removed).all()
 
@@ -166,7 +167,7 @@ def test_a_layout_that_is_a_ramp_cannot_be_told_from_tilt() -> None:
 
 def test_layout_in_scan_frame_follows_the_transform() -> None:
     layout = np.arange(6 * 4, dtype=np.uint8).reshape(6, 4)
-    # Scan pixels of half the size, shifted by one layout pixel to the right and two down.
+    # The scan pixels have half the size. They are shifted by one layout pixel to the right and two down.
     shift = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     level = layout_in_scan_frame(layout, shift, (8, 8), (0.05, 0.05), 0.1)
     expected = np.full((8, 8), np.nan)
@@ -175,11 +176,12 @@ def test_layout_in_scan_frame_follows_the_transform() -> None:
 
 
 @pytest.mark.measured
-def test_planted_tilt_on_a_measured_print_comes_back(measured_prints: Path) -> None:
-    """A tilt laid over a real print is separated from the print, whatever the print's own response is."""
+def test_a_tilt_added_to_a_measured_print_is_recovered(measured_prints: Path) -> None:
+    """A tilt added to a measured print is separated from it, whatever the response of the print is."""
     scan = read_scan(measured_prints / "afm_ug" / "FOV61.txt", unit="m", size_um=(54, 54))
     layout = read_layout(measured_prints / "mask_ug" / "FOV61.tif")
-    # Native pitch and centred margin of 14 px, good to a few pixels: enough for a blurred response.
+    # The registration assumes the nominal pitch and a centred margin of 14 px. It is good to a few pixels,
+    # enough for a blurred response.
     shift = np.array([[1.0, 0.0, -1.4], [0.0, 1.0, -1.4], [0.0, 0.0, 1.0]])
     level = layout_in_scan_frame(layout, shift, scan.shape, scan.require_pitch(), 0.1)
     before = level_layout_aware(scan.height_um, layout_level=level).removed
@@ -190,7 +192,7 @@ def test_planted_tilt_on_a_measured_print_comes_back(measured_prints: Path) -> N
 
 
 def scarred(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A smooth surface, the same with scars, and where they are."""
+    """Return a smooth surface, the same surface with scars, and the mask of the scars."""
     y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in SHAPE), indexing="ij")
     smooth = 0.2 * np.sin(x) * np.cos(y)
     scars = np.zeros(SHAPE, dtype=bool)
@@ -210,7 +212,8 @@ def test_scars_are_found_and_filled() -> None:
     np.testing.assert_array_equal(mark_scars(spoiled, sign="positive"), single)
     filled = remove_scars(spoiled, scars=found)
     np.testing.assert_array_equal(filled.removed[~found], 0.0)
-    # Across three rows the surface bends by less than 0.2 (3/120)² 2² / 2, on top of the noise at both sides.
+    # Across three rows the surface bends by less than 0.2 (3/120)² 2² / 2. The noise at both sides adds to
+    # this.
     np.testing.assert_allclose(filled.height[scars], smooth[scars], rtol=0, atol=0.0025)
 
 
@@ -225,7 +228,7 @@ def test_scars_shorter_or_wider_than_asked_stay() -> None:
 
 
 def test_filling_is_harmonic() -> None:
-    """A linear surface solves Laplace's equation, so it comes back whatever stood under the marks."""
+    """A linear surface solves Laplace's equation, so it is restored whatever the marked pixels held."""
     z = 0.1 * np.arange(30)[:, None] + 0.2 * np.arange(40)[None, :]
     marks = np.zeros(z.shape, dtype=bool)
     marks[5:12, 6:30] = marks[20, 20] = True

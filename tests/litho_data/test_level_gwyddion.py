@@ -1,4 +1,4 @@
-"""Agreement with fields that Gwyddion 2.62 levelled; deviations that we make on purpose are pinned too."""
+"""Levelling agrees with fields that Gwyddion 2.62 levelled. Intended deviations are tested too."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SAMPLED = {
 
 
 def _vectors() -> list[dict[str, Any]]:
-    """All entries of the index; none where the reference fields are absent."""
+    """Return all entries of the index, or none where the reference fields are absent."""
     index = Path(os.environ.get("LITHO_ORACLE_DIR", "")) / "gwyddion" / "index.json"
     return json.loads(index.read_text()) if index.is_file() else []
 
@@ -77,7 +77,7 @@ def _inputs(oracles: Path, entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarra
 
 
 def _field(oracles: Path, name: str) -> tuple[np.ndarray, np.ndarray, tuple]:
-    """Heights in µm, mask and pitch (y, x) in µm."""
+    """Return heights in µm, mask and pitch (y, x) in µm."""
     field = np.load(oracles / "gwyddion" / name)
     ny, nx = field["z"].shape
     pitch_um = (float(field["yreal"]) * 1e6 / ny, float(field["xreal"]) * 1e6 / nx)
@@ -88,15 +88,15 @@ def _field(oracles: Path, name: str) -> tuple[np.ndarray, np.ndarray, tuple]:
 def test_vector(oracles: Path, entry: dict[str, Any]) -> None:
     height_um, mask, pitch_um, expected_um = _inputs(oracles, entry)
     levelled = _level(entry, height_um, mask, pitch_um)
-    # Rounding of another order of summation; normal equations of a polynomial lose two digits more.
+    # Another order of summation rounds differently. Normal equations of a polynomial lose two more digits.
     polynomial = entry["method"].startswith(("polylevel", "rows_poly"))
     tolerance = (1e-10 if polynomial else 1e-12) * np.ptp(height_um)
     np.testing.assert_allclose(levelled.height + levelled.removed, height_um, rtol=0, atol=1e-15)
     if "note" not in entry:
         np.testing.assert_allclose(levelled.height, expected_um, rtol=0, atol=tolerance)
         return
-    # Gwyddion's mask test selects nothing here and it returns its input. Ours takes the mask at its
-    # word, so the same mask inverted and excluded gives the same answer, and rows do move.
+    # Gwyddion's mask test selects no pixel here, so it returns its input. Our code includes the pixels of the
+    # mask. Excluding the inverted mask therefore gives the same result, and rows do move.
     np.testing.assert_allclose(expected_um, height_um, rtol=0, atol=tolerance)
     mirrored = _level(entry | {"masking": "exclude"}, height_um, ~mask, pitch_um)
     np.testing.assert_array_equal(levelled.height, mirrored.height)
@@ -118,7 +118,7 @@ def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> No
 def test_sampled_rows_of_a_measured_scan(
     oracles: Path, measured_prints: Path, tmp_path: Path, name: str, factor: str
 ) -> None:
-    """From the file in metres, and from the same digits written in micrometres."""
+    """Level the file in metres, and the same digits written in micrometres."""
     path = measured_prints / "afm_ug" / "FOV11.txt"
     if factor == "e6":
         scan = read_scan(path, unit="m", size_um=(54, 54))
@@ -140,7 +140,7 @@ def _compare_samples(
     np.testing.assert_allclose(got[::27, ::27], expected_um, rtol=0, atol=tolerance)
 
 
-def test_all_vectors_are_there(oracles: Path) -> None:
+def test_all_reference_fields_are_present(oracles: Path) -> None:
     entries = _vectors()
     assert len(entries) == 55
     assert sum("note" in entry for entry in entries) == 2

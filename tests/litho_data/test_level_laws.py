@@ -32,7 +32,7 @@ SHAPES = st.tuples(st.integers(8, 24), st.integers(8, 24))
 SLOPES = st.floats(-0.1, 0.1, allow_subnormal=False)
 SEEDS = st.integers(0, 2**32 - 1)
 ROW_METHODS = get_args(RowMethod)
-# Cumulative and least-squares steps over a few hundred pixels keep this share of the range.
+# Cumulative sums and least squares over a few hundred pixels are exact to this share of the range.
 ROUNDING = 1e-11
 
 WHOLE_SURFACE = {
@@ -58,7 +58,7 @@ def ramp(shape: tuple[int, int], constant: float, slope_x: float, slope_y: float
 
 
 def rough(shape: tuple[int, int], seed: int) -> np.ndarray:
-    """A smooth surface with noise, about 1 µm high."""
+    """Return a smooth surface with noise, about 1 µm high."""
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     a = rng.normal(size=6)
@@ -85,7 +85,7 @@ def test_a_plane_is_removed_in_closed_form(
 @pytest.mark.parametrize(("slope_x", "slope_y"), [(0.02, -0.03), (0.0, 0.1), (0.0, 0.0)])
 def test_the_facet_of_a_plane_is_the_plane(slope_x: float, slope_y: float) -> None:
     z = ramp((20, 30), 0.3, slope_x * PITCH_UM[1], slope_y * PITCH_UM[0])
-    # Iteration stops once a step is below sqrt(1e-9) in slope, over 30 pixels of 0.1 µm.
+    # The iteration stops at a step below sqrt(1e-9) in slope, here over 30 pixels of 0.1 µm.
     assert np.ptp(level_facet(z, pitch_um=PITCH_UM).height) < 1e-4 * 3
 
 
@@ -96,11 +96,11 @@ def test_four_cells_are_enough_for_a_facet_and_three_are_not() -> None:
         level_facet(z[:2, [0, 1, 2, 2]], pitch_um=PITCH_UM)
 
 
-def test_facets_see_terraces_and_not_their_steps() -> None:
+def test_facet_levelling_follows_terraces_and_ignores_their_steps() -> None:
     terraces = 0.1 * np.repeat(np.arange(6), 10)[None, :] + np.zeros((40, 1))
     tilted = terraces + ramp(terraces.shape, 0.0, 0.02 * PITCH_UM[1], -0.05 * PITCH_UM[0])
     once = level_facet(tilted, pitch_um=PITCH_UM)
-    # Slopes are found to sqrt(1e-9); the least-squares plane would take the staircase for a slope.
+    # Slopes are found to sqrt(1e-9). A least-squares plane would take the staircase for a slope.
     atol = np.sqrt(1e-9) * (60 * PITCH_UM[1] + 40 * PITCH_UM[0])
     np.testing.assert_allclose(once.height - once.height[0, 0], terraces, rtol=0, atol=atol)
     np.testing.assert_allclose(
@@ -120,7 +120,7 @@ def test_a_polynomial_is_removed_whatever_its_coefficients(seed: int, degrees: t
     mask = rng.random(z.shape) < 0.3
     for masking in ("ignore", "exclude", "include"):
         levelled = level_polynomial(z, x_degree=degrees[0], y_degree=degrees[1], mask=mask, masking=masking)
-        # The fit through 30 % of the pixels has a condition of up to 1e4 on top of rounding.
+        # The fit through 30 % of the pixels has a condition number of up to 1e4, which multiplies rounding.
         np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=1e-10 * max(1, np.abs(z).max()))
 
 
@@ -128,28 +128,30 @@ TWICE = [
     (name, masking)
     for name in ALL
     for masking in ("ignore", "exclude", "include")
-    # Facets converge on facetted surfaces only; under a mask the weights of matching do not add up to one.
+    # Facet levelling converges only on surfaces with facets. Under a mask the weights of matching do not add
+    # up to one.
     if "facet" not in name and (name != "rows-matching" or masking == "ignore")
 ]
 
 
 @pytest.mark.parametrize(("name", "masking"), TWICE)
-def test_levelling_twice_is_levelling_once(name: str, masking: str) -> None:
-    # Wide enough that any two rows share more than the fewest pixels that count.
+def test_levelling_a_second_time_changes_nothing(name: str, masking: str) -> None:
+    # The field is so wide that any two rows share more than the minimum number of pixels.
     z = rough((24, 96), 1)
     mask = np.random.default_rng(2).random(z.shape) < 0.5
     once = ALL[name](z, mask=mask, masking=masking).height
     difference = ALL[name](once, mask=mask, masking=masking).height - once
     if name == "rows-polynomial":
-        # The mean that it adds back ignores the mask, so the datum moves each time.
+        # This method adds back a mean that ignores the mask, so the mean height changes each time.
         difference -= difference.mean()
-    # The robust fits stop at 1e-7 noise sigmas of 0.1 µm; marks at a threshold may flip on rounding.
+    # The robust fits stop at 1e-7 of a noise sigma of 0.1 µm. Marks near the threshold may change by
+    # rounding.
     atol = {"robust": 1e-7, "mask-and-relevel": 1e-2}.get(name, ROUNDING)
     np.testing.assert_allclose(difference, 0.0, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("name", list(ALL))
-def test_the_removed_surface_is_what_is_missing(name: str) -> None:
+def test_levelled_and_removed_surface_add_up_to_the_input(name: str) -> None:
     z = rough((20, 28), 3)
     mask = z > np.quantile(z, 0.8)
     levelled = ALL[name](z, mask=mask)
@@ -174,7 +176,7 @@ def test_facets_of_the_transpose() -> None:
 
 
 @pytest.mark.parametrize("method", ROW_METHODS)
-def test_vertical_is_the_transpose(method: str) -> None:
+def test_vertical_alignment_is_horizontal_alignment_of_the_transpose(method: str) -> None:
     z = rough((18, 26), 5)
     mask = z > np.quantile(z, 0.6)
     kwargs = {"method": method, "mask": mask}
@@ -189,10 +191,12 @@ def test_vertical_is_the_transpose(method: str) -> None:
 @pytest.mark.parametrize(
     "name", [name for name in ALL if name not in ("rows-matching", "facet", "rows-facet-tilt")]
 )
-def test_units_and_datum_pass_through(name: str, seed: int, scale: float, offset: float) -> None:
+def test_levelling_commutes_with_a_change_of_unit_and_datum(
+    name: str, seed: int, scale: float, offset: float
+) -> None:
     """level(a z + b) = a level(z) + what the operation does to a constant."""
     z = rough((16, 20), seed)
-    # Rows without any pixel would follow Gwyddion's rule for them, which depends on the datum.
+    # Every row keeps some pixels: rows without any follow Gwyddion's rule, which depends on the datum.
     mask = np.random.default_rng(seed).random(z.shape) < 0.25
     operate = ALL[name]
     expected = scale * operate(z, mask=mask).height
@@ -215,12 +219,12 @@ def test_adding_a_plane_changes_at_most_a_constant(name: str) -> None:
 @pytest.mark.parametrize("name", list(ALL))
 @pytest.mark.parametrize("masking", ["exclude", "include"])
 def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
-    """Anything may stand in the pixels that are left out; only polynomials per row put them into a mean."""
+    """Pixels that are left out may have any value. Only polynomials per row include them in a mean."""
     z = rough((20, 30), 7)
     rng = np.random.default_rng(8)
     left_out = rng.random(z.shape) < 0.2
     if (name, masking) == ("rows-matching", "include"):
-        left_out[:, -1] = False  # Gwyddion does not ask this column's mask
+        left_out[:, -1] = False  # Gwyddion ignores the mask in this column
     mask = left_out if masking == "exclude" else ~left_out
     spoiled = np.where(left_out, 50.0 * rng.normal(size=z.shape), z)
     before = ALL[name](z, mask=mask, masking=masking).removed
@@ -229,13 +233,13 @@ def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
     if name == "rows-polynomial":
         difference -= difference.mean()
     if name == "rows-matching":
-        # Its weights are scaled by the bends beside a masked pixel too, as in Gwyddion.
+        # As in Gwyddion, the curvature beside a masked pixel scales the weights too.
         assert np.abs(difference).max() < 1e-3
     else:
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
 
 
-def test_matching_asks_an_inclusion_mask_in_all_columns_but_the_last() -> None:
+def test_matching_ignores_an_inclusion_mask_in_the_last_column_only() -> None:
     z = rough((20, 30), 7)
     chosen = np.random.default_rng(8).random(z.shape) < 0.8
     other = chosen.copy()
@@ -248,8 +252,11 @@ def test_matching_asks_an_inclusion_mask_in_all_columns_but_the_last() -> None:
     assert np.abs(excluded[0] - excluded[1]).max() > 1e-6
 
 
-def test_the_unit_of_a_file_does_not_move_a_modus() -> None:
-    """Five digits make many equally short windows; the unit in which they were written must not choose."""
+def test_the_modus_of_a_row_does_not_depend_on_the_unit_of_the_file() -> None:
+    """Values of five digits have many equally short windows.
+
+    The unit of the file must not affect the choice.
+    """
     digits = np.random.default_rng(3).integers(10000, 99999, (40, 300))
     from_metres = np.array([[float(f"{n}e-11") for n in row] for row in digits]) * 1e6
     from_um = np.array([[float(f"{n}e-5") for n in row] for row in digits])
@@ -260,11 +267,11 @@ def test_the_unit_of_a_file_does_not_move_a_modus() -> None:
 
 @pytest.mark.parametrize("slope", [0.02, -0.3])
 def test_facet_tilt_levels_rows_whose_facets_are_flat(slope: float) -> None:
-    """Terraces on a tilted row: most slopes are the tilt's, and it goes; the steps stay."""
+    """Most slopes of terraces on a tilted row are the tilt, which is removed. The steps stay."""
     terraces = np.repeat(np.cumsum(np.random.default_rng(2).choice([-1.0, 1.0], (6, 12)), axis=1), 25, axis=1)
     row = (np.arange(300) - 149.5) * slope * PITCH_UM[1]
     levelled = align_rows(terraces + row, method="facet-tilt", pitch_um=PITCH_UM)
-    # The passes end when the slope changes by less than 1e-6.
+    # The iteration ends when the slope changes by less than 1e-6.
     np.testing.assert_allclose(levelled.height, terraces, rtol=0, atol=1e-4)
 
 
@@ -279,14 +286,14 @@ def test_missing_pixels_are_left_out_and_stay_missing(name: str) -> None:
     masked = ALL[name](z, mask=missing)
     difference = levelled.removed - masked.removed
     if name == "rows-polynomial":
-        difference -= difference.mean()  # the mean that it adds back is that of all measured pixels
+        difference -= difference.mean()  # this method adds back the mean of all measured pixels
     if name != "rows-matching":
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("method", [name for name in ROW_METHODS if name not in ("facet-tilt", "modus")])
 def test_row_offsets_are_recovered(method: str) -> None:
-    """Offsets of single rows go, whatever each method keeps of the surface."""
+    """Offsets of single rows are removed, whatever each method keeps of the surface."""
     rng = np.random.default_rng(11)
     offsets = rng.normal(size=40)
     offsets -= np.polynomial.Polynomial.fit(np.arange(40), offsets, 1)(np.arange(40))
@@ -349,13 +356,16 @@ def test_what_cannot_be_levelled_is_refused(operate, message: str) -> None:
 @pytest.mark.parametrize("method", ["median", "median-of-differences", "trimmed-mean", "matching"])
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_row_alignment_warns_where_a_block_moves_lines(method: str, direction: str) -> None:
-    """A block over 55 % of each line that it crosses moves the lines, and 45 % of their pixels stay."""
+    """A block covers 55 % of some lines.
+
+    Row alignment shifts these lines, but 45 % of their pixels are right.
+    """
     rng = np.random.default_rng(0)
     offsets = 0.05 * rng.standard_normal((128, 1))
     z = 0.003 * rng.standard_normal((128, 128)) + offsets
     recipe = Recipe.from_dict({"step": [{"op": "align-rows", "method": method, "direction": direction}]})
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # offsets of whole lines, large as they are, are what it is for
+        warnings.simplefilter("error")  # large offsets of whole lines cause no warning
         recipe.apply(z if direction == "horizontal" else z.T)
     z[30:90, 20:90] += 0.8
     with pytest.warns(

@@ -1,4 +1,4 @@
-"""Recipes: what is written is what is done, and nothing else is accepted."""
+"""A recipe does exactly what it states, and nothing else is accepted."""
 
 from __future__ import annotations
 
@@ -125,20 +125,23 @@ def test_a_recipe_without_steps_changes_nothing() -> None:
         ('name = "a file that was cut"', "no step, wanted at least one"),
     ],
 )
-def test_what_is_no_recipe_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_that_is_not_a_recipe_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         chain(tmp_path, text)
 
 
-def test_a_missing_recipe_and_a_missing_layout(tmp_path: Path) -> None:
+def test_a_missing_recipe_and_a_missing_layout_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read recipe"):
         Recipe.from_toml(tmp_path / "none.toml")
     with pytest.raises(InputError, match=r"step 1 \(layout-aware\): the layout"):
         chain(tmp_path, '[[step]]\nop = "layout-aware"').apply(surface())
 
 
-def test_the_page_says_of_every_operation_whether_another_program_has_levelled_with_it() -> None:
-    """Names of the page's first column; where Gwyddion is followed, one of the two cells below has them."""
+def test_the_page_states_which_operations_were_tested_against_gwyddion() -> None:
+    """The first column names all operations.
+
+    Those that follow Gwyddion are also in one of two cells below.
+    """
     page = (Path(__file__).parents[2] / "docs" / "levelling.md").read_text(encoding="utf-8")
     lines = [line for line in page.splitlines() if line.startswith("|")]
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]

@@ -1,4 +1,4 @@
-"""Files are paired by id; what does not pair is listed, what tries to leave the folder is refused."""
+"""Files are paired by id. Unpaired files are listed, and paths that leave the folder are refused."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
 
 
 def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_path: Path) -> None:
-    """A place that nobody stated would be taken for one in the order of writing."""
+    """A scan without an order would otherwise be taken to stand at some place in the order of writing."""
     card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
     (tmp_path / "scans.csv").write_text("id,order\nP12,4\n", encoding="utf-8")
     listing = list_fields(card)
     assert [(one.id, one.order) for one in listing.fields] == [("P12", 4)]
     assert listing.refused == {"P11": "not in scans.csv, which gives the order"}
-    # Without an order in the table no scan has one, and all are kept in the order of their ids.
+    # If the table has no orders, no scan has an order, and all are kept, sorted by id.
     (tmp_path / "scans.csv").write_text("id,dose\nP12,1.5\n", encoding="utf-8")
     assert [(one.id, one.order) for one in list_fields(card).fields] == [("P11", 0), ("P12", 1)]
 
@@ -130,13 +130,13 @@ def test_the_data_folder_is_searched(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(list_fields(card, data_dir=tmp_path / "data" / "test-prints").fields) == 2
 
 
-def test_no_pair_at_all(tmp_path: Path) -> None:
+def test_a_folder_without_any_pair_is_refused(tmp_path: Path) -> None:
     card = folder_with(tmp_path, ["layouts/P11.tif", "scans/P12.txt"])
     with pytest.raises(InputError, match=r"no field to build.*P11: no file scans/P11\.txt"):
         list_fields(card)
 
 
-def test_an_expression_that_never_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_expression_that_takes_too_long_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listing, "_LONGEST_S", 0.5)
     with pytest.raises(InputError, match="nested repetitions"):
         listing.prints_of(["a" * 40], "(?P<print>(a+)+)b")
@@ -190,7 +190,7 @@ def test_a_table_as_spreadsheets_of_any_language_write_it(tmp_path: Path, separa
     [("unit\nP11,V", "unit, got 'V'"), ("size_um\nP11,0", "size_um"), ("format\nP11,xls", "format"),
      ("fast_axis\nP11,z", "fast_axis"), ("surround\nP11,air", "surround")],
 )  # fmt: skip
-def test_what_a_table_says_of_a_file_is_checked(tmp_path: Path, cell: str, message: str) -> None:
+def test_the_entries_of_a_table_about_a_file_are_checked(tmp_path: Path, cell: str, message: str) -> None:
     card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
     (tmp_path / "scans.csv").write_text(f"id,{cell}\n")
     with pytest.raises(InputError, match=message):

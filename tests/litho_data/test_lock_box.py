@@ -1,4 +1,4 @@
-"""The lock box: a sixth of the scans, from different prints, the same wherever it is asked for."""
+"""The lock box holds a sixth of the scans, from different prints, and is the same in every call."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ MEASURED_IDS = [f"FOV{print_}{field}" for print_ in (1, 2, 3, 4, 6, 7) for field
 PRINTS = [scan_id[3] for scan_id in MEASURED_IDS]
 
 
-def test_it_takes_scans_from_different_prints():
+def test_a_lock_box_takes_scans_from_different_prints():
     locked = lock_box(MEASURED_IDS, PRINTS)
     assert len(locked) == 4
     assert len({scan_id[3] for scan_id in locked}) == 4
 
 
 @pytest.mark.parametrize(("scans", "wanted"), [(1, 0), (2, 0), (3, 1), (8, 1), (24, 4)])
-def test_it_is_a_sixth_of_the_scans(scans, wanted):
+def test_a_lock_box_is_a_sixth_of_the_scans(scans, wanted):
     assert len(lock_box(MEASURED_IDS[:scans], PRINTS[:scans])) == wanted
 
 
-def test_the_recorded_one_of_the_measured_prints_is_the_one_that_is_computed():
+def test_the_recorded_lock_box_of_the_measured_prints_is_the_computed_one():
     record = Path(__file__).parents[2] / "datasets" / "neural-lithography.split.toml"
     stated = tomllib.loads(record.read_text(encoding="utf-8"))["lock_box"]
     locked = lock_box(MEASURED_IDS, PRINTS)
@@ -39,12 +39,12 @@ def test_the_order_of_the_scans_does_not_matter():
 
 
 @pytest.mark.parametrize(("ids", "prints"), [(["a", "b"], ["1"]), (["a", "a"], ["1", "2"])])
-def test_an_impossible_one_is_refused(ids, prints):
+def test_an_impossible_lock_box_is_refused(ids, prints):
     with pytest.raises(InputError):
         lock_box(ids, prints)
 
 
-def test_a_store_draws_it_from_all_its_scans(campaign: Path):
+def test_a_store_draws_its_lock_box_from_all_its_scans(campaign: Path):
     store = open_store(campaign / "prints.zarr")
     assert store.locked_ids == locked_ids(store.scans())
     assert len(store.locked_ids) == 1

@@ -1,4 +1,4 @@
-"""Electron micrographs: edges to a fraction of a pixel, whatever rims, charging and dirt do."""
+"""Edges in electron micrographs are found to a fraction of a pixel despite rims, charging and dirt."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _from_centre(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _micrograph(distance_px: np.ndarray, charging: float = 0.2) -> np.ndarray:
-    """What a microscope makes of a film: a flank one pixel wide, a rim, charging along x, noise."""
+    """Return the micrograph of a film: a flank one pixel wide, a bright rim, charging along x, and noise."""
     film = 1 / (1 + np.exp(-distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(distance_px, 0) / 12))
     grey *= 1 + charging * np.linspace(-1, 1, distance_px.shape[1])
@@ -56,7 +56,8 @@ def test_rim_and_charging_do_not_move_an_edge() -> None:
     found = find_edges(_micrograph(distance)).distance_px
     near = np.abs(distance) < 4
     off = (found - distance)[near]
-    # Noise 3 on a flank of 110 in 2 px, smoothed: 0.03 px; a rim of 1.6 times the film: 0.3 px.
+    # Noise of 3 on a flank of 110 in 2 px, smoothed, moves an edge by 0.03 px. A rim of 1.6 times the film
+    # moves it by 0.3 px.
     assert off.std() < 0.06
     assert abs(off.mean()) < 0.3
 
@@ -65,11 +66,12 @@ def test_coverage_keeps_the_area_of_a_disc_at_any_pitch() -> None:
     distance = _from_centre((201, 201))
     for every in (1, 2, 4):
         share = coverage(distance[::every, ::every], every)
-        # A pixel crossed at an angle is wrong by at most an eighth, with either sign around the disc.
+        # A pixel that the edge crosses at an angle is wrong by at most an eighth. The sign varies around the
+        # disc.
         assert share.sum() * every**2 == pytest.approx(np.pi * RADIUS_PX**2, rel=2e-3)
 
 
-def test_dirt_is_film_where_none_can_be_and_a_lost_island_is_print() -> None:
+def test_film_far_from_the_layout_is_dirt_and_a_lost_island_belongs_to_the_print() -> None:
     layout = np.zeros((80, 80))
     layout[:, 40:] = 1
     layout[10:24, 10:24] = 1
@@ -77,14 +79,14 @@ def test_dirt_is_film_where_none_can_be_and_a_lost_island_is_print() -> None:
     seen[10:24, 10:24] = 0
     seen[50:56, 15:21] = 1
     dirt = foreign(seen, layout, 5)
-    # Farther than 5 px from all edges, and as far around it.
+    # The place is farther than 5 px from all edges, and so are its surroundings.
     assert dirt[52, 16:20].all()
     assert dirt[45:61, 17].all()
     assert not dirt[44, 17]
     assert not dirt[:44].any()
 
 
-def test_specks_are_passed_over() -> None:
+def test_small_specks_are_ignored() -> None:
     distance = _from_centre((200, 260))
     grey = _micrograph(distance, 0)
     grey[10:14, 10:14] = 200
@@ -116,7 +118,7 @@ def test_a_card_that_contradicts_its_instrument_is_refused(change: str, says: st
 
 @pytest.fixture(scope="module")
 def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A film: a layout of 1 nm pixels, a print with rounded corners, a micrograph of 2 nm pixels."""
+    """Build a film: a layout of 1 nm pixels, a print with rounded corners, a micrograph of 2 nm pixels."""
     folder = tmp_path_factory.mktemp("films")
     (folder / "card.toml").write_text(CARD, encoding="utf-8")
     for name in ("layout", "sem"):
@@ -139,7 +141,7 @@ def test_a_film_is_built_into_a_store_that_says_what_its_heights_are(films: Path
     inner = scan.height_um[scan.valid]
     assert inner.min() >= 0
     assert inner.max() == pytest.approx(0.16)
-    # Registered: the film lies on its layout but for a rim of a few pixels.
+    # After registration the film lies on its layout, except for a rim of a few pixels.
     wrong = (scan.height_um > 0.08) != (scan.layout_um > 0.08)
     assert wrong[scan.valid].mean() < 0.05
     assert np.isfinite(scan.height_sigma_um[scan.valid]).all()

@@ -1,4 +1,4 @@
-"""Stores and releases in the tools of others: mlcroissant, rocrate, ome-zarr-models, compliance-checker."""
+"""Other tools read stores and releases: mlcroissant, rocrate, ome-zarr-models, compliance-checker."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def release(campaign: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_croissant_is_valid_and_reads_the_table(release: Path, campaign: Path) -> None:
-    """mlcroissant downloads nothing: the files lie beside the description, and their hashes are checked."""
+    """mlcroissant downloads nothing. The files lie beside the description, and it checks their hashes."""
     dataset = mlcroissant.Dataset(jsonld=release / "croissant.json")
     assert not dataset.metadata.ctx.issues.errors
     quality = open_store(campaign / "prints.zarr").quality
@@ -41,7 +41,7 @@ def test_a_changed_file_is_refused_by_croissant(release: Path, tmp_path: Path) -
         list(mlcroissant.Dataset(jsonld=copy / "croissant.json").records("scans"))
 
 
-def test_the_crate_reads_as_one(release: Path) -> None:
+def test_rocrate_reads_the_crate(release: Path) -> None:
     crate = ROCrate(release)
     parts = {part.id: part for part in crate.root_dataset["hasPart"]}
     assert parts.keys() == {path.name for path in release.iterdir()} - {"ro-crate-metadata.json"}
@@ -52,7 +52,7 @@ def test_the_crate_reads_as_one(release: Path) -> None:
 
 
 def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
-    """Its tools follow ``labels``; the model of the format checks axes, scales and arrays."""
+    """Tools of OME-Zarr follow ``labels``. The model of the format checks axes, scales and arrays."""
     root = open_store(campaign / "prints.zarr").root
     groups = [root[letter] for letter in root.attrs["labels"]]
     names = [name for group in groups for name in group.attrs["labels"]]
@@ -65,7 +65,10 @@ def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
 
 
 def cf_complaints(store: Path, netcdf: Path) -> set[str]:
-    """What compliance-checker finds in a NetCDF copy: words as characters, coordinates never missing."""
+    """Return what compliance-checker finds in a NetCDF copy.
+
+    The copy stores words as characters, and its coordinates have no missing values.
+    """
     prints = xarray.open_zarr(store)
     words = [name for name in prints.coords if prints[name].dtype.kind not in "biuf"]
     encoding = {str(name): {"_FillValue": None} for name in prints.coords if name not in words}
@@ -79,12 +82,12 @@ def cf_complaints(store: Path, netcdf: Path) -> set[str]:
 
 
 def test_units_and_coordinates_follow_the_cf_conventions(campaign: Path, tmp_path: Path) -> None:
-    """But for latitudes and longitudes: the checker takes every axis Y for one, whatever its unit."""
+    """Complaints about latitudes are ignored: the checker takes every Y axis for one, whatever its unit."""
     found = cf_complaints(campaign / "prints.zarr", tmp_path / "prints.nc")
     assert not {one for one in found if not one.startswith(("§4.1 Latitude", "§4.2 Longitude"))}
 
 
-def test_a_wrong_unit_is_a_complaint(own_campaign: Path, tmp_path: Path) -> None:
+def test_compliance_checker_reports_a_wrong_unit(own_campaign: Path, tmp_path: Path) -> None:
     store = own_campaign / "prints.zarr"
     root = zarr.open_group(store)
     root["height_um"].attrs["units"] = "heights"

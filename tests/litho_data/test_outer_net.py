@@ -1,4 +1,4 @@
-"""What a machine or an input does not allow is one line with a way out, and exit code 2."""
+"""A limit of the machine or a bad input ends in one line that names a remedy, with exit code 2."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from litho_data.level.recipe import Recipe
 
 
 class CannotAllocate(RuntimeError):
-    """As PyTorch says it."""
+    """An error of memory, named as in PyTorch."""
 
 
 def os_error(code: int) -> OSError:
@@ -53,7 +53,7 @@ OUTSIDE: dict[str, tuple[Exception, str]] = {
 
 
 @pytest.mark.parametrize("what", OUTSIDE)
-def test_what_is_not_allowed_is_one_line(
+def test_an_error_of_the_machine_is_one_line(
     what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     error, words = OUTSIDE[what]
@@ -100,12 +100,12 @@ SAY = "@app.command()\ndef say():\n    [print('0.1 µm') for _ in range({times})
 SAY += "@app.command()\ndef other(): ..."
 
 
-def test_a_terminal_without_a_micro_sign_gets_another_letter() -> None:
+def test_a_terminal_without_the_micro_sign_gets_another_letter() -> None:
     done = run(SAY.format(times=1), PYTHONIOENCODING="ascii")
     assert (done.returncode, done.stdout, done.stderr) == (0, b"0.1 ?m\n", b"")
 
 
-def test_a_reader_that_has_had_enough_is_no_error() -> None:
+def test_a_reader_that_closes_the_pipe_early_is_no_error() -> None:
     code = "from litho_data.commands.app import *\napp = new_app('t')\n"
     code += SAY.format(times=100_000) + "\nrun_app(app, 't')"
     with subprocess.Popen(
@@ -133,7 +133,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("what", READERS)
-def test_what_no_file_can_hold_is_one_line(what: str, tmp_path: Path) -> None:
+def test_a_value_that_no_file_can_hold_is_one_line(what: str, tmp_path: Path) -> None:
     read, name = READERS[what]
     file = tmp_path / name
     toml = file.suffix == ".toml"
@@ -168,7 +168,7 @@ def test_a_folder_under_a_pipe_cannot_be_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0, 1e300, 10**400, "0.1x", None, True])
-def test_a_range_holds_numbers_that_can_be_and_nothing_else(value: object) -> None:
+def test_a_range_accepts_possible_numbers_only(value: object) -> None:
     assert DOSE.holds(1.0)
     assert DOSE.holds([0.5, 2])
     assert not DOSE.holds(value)
@@ -177,7 +177,7 @@ def test_a_range_holds_numbers_that_can_be_and_nothing_else(value: object) -> No
 
 
 @pytest.mark.parametrize("pitch", [PITCH_UM.low / 2, PITCH_UM.high * 2, float("nan"), 0.0])
-def test_no_grid_has_a_pitch_that_cannot_be(pitch: float) -> None:
+def test_a_grid_refuses_an_impossible_pitch(pitch: float) -> None:
     for pitches in ((0.1, pitch), (pitch, 0.1)):
         with pytest.raises(InputError, match="grid pitch_um"):
             PixelGrid((4, 5), pitches)

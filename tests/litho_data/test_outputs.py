@@ -1,4 +1,4 @@
-"""Whatever a command writes as a whole, it never takes the place of something else."""
+"""A command that writes a whole result never overwrites anything else."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
     write(campaign, out)
     assert {path.name for path in out.iterdir()} == names
 
-    # Measured scans beside their layouts, notes beside a release: one stranger protects the folder.
+    # Measured scans lie beside their layouts, notes beside a release. One foreign file protects the folder.
     (out / "scans").mkdir()
     (out / "scans" / "P11.txt").write_text("weeks of measuring")
     with pytest.raises(InputError, match="which holds scans"):
@@ -91,7 +91,7 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
         require_same(tmp_path, read_record(tmp_path / "plan.json"), now)
 
 
-def test_the_current_folder_is_not_pulled_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_current_folder_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="current folder"):
         write_layout_set(Path("."), count=1, size_px=64)

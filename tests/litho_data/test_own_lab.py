@@ -1,4 +1,4 @@
-"""An own lab's first dataset: right when the page is followed, and every wrong number named first."""
+"""The first dataset of a new lab is right if the page is followed. Every wrong number is named first."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from tests.litho_data.campaigns import write_campaign
 from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, RIM_PX, errors_nm, write_lab
 
 BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
-# The median of |6 nm jitter of the lines| + noise is 4.8 nm; 8 leaves room for what levelling gets wrong.
+# The median of |6 nm jitter of the lines| + noise is 4.8 nm. A limit of 8 nm leaves room for errors of
+# levelling.
 MOST_NM = 8.0
 FEW = ("A1", "A2", "B1", "B2")
 
@@ -44,9 +45,9 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     card = lab(tmp_path)
     found = suggest_recipe(card, tmp_path / "levelling")
     assert found.recipe == "plane and bow"
-    # Of heights the layout leaves a small part of a level.
+    # The part of the heights that the layout does not explain is a small part of a level.
     assert max(found.left_nm["plane and bow"].values()) < 1e3 * LEVEL_HEIGHT_UM / 2
-    # Row alignment takes the print for offsets of lines.
+    # Row alignment would take the print for offsets of lines.
     assert set(found.warned) >= {"lines, then plane and bow", "plane and bow, then lines"}
     assert (tmp_path / "levelling" / "report.html").is_file()
     assert load_card(found.card).process.level == "card.recipe.toml"
@@ -59,11 +60,11 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert max(errors.values()) < MOST_NM, errors
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
     assert f"check {MIRRORED}: a mirror image" in build.stderr
-    # Level 0 of these prints stands two levels above the substrate.
+    # Level 0 of these prints lies two levels above the substrate.
     assert "check all scans: their outermost pixels deviate" in build.stderr
     scan = store.scan("B3")
     assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
-    # Around it models see the substrate, and its measured heights stand where the scan has them.
+    # Models see the substrate around the field, and the measured heights stay where the scan has them.
     rim = np.ones(scan.shape, bool)
     rim[RIM_PX:-RIM_PX, RIM_PX:-RIM_PX] = False
     assert not scan.mask_level[rim].any()
@@ -132,7 +133,7 @@ def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[process]\nregistration = 'affine'\n", BOW])
-def test_a_suggested_card_says_the_rest_as_before(tmp_path: Path, text: str) -> None:
+def test_a_suggested_card_keeps_all_other_entries(tmp_path: Path, text: str) -> None:
     from litho_data.making.suggest import _write_card
 
     card = tmp_path / "card.toml"
@@ -147,14 +148,15 @@ def test_a_suggested_card_says_the_rest_as_before(tmp_path: Path, text: str) -> 
     assert same == before
 
 
-def test_what_the_layout_leaves_is_noise_tilt_and_lost_print() -> None:
+def test_the_residual_of_the_layout_is_noise_tilt_and_lost_print() -> None:
     rng = np.random.default_rng(0)
     level = np.repeat(np.repeat(rng.integers(0, 6, (16, 16)), 8, 0), 8, 1).astype(float)
     from scipy import ndimage
 
     print_um = LEVEL_HEIGHT_UM * ndimage.gaussian_filter(level, 1.5)
     noise = 0.004 * rng.standard_normal(level.shape)
-    # What is left of white noise is its own deviation: 7000 pixels know it to 1 %, the fit costs six numbers.
+    # The residual of white noise is its standard deviation, known to 1 % from 7000 pixels. The fit uses six
+    # numbers.
     assert left_by_layout(print_um + noise, level) == pytest.approx(0.004, rel=0.05)
     tilt = 0.1 * np.linspace(-1, 1, 128)
     assert left_by_layout(print_um + noise + tilt, level) > 0.04

@@ -1,4 +1,4 @@
-"""A reader from a file outside the package: asked first, and taken by cards and commands."""
+"""A reader from a file outside the package is asked first and can be named in cards and commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of
 
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """`examples/own_reader.py`, its reader added for one test."""
+    """Load `examples/own_reader.py` and add its reader for one test."""
     path = Path(__file__).parents[2] / "examples" / "own_reader.py"
     spec = importlib.util.spec_from_file_location("own_reader", path)
     assert spec is not None
@@ -32,7 +32,9 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return module
 
 
-def test_it_is_read_by_its_content_and_offered_by_the_commands(example: ModuleType, tmp_path: Path) -> None:
+def test_an_own_reader_reads_by_content_and_is_offered_by_the_commands(
+    example: ModuleType, tmp_path: Path
+) -> None:
     height_nm = np.arange(12.0).reshape(3, 4)
     example.write_toy(tmp_path / "scan.anything", height_nm, (0.3, 0.4))
     scan = read_scan(tmp_path / "scan.anything")
@@ -42,7 +44,9 @@ def test_it_is_read_by_its_content_and_offered_by_the_commands(example: ModuleTy
     assert "read as toy" in said.output
 
 
-def test_a_card_may_name_it_and_a_dataset_is_built_with_it(example: ModuleType, tmp_path: Path) -> None:
+def test_a_card_may_name_an_own_reader_and_a_dataset_is_built_with_it(
+    example: ModuleType, tmp_path: Path
+) -> None:
     card = write_campaign(tmp_path, count=1)
     layout = layout_of(0)
     side_um = (layout.shape[0] + 2 * MARGIN_PX) * PITCH_UM
@@ -53,7 +57,7 @@ def test_a_card_may_name_it_and_a_dataset_is_built_with_it(example: ModuleType, 
     assert open_store(tmp_path / "prints.zarr").manifest["card"]["scan"]["format"] == "toy"
 
 
-def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_path: Path) -> None:
+def test_an_own_reader_is_asked_before_the_built_in_readers(example: ModuleType, tmp_path: Path) -> None:
     np.savetxt(tmp_path / "scan.txt", np.ones((3, 3)))
     greedy = Reader("greedy", lambda path, head: path.suffix == ".txt", example.read_channels)
     register_reader(greedy)
@@ -63,6 +67,6 @@ def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_
 
 
 @pytest.mark.parametrize("name", ["toy", "gsf", "auto", "image"])
-def test_a_name_that_is_taken_is_refused(example: ModuleType, name: str) -> None:
+def test_an_own_reader_with_a_used_name_is_refused(example: ModuleType, name: str) -> None:
     with pytest.raises(InputError, match="another name"):
         register_reader(Reader(name, lambda path, head: True, example.read_channels))

@@ -1,4 +1,4 @@
-"""The authors' pair format: what it can hold comes back, to half a grey value."""
+"""Data survive the authors' pair format, to half a grey value."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
     for scan in open_store(campaign / "prints.zarr").scans():
         other = back.scan(scan.id)
         np.testing.assert_array_equal(other.mask_level, scan.mask_level)
-        # Half of one of 255 steps, and half a digit of the note's rounding to 0.1 nm.
+        # The error is half of one of 255 steps plus half of the last digit, 0.1 nm, of the note.
         half_step_um = (np.nanmax(scan.height_um) + raised.get(scan.id, 0)) / 255 / 2
         difference = other.height_um - scan.height_um - raised.get(scan.id, 0)
         assert np.abs(difference).max() <= half_step_um + 0.5e-4 + 1e-6
@@ -40,10 +40,10 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
     [{"pitch_um": 0.2}, {"level_height_um": 0.2}, {"levels": 14}, {"name": "others"}],
     ids=lambda one: next(iter(one)),
 )
-def test_what_was_begun_with_other_words_is_not_continued(
+def test_an_import_begun_with_other_options_is_not_continued(
     other: dict[str, Any], campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two fields of one pitch and one of another would be one store."""
+    """A continued import with other options would mix fields of two pitches in one store."""
     export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
     add, added = PartialStore.add, []
 
@@ -102,7 +102,7 @@ def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
     assert result.unpaired == {"mask/P213.tif": "no heights of this name"}
 
 
-def test_what_is_no_pair_folder(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_in_the_pair_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cannot read .*src_max_dict\.txt"):
         import_pairs(tmp_path, tmp_path / "out.zarr")
     (tmp_path / "src_max_dict.txt").write_text("{}")

@@ -1,4 +1,4 @@
-"""Figures and tables for a paper: widths, fonts, escaping, and nothing where nobody asks."""
+"""Figures and tables for a paper: widths, fonts, escaping. Nothing is written unless requested."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_figures_are_as_wide_as_columns_with_their_fonts_in_them(tmp_path):
         pdf = (tmp_path / f"figure-{number}.pdf").read_bytes()
         width = float(re.search(rb"/MediaBox \[ 0 0 ([\d.]+)", pdf)[1])
         assert width == pytest.approx(inches * POINTS_PER_INCH, abs=0.01)
-        # A TrueType font as a file of its own; type 3, which publishers refuse, has none.
+        # A TrueType font is embedded as a file. Type 3, which publishers refuse, has no such file.
         assert b"/FontFile2" in pdf
         assert b"/Type3" not in pdf
 
@@ -43,7 +43,7 @@ def test_text_of_an_svg_needs_no_font(tmp_path):
     assert "<text" not in (tmp_path / "figure-1.svg").read_text("utf-8")
 
 
-def test_tables_keep_what_their_language_reads_as_its_own(tmp_path):
+def test_tables_escape_the_special_characters_of_their_language(tmp_path):
     with paper_copies(tables="latex"):
         page().write(tmp_path)
     with paper_copies(tables="markdown"):
@@ -56,7 +56,7 @@ def test_tables_keep_what_their_language_reads_as_its_own(tmp_path):
     assert "12.345678" in (tmp_path / "shares.csv").read_text("utf-8")
 
 
-def test_nothing_more_is_written_where_nobody_asks(tmp_path):
+def test_no_copies_are_written_unless_requested(tmp_path):
     with paper_copies(figures="png", tables="latex"):
         pass
     page().write(tmp_path)

@@ -1,4 +1,4 @@
-"""What a command says about its time: within a factor of two of what follows, whoever does the work."""
+"""A command estimates its remaining time within a factor of two, whatever processes do the work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.commands import progress as module
 from litho_data.commands.app import new_app, run_app
 from litho_data.commands.progress import progress, say, say_estimate
 
-# Items, how many at once, seconds of each and of the start of the workers.
+# Number of items, items at once, seconds of each item, and seconds that workers take to start.
 WORK = {
     "one by one": (40, 1, 4.0, 0.0),
     "short ones": (20_000, 1, 0.01, 0.0),
@@ -23,7 +23,7 @@ WORK = {
 
 
 class Clock:
-    """A clock that work moves on."""
+    """A clock that advances only when work advances it."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -59,14 +59,14 @@ def test_an_estimate_is_within_a_factor_of_two(
 
 
 def silent() -> None:
-    """Work until somebody says so."""
+    """Work until a line is printed."""
     until_s = time.monotonic() + 20
     while module._silent.is_set() and time.monotonic() < until_s:
         time.sleep(0.01)
 
 
 def spoken() -> None:
-    """Say what is done, and do it for longer than one may be silent."""
+    """Report progress, then work for longer than a command may be silent."""
     say("working")
     time.sleep(1)
 
@@ -75,7 +75,7 @@ def spoken() -> None:
     ("work", "within_s", "said"),
     [(silent, 0.01, "litho-test is at work\n"), (spoken, 0.5, "working\n"), (list, 60.0, "")],
 )
-def test_a_command_that_says_nothing_is_said_to_be_at_work(
+def test_a_silent_command_is_reported_to_be_at_work(
     work: Callable[[], object],
     within_s: float,
     said: str,
@@ -99,7 +99,7 @@ def test_a_command_that_says_nothing_is_said_to_be_at_work(
     assert capsys.readouterr().err == said
 
 
-def test_what_takes_less_than_a_minute_is_not_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_estimate_is_given_below_one_minute(capsys: pytest.CaptureFixture[str]) -> None:
     for seconds, words in ((59.0, ""), (150.0, "about 2 min"), (9000.0, "about 2.5 h")):
         say_estimate("it", seconds)
         assert words in (said := capsys.readouterr().err)

@@ -1,4 +1,4 @@
-"""The public functions, called one after the other by hand, make what ``build_dataset`` stores."""
+"""The public functions, called one by one, give the result that ``build_dataset`` stores."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import litho_data
 
 
-def test_one_scan_by_hand_is_the_scan_of_the_dataset(campaign: Path) -> None:
+def test_public_functions_give_the_scan_of_the_dataset(campaign: Path) -> None:
     store = litho_data.open_store(campaign / "prints.zarr")
     stored = store.scan("P11")
     layout = litho_data.read_layout(campaign / "layouts" / "P11.tif")

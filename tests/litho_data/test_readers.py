@@ -1,4 +1,4 @@
-"""Every reader returns the same asymmetric map: orientation, scale, pitch and unit pinned."""
+"""Every reader returns the same asymmetric map with correct orientation, scale, pitch and unit."""
 
 from __future__ import annotations
 
@@ -171,14 +171,14 @@ def test_channels_of_one_name_are_numbered(tmp_path: Path) -> None:
         ({"full_scale_um": 1.0}, "full scale"),
     ],
 )
-def test_what_the_caller_gets_wrong(tmp_path: Path, arguments: dict, message: str) -> None:
+def test_wrong_arguments_of_a_reader_are_named(tmp_path: Path, arguments: dict, message: str) -> None:
     path = tmp_path / "scan.txt"
     np.savetxt(path, HEIGHT_UM)
     with pytest.raises(InputError, match=message):
         read_scan(path, **arguments)
 
 
-def test_what_contradicts_the_file_is_refused(tmp_path: Path) -> None:
+def test_arguments_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "scan.gwy"
     afm_files.write_gwy(path, {"Topography": (HEIGHT_UM * 1e-6, "m"), "Phase": (HEIGHT_UM, "deg")})
     with pytest.raises(InputError, match=r"unit.*'nm'.*'m' as in the file"):
@@ -188,7 +188,7 @@ def test_what_contradicts_the_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'Phase' is no height"):
         read_scan(path, channel="Phase")
     assert read_scan(path, unit="m", size_um=SIZE_UM).pitch_um == pytest.approx(PITCH_UM)
-    # As defaults for many files they give way to what the file states.
+    # Given as defaults for many files, the arguments yield to what the file states.
     scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=True)
     assert (scan.unit, scan.pitch_um) == ("m", pytest.approx(PITCH_UM))
     assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "2.5 × 1.6 µm"]
@@ -219,7 +219,7 @@ def test_layouts(tmp_path: Path) -> None:
         assert read_layout(tmp_path / name).dtype == np.uint8
 
 
-def test_layouts_that_are_none(tmp_path: Path) -> None:
+def test_files_that_are_not_layouts_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "fraction.npy", np.full((4, 4), 0.5))
     np.save(tmp_path / "negative.npy", np.full((4, 4), -1))
     np.save(tmp_path / "large.npy", np.full((4, 4), 256))
@@ -249,7 +249,7 @@ def test_fields_written_by_gwyddion(oracles: Path, suffix: str) -> None:
     assert scan.pitch_um == pytest.approx((3.6 / 301, 0.01), rel=1e-12)
     if suffix == "gwy":
         assert scan.mask is not None
-        # The mask is not trivial, and heights under it are those of the unmasked formats.
+        # The mask is not empty, and the heights under it equal those of the formats without a mask.
         assert 0 < scan.mask.sum() < scan.mask.size
         np.testing.assert_array_equal(scan.height_um[scan.mask], expected_um[scan.mask])
 
@@ -272,7 +272,7 @@ def test_all_measured_scans_and_layouts(measured_prints: Path) -> None:
         scan = read_scan(path, unit="m", size_um=(54, 54))
         assert scan.shape == (540, 540)
         assert np.isfinite(scan.height_um).all()
-        # The files were shifted to minimum zero, but for one.
+        # All files but one were shifted to a minimum of zero.
         assert scan.height_um.min() == pytest.approx(0.021049 if path.stem == "FOV42" else 0.0, abs=1e-9)
     for path in sorted((measured_prints / "mask_ug").glob("*.tif")):
         assert read_layout(path).shape == (512, 512)

@@ -1,4 +1,4 @@
-"""Texts and arrays as other programs and people write them: one map right, or one line that says why not."""
+"""Read texts and arrays as other programs and people write them: a right map, or one line of reason."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ HEIGHT_UM[:3, :3] = 0.9
 
 
 def rows(scale: float = 1.0, separator: str = "\t", decimal: str = ".", digits: int = 4) -> list[str]:
-    """The heights in lines; µm times ``scale``."""
+    """Return the heights as lines of text, in µm times ``scale``."""
     lines = ([f"{value * scale:.{digits}f}" for value in row] for row in HEIGHT_UM)
     return [separator.join(line).replace(".", decimal) for line in lines]
 
 
 def points(line: str, scale: float = 1.0) -> list[str]:
-    """One line per pixel."""
+    """Return one line of text per pixel."""
     places = zip(Y.ravel(), X.ravel(), HEIGHT_UM.ravel() * scale, strict=True)
     return [line.format(x=x * PITCH_UM, y=y * PITCH_UM, z=z, i=x, j=y) for y, x, z in places]
 
 
-# What the texts are, with what a reader has to be told; those in brackets state the size of a pixel.
+# Each text with the arguments that its reader needs. Arguments in brackets state the size of a pixel.
 RIGHT: dict[str, tuple[list[str], dict]] = {
     "[decimal commas in a header]": (
         ["Width: 6,4 µm", "Height: 4,8 µm", "Value units: µm", *rows(decimal=",")],
@@ -62,7 +62,7 @@ def test_a_text_that_is_read(tmp_path: Path, what: str) -> None:
     lines, arguments = RIGHT[what]
     (tmp_path / "scan").write_text("\n".join(lines) + "\n", encoding="utf-8")
     scan = read_scan(tmp_path / "scan", **arguments)
-    # The last of four digits.
+    # The tolerance is the last of four digits.
     np.testing.assert_allclose(scan.height_um, HEIGHT_UM, atol=1e-9)
     assert (scan.pitch_um is not None) == what.startswith("[")
     assert scan.pitch_um is None or scan.pitch_um == pytest.approx((PITCH_UM, PITCH_UM))
@@ -138,7 +138,7 @@ def test_axes_by_their_names_and_lengths(tmp_path: Path, write: Callable[[h5py.F
     assert scan.pitch_um is None or write is with_lines
 
 
-def test_x_that_falls_is_turned_round(tmp_path: Path) -> None:
+def test_a_falling_x_axis_is_reversed(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "scan", "w") as file:
         data = file.create_dataset("z", data=HEIGHT_UM[:, ::-1])
         x = file.create_dataset("x", data=PITCH_UM * np.arange(NX)[::-1])
@@ -186,7 +186,7 @@ def test_numbers_beside_a_matrix_of_matlab(tmp_path: Path) -> None:
         read_scan(tmp_path / "scan", unit="um")
 
 
-def test_what_a_tiff_says_of_itself(tmp_path: Path) -> None:
+def test_the_statements_of_a_tiff_about_itself_are_applied(tmp_path: Path) -> None:
     path, values = tmp_path / "scan", HEIGHT_UM.astype(np.float32)
     tifffile.imwrite(path, values, extratags=[(274, "H", 1, 4, True)], metadata=None)
     with pytest.raises(InputError, match="Orientation of the page, got 4"):

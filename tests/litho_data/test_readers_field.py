@@ -1,4 +1,4 @@
-"""What instruments and their users really hand over: packed files, odd text, real vendor files."""
+"""Read what instruments and their users deliver: packed files, odd text, real vendor files."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def test_ome_tiff_states_its_pitch(tmp_path: Path, unit: str) -> None:
     path = tmp_path / "scan.ome.tif"
     factor = 1 if unit == "µm" else 1000
     metadata = {"axes": "YX", "PhysicalSizeX": 0.2 * factor, "PhysicalSizeY": 0.5 * factor}
-    if unit != "µm":  # the unit of the standard needs no words
+    if unit != "µm":  # the default unit of the standard need not be stated
         metadata |= {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": unit}
     tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), ome=True, metadata=metadata)
     assert read_scan(path, unit="um").pitch_um == pytest.approx((0.5, 0.2), rel=1e-12)
 
 
-def test_a_channel_of_a_nanoscope_file_that_is_no_height(tmp_path: Path) -> None:
-    """Its scale has no calibration in metres; it must not take the heights with it."""
+def test_a_nanoscope_channel_without_calibration_does_not_hide_the_heights(tmp_path: Path) -> None:
+    """The scale of this channel has no calibration in metres. The heights must still be read."""
     path = tmp_path / "scan.spm"
     afm_files.write_spm(path, np.ones(SHAPE, int), hard_v=1.0, sensitivity_nm_per_v=1.0)
     raw = path.read_bytes()
@@ -72,7 +72,7 @@ def test_a_channel_of_a_nanoscope_file_that_is_no_height(tmp_path: Path) -> None
 
 
 def write_jpk_series(path: Path) -> None:
-    """JPK's HDF5: pixels x fastest and y upwards, one column of counts per frame, a thumbnail beside."""
+    """Write JPK's HDF5: x fastest, y upwards, one column of counts per frame, and a thumbnail."""
     ny, nx = SHAPE
     with h5py.File(path, "w") as file:
         file.attrs["file-format-info"] = np.bytes_("JPK SCAN")
@@ -126,7 +126,9 @@ def _whole(path: Path) -> list[Channel]:
     return _height(path, partial(np.full, (1, 2, 2), 7.0))
 
 
-def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parser_that_crashes_or_never_ends_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("litho_data.readers.confined._COMPUTING_S", 0.3)
     path = tmp_path / "scan"
     path.write_bytes(b"1")
@@ -137,19 +139,19 @@ def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pyt
         (_crash, "crashed"),
         (_greedy, "memory"),
     ):
-        # Minutes to start on a busy machine; only the parser that sleeps has to be waited for.
+        # On a busy machine the start may take minutes. Only the parser that sleeps has to run into the limit.
         waiting = 2 if parser is _asleep else 500
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", waiting)
         with pytest.raises(InputError, match=message):
             parse(partial(parser, path), path, "toy", ("json",))
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", 500)
-        # The next file finds a parser at work again.
+        # A parser is ready for the next file.
         found = parse(partial(_whole, path), path, "toy", ("json",))
         assert parse(found[0].load, path, "toy", ("json",))[0, 0, 0] == 7
     assert time.process_time() - start < 2
 
 
-# What each real file says of itself: heights among its channels, (ny, nx), unit, size (y, x) in µm.
+# Content of each real file: the height among its channels, (ny, nx), unit, size (y, x) in µm.
 INTACT = {
     "10x10-one_channel_without_name.ibw": (1, (10, 10), None, None),
     "al3d-1.al3d": (1, (296, 200), "m", (296 * 0.438027, 200 * 0.438027)),
@@ -206,11 +208,12 @@ def test_real_files_of_vendors(oracles: Path) -> None:
 
 @pytest.mark.oracle
 def test_real_files_agree_with_another_reader(oracles: Path) -> None:
-    """AFMReader 0.0.7, every 8th pixel; its WSxM maps are turned back.
+    """Compare every 8th pixel with AFMReader 0.0.7. Its WSxM maps are turned back first.
 
-    WSxM writes its rows with x downwards and y upwards: in the example of a matrix and of points of the
-    same image at https://spmimages.ftmc.uam.es/file-specifications the first number is the one at the
-    largest x and the smallest y. That is the lower right pixel, which AFMReader shows in the upper left.
+    WSxM writes its rows with x downwards and y upwards. An example at
+    https://spmimages.ftmc.uam.es/file-specifications shows one image as a matrix and as points. The first
+    number of the matrix is the point with the largest x and the smallest y. That is the lower right pixel,
+    which AFMReader shows in the upper left.
     """
     reference = np.load(oracles / "vendor" / "reference.npz")
     for name, channel, key, turned in (
@@ -226,8 +229,8 @@ def test_real_files_agree_with_another_reader(oracles: Path) -> None:
 
 
 @pytest.mark.parametrize("format", ["gsf", "npy", "npz", "gwy", "h5"])
-def test_a_size_that_is_only_declared_is_one_line(tmp_path: Path, format: str) -> None:
-    """16000 × 16000 pixels of nothing: 1 GB that the file does not hold."""
+def test_a_declared_size_without_the_pixels_is_one_line(tmp_path: Path, format: str) -> None:
+    """The header declares 16000 × 16000 pixels, 1 GB, but the file does not hold them."""
     path, side = tmp_path / f"scan.{format}", 16_000
     header = io.BytesIO()
     shape = {"descr": "<f4", "fortran_order": False, "shape": (side, side)}

@@ -32,7 +32,7 @@ STARTS = (
 
 @pytest.fixture(autouse=True)
 def _alarm() -> Iterator[None]:
-    """A reader that hangs is a failure, not a stuck test run."""
+    """Fail the test if a reader hangs, so that the test run goes on."""
 
     def stop(*_: object) -> None:
         raise AssertionError(f"a reader took longer than {LONGEST_S} s")
@@ -104,7 +104,7 @@ def whole_files(folder: Path) -> dict[str, bytes]:
 
 
 def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
-    """Flipped bytes and cut ends: a map comes back or an InputError, nothing else."""
+    """For flipped bytes and cut ends, a reader returns a map or raises an InputError, nothing else."""
     rng = np.random.default_rng(0)
     (tmp_path / "whole").mkdir()
     for name, content in whole_files(tmp_path / "whole").items():
@@ -119,7 +119,7 @@ def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
 
 
 def test_no_header_claims_more_pixels_than_its_file_can_hold(tmp_path: Path) -> None:
-    """Small numbers behind this signature pass for sizes and leave the pixels to the imagination."""
+    """With this signature, small numbers are read as sizes. The file holds almost no pixels."""
     path = tmp_path / "zeta"
     largest = []
     for seed in range(60):
@@ -127,7 +127,7 @@ def test_no_header_claims_more_pixels_than_its_file_can_hold(tmp_path: Path) -> 
         path.write_bytes(b"Zeta-Instruments" + numbers.tobytes())
         with suppress(InputError):
             largest += [channel.shape[0] * channel.shape[1] for channel in list_channels(path)]
-    # Deflate packs at most 1032 bytes into one.
+    # Deflate packs at most 1032 bytes into one byte.
     assert all(pixels <= 1032 * 2016 for pixels in largest)
 
 
@@ -157,21 +157,21 @@ _LONG = 200_000
         "1;" * _LONG,
     ],
 )
-def test_no_line_keeps_an_expression_busy(tmp_path: Path, text: str) -> None:
-    """Where two neighbouring repetitions may match the same characters, each takes minutes or hours."""
+def test_no_line_makes_a_regular_expression_slow(tmp_path: Path, text: str) -> None:
+    """If two neighbouring repetitions can match the same characters, each line takes minutes or hours."""
     path = tmp_path / "scan.txt"
     path.write_text(text)
     started = time.process_time()
     with suppress(InputError):
         read_scan(path, format="text-matrix", unit="m", size_um=(1.0, 1.0))
-    # Splitting 200 kB into cells takes a few hundredths; the square of it would take 40 s or more.
+    # Splitting 200 kB into cells takes a few hundredths of a second. Quadratic time would be 40 s or more.
     assert time.process_time() - started < 2
 
 
 @pytest.mark.parametrize(
     "text", ["<" * _LONG, "<a" * _LONG, "<Pixels PhysicalSizeX" + " " * _LONG, '="' * _LONG]
 )
-def test_no_metadata_keeps_an_expression_busy(text: str) -> None:
+def test_no_metadata_makes_a_regular_expression_slow(text: str) -> None:
     started = time.process_time()
     assert ome_pitch_um(text) is None
     assert time.process_time() - started < 2

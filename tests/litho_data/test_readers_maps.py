@@ -1,4 +1,4 @@
-"""A map is right or refused: 200 files of other programs, formats × unit × axes × missing × channels."""
+"""A map is read correctly or refused: 200 files that vary format, unit, axes, missing pixels and channels."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ FILES = 200
 
 
 def made(path: Path, seed: int) -> MapFile:
-    """The file of a seed; some maps have missing pixels, marked by a number or a word or not at all."""
+    """Write the map file of one seed and return its description.
+
+    Some maps have missing pixels, marked by a number, by a word or not at all.
+    """
     rng = np.random.default_rng(seed)
     height_um, mark = random_map(rng), None
     if rng.random() < 0.4:
@@ -63,7 +66,7 @@ def test_no_file_is_read_wrongly_without_a_word(tmp_path: Path) -> None:
         one = made(path, seed)
         what = f"{seed} {WRITERS[seed % len(WRITERS)].__name__} {one.unit} {one.mark} {one.arguments}"
         try:
-            # As a newcomer: with nothing but the file.
+            # The reader first gets nothing but the file, as a new user would try it.
             if differs(read_scan(path), one) or one.asks:
                 wrong.append(f"{what}: read as it is, wrongly")
         except InputError as error:
@@ -79,8 +82,8 @@ def test_no_file_is_read_wrongly_without_a_word(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_law_can_fail(tmp_path: Path, seed: int) -> None:
-    """A map that is turned, or whose unit is not that of the file, differs."""
+def test_the_comparison_finds_a_turned_map_and_a_wrong_unit(tmp_path: Path, seed: int) -> None:
+    """Check that the comparison finds a turned map and a map in a wrong unit."""
     one = made(tmp_path / "scan", seed)
     scan = read_scan(tmp_path / "scan", **one.arguments)
     assert not differs(scan, one)
@@ -88,7 +91,7 @@ def test_the_law_can_fail(tmp_path: Path, seed: int) -> None:
     assert differs(scan, one)
 
 
-# Rows of the page's table by how they begin: a writer, or real files of the other tests.
+# First words of the rows of the page's table, each with its writer here or the other tests of real files.
 TRIED = {
     "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "TIFF": tiff, "GSF": gsf,
     "NPY": numpy_archive, "NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,
@@ -98,7 +101,7 @@ TRIED = {
 }  # fmt: skip
 
 
-def test_every_format_of_the_page_has_a_file_of_its_own() -> None:
+def test_every_format_of_the_page_is_tested_with_a_file() -> None:
     page = (Path(__file__).parents[2] / "docs" / "readers.md").read_text(encoding="utf-8")
     table = page.split("| tested with |\n")[1].split("\n\n")[0].splitlines()[1:]
     rows = [row.split("|")[1].strip() for row in table]
@@ -116,7 +119,7 @@ def test_every_format_of_the_page_has_a_file_of_its_own() -> None:
         (park, "vendor"), (sdf, "vendor"), (bcr, "vendor"),
     ],
 )  # fmt: skip
-def test_a_file_lands_in_its_own_reader(tmp_path: Path, writer: Writer, format: str) -> None:
+def test_a_file_is_given_to_the_reader_of_its_format(tmp_path: Path, writer: Writer, format: str) -> None:
     rng = np.random.default_rng(3)
     one = MapFile(random_map(rng), 0.2, "um")
     writer(tmp_path / "scan", one, rng)

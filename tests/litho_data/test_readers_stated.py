@@ -1,4 +1,4 @@
-"""What a file states is applied, or the file is refused with its name; one bad part spoils nothing."""
+"""What a file states is applied, or the file is refused by name. One bad part does not affect the others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def refused(path: Path, message: str, **arguments: object) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_calibration_that_is_no_line_is_refused_with_its_keys(tmp_path: Path) -> None:
+def test_a_calibration_that_is_not_linear_is_refused_with_its_keys(tmp_path: Path) -> None:
     path = tmp_path / "scan.tif"
     tifffile.imwrite(
         path, np.ones(SHAPE, np.uint16), imagej=True, metadata={"cf": 3, "c0": 1.0, "c1": 2.0, "c2": 3.0}
@@ -41,7 +41,7 @@ def test_a_unit_that_is_no_length_makes_no_height(tmp_path: Path) -> None:
 
 
 def test_a_picture_beside_an_unknown_private_tag_is_no_map(tmp_path: Path) -> None:
-    """So do instrument makers keep a preview in the page and the heights elsewhere."""
+    """Instrument makers keep a preview in the page like this, and the heights elsewhere."""
     path = tmp_path / "scan.tif"
     tag = (55555, "B", 4 * HEIGHT_UM.size, HEIGHT_UM.astype("<f4").tobytes(), False)
     tifffile.imwrite(path, np.ones(SHAPE, np.uint8), extratags=[tag], metadata=None)
@@ -66,7 +66,7 @@ def test_numbers_beside_an_array_are_applied_or_named(tmp_path: Path, attributes
         file.create_dataset("height", data=HEIGHT_UM).attrs.update(attributes)
         file.create_dataset("other", data=2 * HEIGHT_UM)
     refused(path, message, channel="height")
-    # The other channel is as good as before.
+    # The other channel is still read.
     np.testing.assert_array_equal(read_scan(path, channel="other", unit="um").height_um, 2 * HEIGHT_UM)
     assert [bool(one.problem) for one in list_channels(path)] == [True, False]
 
@@ -78,7 +78,7 @@ def test_numbers_beside_counts_may_be_their_calibration(tmp_path: Path) -> None:
     refused(path, "b = 0.0, m = 0.0001")
 
 
-def test_arrays_show_what_runs_along_x(tmp_path: Path) -> None:
+def test_an_array_states_which_axis_runs_along_x(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("plain", data=HEIGHT_UM)
@@ -89,7 +89,7 @@ def test_arrays_show_what_runs_along_x(tmp_path: Path) -> None:
     np.testing.assert_array_equal(plain.load()[0], turned.load()[0])
 
 
-def test_a_field_without_its_size_is_a_field_all_the_same(tmp_path: Path) -> None:
+def test_a_field_without_its_size_is_still_read(tmp_path: Path) -> None:
     from gwyfile.objects import GwyContainer, GwyDataField, GwyObject, GwySIUnit
 
     path = tmp_path / "scan.gwy"
@@ -158,7 +158,9 @@ def test_a_caller_may_say_that_no_pixel_is_missing(tmp_path: Path) -> None:
         (", ".join(f"h{k} (um)" for k in range(4)), "unit, got 'nm', wanted 'um'"),
     ],
 )
-def test_what_words_say_of_the_heights_is_not_passed_over(tmp_path: Path, head: str, message: str) -> None:
+def test_statements_about_the_heights_in_words_are_not_ignored(
+    tmp_path: Path, head: str, message: str
+) -> None:
     path = tmp_path / "scan.txt"
     path.write_text(f"{head}\n{ROWS}")
     refused(path, message, unit="nm")
@@ -198,7 +200,7 @@ def test_json_beside_a_page_is_read_like_words(tmp_path: Path) -> None:
     refused(path, "scale = 10")
 
 
-def test_what_lies_beside_a_map_in_an_archive_is_heeded(tmp_path: Path) -> None:
+def test_other_entries_beside_a_map_in_an_archive_are_not_ignored(tmp_path: Path) -> None:
     path = tmp_path / "scan.npz"
     y, x = (0.2 * np.arange(count) for count in SHAPE)
     np.savez(path, z=HEIGHT_UM.T, x=x, y=y, unit="um")
@@ -231,14 +233,14 @@ def test_axes_may_be_told_by_attributes(tmp_path: Path, says: tuple[str, str, st
     assert scan.require_pitch() == pytest.approx((0.2, 0.2))
 
 
-def test_a_mask_beside_a_map_is_not_passed_over(tmp_path: Path) -> None:
+def test_a_mask_beside_a_map_is_not_ignored(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with h5py.File(path, "w") as file:
         file["z"], file["seen"] = HEIGHT_UM, HEIGHT_UM > 0
     refused(path, "mask '/seen'")
 
 
-def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:
+def test_one_extreme_value_in_many_pixels_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "scan.npy"
     height_um = np.random.default_rng(0).random((40, 50))
     np.save(path, np.minimum(height_um, 0.97))
@@ -248,7 +250,7 @@ def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:
 
 
 def test_bytes_without_a_known_start_are_unknown_and_not_damaged(tmp_path: Path) -> None:
-    """NanoFocus' NMS begins like an Igor wave of version 2."""
+    """NanoFocus' NMS begins like an Igor wave of version 2 and is not called a damaged wave."""
     path = tmp_path / "scan.nms"
     path.write_bytes(b"\2\0\0\0\1\0\0\0\0\0\xff\xff" + bytes(4000))
     refused(path, "unknown content", unit=None)
@@ -261,7 +263,7 @@ def test_a_digital_surf_file_of_another_kind_is_named(tmp_path: Path, kind: int)
     raw = bytearray(path.read_bytes())
     raw[18] = kind
     path.write_bytes(raw)
-    if kind == 1:  # more than one line all the same
+    if kind == 1:  # this message takes more than one line
         assert read_scan(path).shape == SHAPE
     else:
         refused(path, f"kind of studiable, got {kind}", unit=None)
@@ -286,8 +288,13 @@ def test_axes_at_uneven_steps_are_refused(tmp_path: Path) -> None:
         ("nm", 20, None),
     ],
 )
-def test_coordinates_without_a_unit(tmp_path: Path, unit: str, step: float, pitch_um: float | None) -> None:
-    """They are µm or in the unit of the heights; where both make a scan, the size has to be given."""
+def test_coordinates_without_a_unit_are_taken_as_micrometres_or_need_a_size(
+    tmp_path: Path, unit: str, step: float, pitch_um: float | None
+) -> None:
+    """The coordinates are in µm or in the unit of the heights.
+
+    If both give a scan, the size has to be given.
+    """
     path = tmp_path / "scan.txt"
     values = 0.05 * np.random.default_rng(0).random((9, 12))
     values[0, 1:], values[1:, 0] = np.arange(11) * step, np.arange(8) * step

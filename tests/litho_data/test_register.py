@@ -51,9 +51,9 @@ def test_known_warp_is_recovered_at_snr_5_in_any_orientation_and_polarity(index)
     truth = true_scan_to_layout(warp, orientation, SCAN_SHAPE)
     assert (found.quality.dihedral, found.quality.polarity) == (orientation, polarity)
     assert found.quality.passed, found.quality.reason
-    # The target; white noise at SNR 5 alone would allow about 0.02 px at a corner.
+    # This is the required accuracy. White noise at SNR 5 alone would allow about 0.02 px at a corner.
     assert warp_error_px(found.scan_to_layout, truth, SHAPE) < 0.3
-    # The record's own claim must hold: no corner further off than six of its standard deviations.
+    # The stated uncertainty must hold: no corner is off by more than six standard deviations.
     assert warp_error_px(found.scan_to_layout, truth, SHAPE) < 6 * found.quality.corner_sd_px + 0.02
 
 
@@ -67,7 +67,7 @@ RUNGS = {
 
 
 @pytest.mark.parametrize("rung", RUNGS)
-def test_ladder_stops_at_the_rung_the_phantom_was_made_with(rung):
+def test_the_ladder_of_models_stops_at_the_model_of_the_phantom(rung):
     layout = random_layout(SHAPE, seed=11)
     warp = warp_about_centre(SHAPE, shift_px=(3.3, -4.6), margin_px=MARGIN_PX, **RUNGS[rung])
     found = register(scan_of(layout, warp, SCAN_SHAPE, snr=5, seed=1), layout, model="ladder")
@@ -75,7 +75,7 @@ def test_ladder_stops_at_the_rung_the_phantom_was_made_with(rung):
     error = warp_error_px(found.scan_to_layout, true_scan_to_layout(warp, "identity", SCAN_SHAPE), SHAPE)
     assert error < 0.3
     wanted_um = PITCH_UM * np.add((3.3, -4.6), MARGIN_PX)
-    # The same 0.3 px.
+    # The limit is again 0.3 px.
     shift_um = (found.quality.shift_x_um, found.quality.shift_y_um)
     assert shift_um == pytest.approx(wanted_um, abs=0.3 * PITCH_UM)
 
@@ -137,7 +137,7 @@ def test_without_structure_the_centred_placement_comes_back_as_failed(empty):
 
 
 def test_correlation_takes_over_where_keypoints_are_too_few():
-    # A few broad bumps: ORB finds nothing to hold on to.
+    # The layout has a few broad bumps, on which ORB finds no keypoints.
     layout = random_layout(SHAPE, seed=3, blob_px=30.0)
     warp = warp_about_centre(
         SHAPE, rotation_deg=0.5, scale=(1.04, 0.97), margin_px=MARGIN_PX, shift_px=(3.0, -2.0)

@@ -1,4 +1,4 @@
-"""Scans that the scanner has bent: recovered, stored, replayed; and nothing is bent that is not."""
+"""A bend of the scanner is recovered, stored and replayed, and a straight scan is not bent."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from tests.litho_data.test_register_quality import GOOD
 
 SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
 AMOUNT_UM = np.array([[0.66, -0.45, 0.54], [-0.6, 0.72, 0.39]])
-# The target of a straight scan, too. White noise at SNR 5 alone moves a corner by about 0.02 px under an
-# affine; twelve numbers know it (26 / 7)**0.5 times worse: the squares of the basis functions, of unit mean
-# square, add up to 1 + 3 + 3 there, and with the quadratic ones to 5 + 9 + 5 more.
+# The limit is that of a straight scan. White noise at SNR 5 alone moves a corner by about 0.02 px under an
+# affine warp. Twelve parameters are (26 / 7)**0.5 times less certain: the squares of the basis functions, of
+# unit mean square, add up to 1 + 3 + 3 there for an affine, and the quadratic ones add 5 + 9 + 5.
 CORNER_PX = 0.3
 PITCHES = {"scan_pitch_um": (PITCH_UM, PITCH_UM), "layout_pitch_um": PITCH_UM}
 
@@ -45,20 +45,20 @@ def bend_of(factor: float = 1.0, shape: tuple[int, int] = SCAN_SHAPE) -> Bend:
 
 
 def true_map() -> np.ndarray:
-    """Straightened scan to layout, µm."""
+    """Return the true map from the straightened scan to the layout, µm."""
     frame = index_to_um((PITCH_UM, PITCH_UM))
     warp = warp_about_centre(SHAPE, rotation_deg=0.8, scale=(1.01, 0.99), margin_px=(39.0, 35.0))
     return frame @ np.linalg.inv(warp) @ np.linalg.inv(frame)
 
 
 def places_um(shape: tuple[int, int]) -> np.ndarray:
-    """(x, y) of all pixel centres of a scan, row by row."""
+    """Return (x, y) of all pixel centres of a scan, row by row."""
     y, x = (PITCH_UM * (one.ravel() + 0.5) for one in np.indices(shape))
     return np.stack([x, y], axis=1)
 
 
 def bent_scan(layout: np.ndarray, bend: Bend, snr: float = 5.0) -> np.ndarray:
-    """The blurred print where each pixel of a bent scan really was, and white noise."""
+    """Return the blurred print at the true place of each pixel of a bent scan, plus white noise."""
     print_um = LEVEL_HEIGHT_UM * gaussian_filter(layout.astype(float), PRINT_BLUR_PX, mode="constant")
     x, y = apply_transform(true_map(), bend.straighten(places_um(SCAN_SHAPE))).T / PITCH_UM - 0.5
     scan = map_coordinates(print_um, (y, x), order=5, mode="constant").reshape(SCAN_SHAPE)
@@ -86,7 +86,7 @@ def test_a_known_bend_is_recovered_in_any_orientation(orientation, factor, model
     assert found.quality.passed, found.quality.reason
     assert found.quality.model == "quadratic"
     assert found.quality.dihedral == orientation
-    # Every pixel of the scan that shows the layout: where the record puts it, against where it was.
+    # For every pixel on the layout, compare the registered place with the true place.
     upright_um = places_um(SCAN_SHAPE)
     truth_um = apply_transform(true_map(), bend.straighten(upright_um))
     turn = orientation_matrix(back, SCAN_SHAPE)
@@ -94,21 +94,22 @@ def test_a_known_bend_is_recovered_in_any_orientation(orientation, factor, model
     seen = ((truth_um > 0) & (truth_um < PITCH_UM * np.array(SHAPE[::-1]))).all(axis=1)
     error_px = np.hypot(*(layout_places_um(found, turned_um) - truth_um)[seen].T) / PITCH_UM
     assert error_px.max() < CORNER_PX
-    # The record's own claim: no corner further off than six of its standard deviations.
+    # The stated uncertainty holds: no corner is off by more than six standard deviations.
     assert error_px.max() < 6 * found.quality.corner_sd_px + 0.02
-    # The largest displacement is at the frame's corner, beyond the layout's by up to (430 / 352)².
+    # The largest displacement is at the corner of the frame. It exceeds that on the layout by up to (430 /
+    # 352)².
     assert found.bend_um.largest == pytest.approx(bend.largest, abs=CORNER_PX * PITCH_UM * (430 / 352) ** 2)
     assert f"scan bent by up to {found.bend_um.largest:.2f} µm" in found.quality.warning
 
 
-def test_the_straight_warp_alone_misses_its_limits_where_the_bend_is_needed():
+def test_a_straight_warp_of_a_bent_scan_exceeds_its_limits():
     layout = random_layout(SHAPE, seed=2)
     scan = bent_scan(layout, bend_of())
-    # A model that is stiffer by choice does not bend, and shows what an affine would leave.
+    # A stiffer model that was chosen does not bend, and shows the residual of an affine warp.
     stiff = register(scan, layout, model="similarity")
     assert stiff.bend_um is None
     assert "target registration error" in stiff.quality.reason
-    # The limit of a pass is 1.5 px; a block's shift is known to a tenth of a pixel at SNR 5.
+    # A scan passes below 1.5 px. The shift of a block is known to a tenth of a pixel at SNR 5.
     assert register(scan, layout).quality.tre_median_px < 0.3 < 1.5 < stiff.quality.tre_median_px
 
 
@@ -119,8 +120,9 @@ def test_a_straight_scan_is_not_bent():
     assert found.bend_um is None
 
 
-def test_a_bend_that_the_straight_warp_can_live_with_stays_out():
-    # At most 0.15 µm, 1.5 px, at a corner, and less elsewhere: within the limits of an affine.
+def test_a_bend_within_the_limits_of_a_straight_warp_is_not_fitted():
+    # The bend is at most 0.15 µm, 1.5 px, at a corner, and smaller elsewhere. An affine warp is within its
+    # limits.
     layout = random_layout(SHAPE, seed=3)
     found = register(bent_scan(layout, bend_of(0.1)), layout)
     assert bend_of(0.1).largest < 0.16
@@ -163,13 +165,13 @@ def test_undo_is_the_inverse_of_straighten_up_to_the_fold():
     assert 0.5 < bend.slope < 1
     points = bend.middle + bend.half * unit
     back = np.stack(bend.undo(*bend.straighten(points).T), axis=1)
-    # It ends with a step below 1e-9 half widths, 2e-8 µm, and each step is at most 0.9 of the last.
+    # The iteration ends with a step below 1e-9 half widths, 2e-8 µm. Each step is at most 0.9 of the last.
     np.testing.assert_allclose(back, points, atol=2e-7)
 
 
-def test_a_bend_is_centred_turns_into_pixels_and_is_found_from_its_points():
+def test_a_bend_is_centred_converts_to_pixels_and_is_fitted_from_points():
     bend = bend_of()
-    # The terms are orthogonal to 1, u, v over the frame: nothing affine is left in a dense average.
+    # The terms are orthogonal to 1, u, v over the frame, so a dense average contains no affine part.
     u, v = np.meshgrid(*[(np.arange(400) + 0.5) / 200 - 1] * 2)
     shift = np.array(bend.shift(bend.middle[0] + bend.half[0] * u, bend.middle[1] + bend.half[1] * v))
     for basis in (np.ones_like(u), u, v):
@@ -192,8 +194,8 @@ def test_points_on_a_line_do_not_determine_a_bend():
         fit_bent_affine(on_a_line, on_a_line, bend.middle, bend.half)
 
 
-def test_resampling_looks_where_the_bend_says():
-    # A cubic spline reproduces a ramp: the registered height tells which place of the scan was taken.
+def test_resampling_reads_the_scan_at_the_bent_place():
+    # A cubic spline reproduces a ramp, so the registered height shows which place of the scan was read.
     y_um, x_um = (one.reshape(SCAN_SHAPE) for one in places_um(SCAN_SHAPE).T[::-1])
     bend, origin_um = bend_of(), true_map()
     taken = [resample_to_layout(ramp, origin_um, SHAPE, **PITCHES, bend_um=bend)[0] for ramp in (x_um, y_um)]
@@ -232,13 +234,13 @@ def test_a_bent_campaign_is_built_verified_and_replayed_from_its_raw_files(tmp_p
         np.testing.assert_array_equal(scan.bend_um.amount[0, 0], row["bend_x_by_xx_um"])
         shape = store.scan_frame(scan.id, "raw_height_um").shape
         frame = ScanFrame(shape, 0.1, np.array(truth.scans[index].scan_to_layout), 0.1)
-        # The fab itself says where each pixel was: it is made to scan ramps.
+        # The fab scans ramps, which give the true place of each pixel.
         true_px = np.stack([sample_surface(r, frame, board, index).ravel() for r in (x_px, y_px)], axis=1)
         found_um = apply_transform(scan.scan_to_layout, scan.bend_um.straighten(places_um(shape)))
         seen = ((true_px > 0) & (true_px < 255)).all(axis=1)
         error_px = np.hypot(*(found_um / 0.1 - 0.5 - true_px)[seen].T)
         assert error_px.max() < 6 * row["corner_sd_px"] + 0.02
-        # Its limit of a pass is 1.5 px at the worst corner; over the field a third of that.
+        # A scan passes below 1.5 px at the worst corner. The mean over the field is a third of that.
         assert np.sqrt((error_px**2).mean()) < 0.5
         assert row["tre_median_px"] < 1.0
     step = {one.op: one for _, one in read_steps(store)[store.ids[0]]}

@@ -54,8 +54,9 @@ def test_no_scan_correlates_less_than_the_authors_own(registered):
 
 
 def test_the_median_correlation_reaches_the_reference_figure(registered):
-    # 0.960 is the reference for layout and height smoothed alike. Against the layout's sharp steps
-    # the authors' own quadrants reach 0.951: that bound says how sharp a print is, not how it lies.
+    # 0.960 is the reference for a layout and a height that are smoothed alike. Against the sharp steps of the
+    # layout the authors' own quadrants reach 0.951. That bound depends on the sharpness of a print, not on
+    # its registration.
     alike = [correlation(h, gaussian_filter(m.astype(float), 1)) for h, m, _, _ in registered.values()]
     sharp = [quality.ncc_after for _, _, quality, _ in registered.values()]
     authors = [correlation(a, m.astype(float)) for _, m, _, a in registered.values()]
@@ -68,12 +69,15 @@ def test_held_out_blocks_lie_within_a_pixel(registered):
         assert quality.tre_windows >= 40
         assert quality.tre_median_px < 1.0, name
         if name[3] in "67":
-            # These rows have structure fine enough to place nearly every block.
+            # In these rows of prints the structure is fine enough to place nearly every block.
             assert quality.tre_p95_px < 1.5, name
 
 
 def correlation(height_um: np.ndarray, layout: np.ndarray) -> float:
-    """Pearson, height smoothed with sigma = 1 px by normalised convolution, 8 px from the border."""
+    """Return the Pearson correlation, 8 px from the border, of the layout and the smoothed height.
+
+    The height is smoothed with sigma = 1 px by normalised convolution.
+    """
     valid = np.isfinite(height_um)
     weight = gaussian_filter(valid.astype(float), 1)
     smoothed = gaussian_filter(np.where(valid, height_um, 0.0).astype(float), 1) / np.maximum(weight, 1e-12)

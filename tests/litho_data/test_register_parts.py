@@ -1,4 +1,4 @@
-"""A part of the registration that is a fast way to something with a plain definition."""
+"""Test a fast part of the registration against its plain definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a registration counts as passed, and how wide a blur is matched."""
+"""Test when a registration passes, and up to which width a blur is matched."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOOD = {
 }
 
 
-def test_a_good_fit_passes_without_a_word():
+def test_a_good_fit_passes_without_a_warning():
     assert judge(GOOD, 2.0) == (True, "", "")
 
 

@@ -1,4 +1,4 @@
-"""The one resampling: equal to the analytic field, honest about gaps and edges."""
+"""Resampling equals the analytic field and marks gaps and edges as invalid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCAN_PITCH_UM, LAYOUT_PITCH_UM = (0.1, 0.09), 0.1
 
 
 def field_um(x_um: np.ndarray, y_um: np.ndarray) -> np.ndarray:
-    """Band-limited: periods of 2 µm and 1.6 µm, 18 pixels and 16."""
+    """Return a band-limited field with periods of 2 µm and 1.6 µm, 18 pixels and 16."""
     return 0.4 * np.sin(2 * np.pi * x_um / 2.0 + 0.3) * np.cos(2 * np.pi * y_um / 1.6) + 0.01 * x_um
 
 
@@ -47,7 +47,7 @@ def test_a_band_limited_field_comes_out_as_its_formula(flip):
     on_scan = apply_transform(np.linalg.inv(transform), np.stack([x.ravel(), y.ravel()], axis=1))
     expected = field_um(*on_scan.T).reshape(LAYOUT_SHAPE)
     assert height.dtype == np.float32
-    # The spline's boundary condition is felt for a few pixels (0.268 per pixel): keep six away.
+    # The boundary condition of the spline decays by 0.268 per pixel. Six pixels are left out.
     inner = np.zeros(LAYOUT_SHAPE, bool)
     near = 6 * np.array(SCAN_PITCH_UM[::-1])
     size = np.array([SCAN_SHAPE[1] * SCAN_PITCH_UM[1], SCAN_SHAPE[0] * SCAN_PITCH_UM[0]])
@@ -82,7 +82,7 @@ def test_two_transforms_compose_in_micrometres():
     )
     both = np.isfinite(once) & np.isfinite(twice)
     both[:20], both[-20:], both[:, :20], both[:, -20:] = False, False, False, False
-    # Two interpolations of 1e-4 µm each.
+    # Two interpolations are off by 1e-4 µm each.
     np.testing.assert_allclose(once[both], twice[both], atol=3e-4)
 
 
@@ -96,7 +96,7 @@ def test_outside_the_scan_nothing_is_valid_and_heights_are_nan():
     np.testing.assert_array_equal(np.isnan(height), ~valid)
 
 
-def test_a_gap_takes_its_kernel_with_it_and_poisons_nothing_else():
+def test_a_gap_invalidates_the_pixels_of_its_kernel_and_no_others():
     x, y = grid_um((80, 90), (0.1, 0.1))
     scan = field_um(x, y)
     scan[30, 40] = np.nan
@@ -110,15 +110,15 @@ def test_a_gap_takes_its_kernel_with_it_and_poisons_nothing_else():
     expected = field_um(x - 0.025, y - 0.025)
     far = valid.copy()
     far[:6], far[-6:], far[:, :6], far[:, -6:] = False, False, False, False
-    # A straight continuation is wrong by at most k² · 0.4 µm = 0.06 µm one pixel into the gap (k = 2π/16),
-    # of which the cardinal spline passes on about 3 % two pixels away.
+    # A straight continuation is wrong by at most k² · 0.4 µm = 0.06 µm one pixel into the gap (k = 2π/16).
+    # The cardinal spline passes on about 3 % of it two pixels away.
     assert np.abs(height - expected)[far].max() < 2e-3
     far[52:, 62:] = False
     far[22:39, 32:49] = False
     np.testing.assert_allclose(height[far], expected[far], atol=1e-4)
 
 
-def test_white_noise_leaves_with_the_recorded_share_of_its_variance():
+def test_resampled_white_noise_has_the_recorded_share_of_its_variance():
     noise = np.random.default_rng(1).standard_normal((600, 600))
     rotation = similarity(3.0, 1.0, (0.0, 0.0))
     out, valid = resample_to_layout(
@@ -152,12 +152,12 @@ def test_a_gap_continues_the_plane_of_what_is_measured_beside_it(turns, wide):
     plane = np.rot90(0.02 * y - 0.05 * x, turns)
     height = plane.copy()
     height[:-wide] = np.nan
-    # Reflected about its border, as far as the measured strip is wide.
+    # The measured strip is reflected about its border, as far as it is wide.
     filled = slice(-2 * wide + 1, -wide)
     np.testing.assert_allclose(fill_gaps(height)[filled], plane[filled], atol=1e-12)
 
 
 @pytest.mark.parametrize("matrix", [np.eye(2), np.zeros((3, 3)), np.full((3, 3), np.nan)])
-def test_a_transform_that_is_none_is_refused(matrix):
+def test_an_invalid_transform_is_refused(matrix):
     with pytest.raises(InputError, match="scan_to_layout"):
         resample_to_layout(np.ones((40, 40)), matrix, (40, 40), scan_pitch_um=(0.1, 0.1), layout_pitch_um=0.1)

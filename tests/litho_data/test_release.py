@@ -54,7 +54,7 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
         raw = entities[one["@id"]]
         assert raw["identifier"] == f"sha256:{file_sha256(campaign / raw['name'])}"
     assert action["startTime"] < action["endTime"]
-    # RO-Crate 1.1 asks every root dataset for these.
+    # RO-Crate 1.1 requires these entries for every root dataset.
     assert {"name", "description", "datePublished"} <= set(root)
 
 

@@ -1,4 +1,4 @@
-"""Roughness against closed forms and surfaces of known spectrum."""
+"""Test roughness against closed forms and surfaces of known spectrum."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PITCH_UM = 0.1
 
 
 def gaussian_surface(shape: tuple[int, int], length_um: float, seed: int) -> np.ndarray:
-    """Periodic Gaussian surface with autocorrelation exp(−r²/T²), 10 nm rms on average, µm."""
+    """Return a periodic Gaussian surface, autocorrelation exp(−r²/T²), 10 nm rms on average, in µm."""
     frequency = np.hypot(
         np.fft.fftfreq(shape[0], PITCH_UM)[:, None], np.fft.rfftfreq(shape[1], PITCH_UM)[None]
     )
-    # The transform of exp(−r²/T²) goes as exp(−π²T²f²); an amplitude filter is its root.
+    # The transform of exp(−r²/T²) is proportional to exp(−π²T²f²). The filter of amplitudes is its root.
     transfer = np.exp(-((np.pi * length_um * frequency) ** 2) / 2)
     field = np.fft.irfft2(
         np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape)) * transfer, s=shape
@@ -43,7 +43,8 @@ class TestAmplitudes:
     def test_sine_has_its_closed_form_values(self):
         x = np.arange(400) / 400 * 2 * np.pi * 5
         found = amplitude_parameters(0.05 * np.sin(x)[None, :].repeat(3, 0))
-        # 80 pixels per period: sums of sin² and sin⁴ are exact, the sampled mean|sin| is 2/80·cot(π/80).
+        # With 80 pixels per period the sums of sin² and sin⁴ are exact. The sampled mean|sin| is
+        # 2/80·cot(π/80).
         assert found.sq_nm == pytest.approx(50 / 2**0.5, rel=1e-12)
         assert found.sa_nm == pytest.approx(50 * 2 / 80 / np.tan(np.pi / 80), rel=1e-12)
         assert found.ssk == pytest.approx(0, abs=1e-12)
@@ -58,7 +59,7 @@ class TestAmplitudes:
         assert found.ssk == pytest.approx(0.8 / 0.3, rel=1e-9)
         assert found.sku == pytest.approx(3 + (1 - 0.54) / 0.09, rel=1e-9)
 
-    def test_offset_changes_nothing_and_missing_pixels_are_left_out(self):
+    def test_an_offset_changes_nothing_and_missing_pixels_are_ignored(self):
         height = np.random.default_rng(0).standard_normal((40, 50)) * 0.01
         holes = np.where(np.random.default_rng(1).random(height.shape) < 0.2, np.nan, height)
         assert amplitude_parameters(height + 3).sq_nm == pytest.approx(amplitude_parameters(height).sq_nm)
@@ -87,14 +88,14 @@ class TestSpectra:
         spectrum = psd_along(height, PITCH_UM, "x", window=False)
         peak = np.argmax(spectrum.density)
         assert spectrum.frequency_per_um[peak] == pytest.approx(1.2)
-        # All power, amplitude²/2, in one bin of width 1/50 per µm.
+        # All power, amplitude²/2, lies in one bin of width 1/50 per µm.
         assert spectrum.density[peak] / 50 == pytest.approx(20**2 / 2, rel=1e-9)
 
     def test_white_noise_is_level_also_through_the_window(self):
         height = np.random.default_rng(3).standard_normal((400, 256)) * 0.002
         spectrum = psd_along(height, PITCH_UM, "x")
-        # One-sided density of white noise: 2 σ² pitch = 0.8 nm²µm; 400 lines average to 5 % per bin,
-        # 100 bins together to 1 %.
+        # The one-sided density of white noise is 2 σ² pitch = 0.8 nm²µm. The mean of 400 lines is known to 5
+        # % per bin, and that of 100 bins to 1 %.
         assert spectrum.density[10:110].mean() == pytest.approx(2 * 4 * PITCH_UM, rel=0.03)
 
     def test_nan_is_an_error(self):
@@ -107,20 +108,21 @@ class TestCorrelation:
         x = np.arange(400)
         correlation = autocorrelation(np.cos(2 * np.pi * x / 40)[None, :].repeat(8, 0))
         centre = correlation.shape[1] // 2
-        # Whole numbers of pairs only every half period; there it is exact: −1 at half a period.
+        # The pairs span a whole number of periods only at every half period. There the value is exact: −1 at
+        # half a period.
         assert correlation[0, centre + 20] == pytest.approx(-1, abs=1e-9)
         assert correlation[0, centre + 40] == pytest.approx(1, abs=1e-9)
 
     def test_white_noise_counts_every_pixel(self):
         noise = np.random.default_rng(4).standard_normal((128, 128))
-        # ρ² of the remaining lags is about 1/pairs each; a quarter of the field holds 64·65/… ≈ 0.3 of them.
+        # ρ² of each other lag is about 1/pairs. Over a quarter of the field they add up to 64·65/… ≈ 0.3.
         assert effective_samples(noise) > 0.6 * noise.size
 
     def test_uncertainty_of_sq_matches_its_scatter(self):
         surfaces = [gaussian_surface((128, 128), 0.8, seed) for seed in range(60)]
         scatter = np.std([amplitude_parameters(s).sq_nm for s in surfaces])
         stated = np.mean([sq_uncertainty_nm(s) for s in surfaces])
-        # An sd from 60 draws is known to 1/√120 = 9 %; the estimate of Σρ² adds about as much.
+        # An sd from 60 draws is known to 1/√120 = 9 %. The estimate of Σρ² adds about as much.
         assert stated == pytest.approx(scatter, rel=0.35)
 
 
@@ -132,11 +134,11 @@ class TestStepHeight:
         assert found.height_nm == pytest.approx(-250, abs=1e-9)
         assert found.line_sd_nm == pytest.approx(0, abs=1e-9)
 
-    def test_rounded_edges_do_not_count(self):
+    def test_rounded_edges_do_not_affect_a_step_height(self):
         x_um = (np.arange(300) + 0.5) * PITCH_UM
         smooth = 0.1 * (np.tanh((x_um - 10) / 0.3) - np.tanh((x_um - 20) / 0.3)) / 2
         found = groove_depth(smooth[None, :].repeat(3, 0), PITCH_UM, left_um=10, right_um=20)
-        # A third of 10 µm is 11 lengths of the tanh: e^−22 of the step is left.
+        # A third of 10 µm is 11 lengths of the tanh, where e^−22 of the step remains.
         assert found.height_nm == pytest.approx(100, abs=1e-6)
 
     def test_stairs_along_y_with_missing_pixels(self):
@@ -170,15 +172,15 @@ class TestLevellingBias:
         def white(y_um, x_um):
             return ((y_um == 0) & (x_um == 0)).astype(float)
 
-        # 6 terms of a second-order polynomial out of 32 × 40 pixels.
+        # A second-order polynomial uses 6 terms for 32 × 40 pixels.
         assert retained_variance((32, 40), PITCH_UM, white, degree=2) == pytest.approx(
             1 - 6 / 1280, rel=1e-12
         )
-        # Independent degrees 1 × 2: 2 · 3 terms.
+        # Independent degrees 1 × 2 use 2 · 3 terms.
         assert retained_variance((32, 40), PITCH_UM, white, degree=(1, 2)) == pytest.approx(
             1 - 6 / 1280, rel=1e-12
         )
-        # Rows alone: two terms out of 40 pixels.
+        # Rows alone use two terms for 40 pixels.
         assert retained_variance((1, 40), PITCH_UM, white, degree=(0, 1)) == pytest.approx(
             1 - 2 / 40, rel=1e-12
         )
@@ -192,21 +194,21 @@ class TestLevellingBias:
         assert found == pytest.approx(closed, rel=2e-4)
 
     @pytest.mark.parametrize("degree", [0, 1, 2])
-    def test_monte_carlo_agrees(self, degree):
+    def test_the_levelling_bias_agrees_with_a_monte_carlo_simulation(self, degree):
         shape, length_um = (64, 64), 0.6
         y, x = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij"))
         basis = np.stack([x**p * y**q for p in range(degree + 1) for q in range(degree + 1 - p)], axis=1)
         q, _ = np.linalg.qr(basis)
         kept = []
         for seed in range(200):
-            # Cut from a larger periodic surface, so that opposite edges are independent.
+            # The surfaces are cut from a larger periodic one, so that opposite edges are independent.
             surface = gaussian_surface((128, 128), length_um, seed)[:64, :64].ravel() / 0.010
             kept.append(np.mean((surface - q @ (q.T @ surface)) ** 2))
         expected = retained_variance(shape, PITCH_UM, gaussian_correlation(length_um), degree=degree)
         # 6.4²/(π·0.36/2) = 72 spots per surface: relative sd √(2/72/200) = 1.2 %.
         assert np.mean(kept) == pytest.approx(expected, rel=0.04)
 
-    def test_rows_lose_more_than_the_field(self):
+    def test_levelling_rows_removes_more_variance_than_levelling_the_field(self):
         correlation = gaussian_correlation(0.8)
         by_rows = retained_variance((1, 128), PITCH_UM, correlation, degree=(0, 1))
         assert by_rows < retained_variance((128, 128), PITCH_UM, correlation, degree=1)

@@ -1,4 +1,4 @@
-"""Lines of a surface: their direction and their period are found, and not where there are none."""
+"""The direction and the period of lines on a surface are found, and none are found where there are none."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ PITCH_UM = 0.1
 
 
 def rough(seed: int, size_px: int = 192) -> np.ndarray:
-    """Roughness alike in all directions with some white noise, as scans have it."""
+    """Return isotropic roughness with some white noise, as scans have it."""
     random = np.random.default_rng(seed)
     white = random.normal(size=(2, size_px, size_px))
     return gaussian_filter(white[0], 2.0, mode="wrap") + 0.03 * white[1]
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0, -45.0])
-def test_the_direction_of_lines_is_theirs(angle_deg: float) -> None:
+def test_the_direction_of_lines_is_found(angle_deg: float) -> None:
     y, x = np.mgrid[:192, :192] - 96.0
     across = -np.sin(np.radians(angle_deg)) * x + np.cos(np.radians(angle_deg)) * y
     line = gaussian_filter(np.random.default_rng(1).normal(size=400), 3.0)
@@ -40,7 +40,7 @@ def test_lines_that_are_weak_in_one_surface_stand_out_in_ten() -> None:
     assert abs(abs(turned.angle_deg) - 90) < 5
 
 
-def test_chances_are_what_they_say() -> None:
+def test_stated_probabilities_are_right() -> None:
     count = 200
     direction = np.array([line_direction([rough(seed, 96)]).p for seed in range(count)])
     period = []
@@ -48,13 +48,13 @@ def test_chances_are_what_they_say() -> None:
         found = line_period([rough(seed, 128).mean(axis=1)], PITCH_UM)
         assert found is not None
         period.append(found.p)
-    # 5 % of 200 are 10 ± 3; up to 4 standard deviations.
+    # 5 % of 200 draws are 10 ± 3. Up to four standard deviations are allowed.
     assert (direction < 0.05).sum() <= 22
     assert (np.array(period) < 0.05).sum() <= 22
 
 
 def test_a_period_is_found_with_its_amplitude_and_phase() -> None:
-    """A weak wave of 1.3 µm, the same in all surfaces or with phases of their own."""
+    """A weak wave of 1.3 µm has the same phase in all surfaces, or an independent phase in each."""
     random = np.random.default_rng(3)
     at = np.arange(256)
     noise = gaussian_filter(random.normal(size=(12, 256)), (0, 1.0)) * 0.01
@@ -70,10 +70,12 @@ def test_a_period_is_found_with_its_amplitude_and_phase() -> None:
         assert found.p < 1e-4
         # A bin of 25.6 µm is 1.3² / 25.6 = 0.07 µm wide here.
         assert found.period_um == pytest.approx(1.3, abs=0.03)
-        # The noise adds to the amplitude at this frequency in quadrature: less than a third of it.
+        # The noise adds in quadrature to the amplitude at this frequency. It is less than a third of the
+        # amplitude.
         assert found.amplitude_um == pytest.approx(0.004, rel=0.15)
     assert locked.coherence > 0.9
-    # Twelve random phasors: 1 / √12 = 0.29 on average, beyond 0.7 in exp(-12 · 0.49) = 0.3 % of draws.
+    # The mean of twelve random phasors is 1 / √12 = 0.29 on average, and above 0.7 in exp(-12 · 0.49) = 0.3 %
+    # of draws.
     assert free.coherence < 0.7
 
 
@@ -83,7 +85,7 @@ def test_few_lines_have_no_period_and_small_surfaces_no_direction() -> None:
         line_direction([np.zeros((63, 100))])
 
 
-def test_flat_surfaces_have_neither() -> None:
+def test_flat_surfaces_have_neither_period_nor_direction() -> None:
     assert line_direction([np.zeros((64, 64))]).p == 1.0
     found = line_period([np.zeros(128)], PITCH_UM)
     assert found is None or found.p > 0.5

@@ -1,4 +1,4 @@
-"""What a result says about its run: the command if there was one, and whether the code was changed."""
+"""A result records its run: the command, if there was one, and whether the code was changed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_data.level.scan import LevelRecord
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A git repository with one committed file in each package and one beside them."""
+    """Make a git repository with one committed file in each package and one beside the packages."""
     for name in ("litho_data", "litho_models", "litho_design", "docs"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.py").write_text("1\n")
@@ -34,7 +34,7 @@ def test_a_change_in_any_package_makes_the_checkout_dirty(checkout: Path, packag
     assert checkout_state(checkout) == {**clean, "dirty": True}
 
 
-def test_a_new_file_counts_and_a_page_does_not(checkout: Path) -> None:
+def test_a_new_code_file_makes_the_checkout_dirty_and_a_changed_page_does_not(checkout: Path) -> None:
     (checkout / "docs" / "a.py").write_text("2\n")
     assert checkout_state(checkout)["dirty"] is False
     (checkout / "litho_models" / "b.py").write_text("2\n")
@@ -45,7 +45,7 @@ def test_without_a_checkout_nothing_is_claimed(tmp_path: Path) -> None:
     assert checkout_state(tmp_path) == {"commit": None, "dirty": None}
 
 
-def test_the_command_is_recorded_inside_and_nowhere_else() -> None:
+def test_a_command_is_recorded_only_while_it_runs() -> None:
     assert run_facts()["command"] == ""
     with running_command("litho-data build card.toml"):
         assert run_info([3], 5, ["a: torn"]).command == "litho-data build card.toml"
@@ -66,6 +66,6 @@ def test_every_command_line_records_itself(tmp_path: Path, monkeypatch: pytest.M
     assert {"numpy", "blas"} <= set(record.versions)
 
 
-def test_an_older_result_has_nothing_to_say_about_the_tree() -> None:
+def test_an_older_result_states_nothing_about_the_checkout() -> None:
     old = {"command": "a", "commit": "b", "versions": {}, "seeds": [0], "n_scans": 1, "dropped": []}
     assert RunInfo.model_validate(old).dirty is None

@@ -61,7 +61,7 @@ def test_heights_are_copied_and_locked() -> None:
     assert scan.grid.size_um == pytest.approx((0.3, 0.8))
 
 
-def test_what_is_not_finite_is_not_measured() -> None:
+def test_values_that_are_not_finite_count_as_missing() -> None:
     height = HEIGHT_UM.copy()
     height[1, 1:3] = np.inf, -np.inf
     assert np.isnan(Scan(height_um=height, pitch_um=None).height_um[1, 1:3]).all()
@@ -78,7 +78,7 @@ def test_what_is_not_finite_is_not_measured() -> None:
         ({"pitch_um": (0.1, float("nan"))}, "pitch"),
     ],
 )
-def test_what_is_no_scan_is_refused(arguments: dict, message: str) -> None:
+def test_an_invalid_scan_is_refused(arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Scan(**({"height_um": HEIGHT_UM, "pitch_um": None} | arguments))
 

@@ -1,4 +1,4 @@
-"""The one key of a scan: change any field of the record, and the key changes."""
+"""A change of any field of a scan changes its key."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHAPE, LEVELS = (6, 5), 13
 
 
 def whole_scan() -> PrintedScan:
-    """A scan that states everything it can."""
+    """Return a scan in which every optional field is set."""
     rng = np.random.default_rng(0)
     return PrintedScan(
         id="P11", print_id="P1", order=3,
@@ -36,7 +36,7 @@ def whole_scan() -> PrintedScan:
 
 
 def otherwise(value: Any) -> list[Any]:
-    """Other values of the same kind: the nearest, the same in another place, none of it."""
+    """Return other values of the same kind: the next value, the same value elsewhere, an empty value."""
     if isinstance(value, np.ndarray):
         one, moved = value.copy(), value[::-1, ::-1].copy()
         one.flat[-1] = ~one.flat[-1] if one.dtype == bool else np.asarray(one.flat[-1] + 1, one.dtype)
@@ -72,15 +72,15 @@ def test_every_field_of_a_scan_is_in_its_key() -> None:
         assert scan_sha256(replace(scan, **left_out)) != scan_sha256(scan)
 
 
-def test_the_key_does_not_see_how_an_array_lies_in_memory() -> None:
+def test_the_key_does_not_depend_on_the_memory_layout_of_an_array() -> None:
     scan = whole_scan()
     turned = replace(scan, height_um=np.asfortranarray(scan.height_um))
     assert scan_sha256(turned) == scan_sha256(scan)
 
 
 @pytest.mark.parametrize("name", [one.name for one in fields(Job)])
-def test_every_field_of_own_layouts_decides_what_the_fab_makes(name: str) -> None:
-    """Layouts of one shape are not one layout."""
+def test_every_field_of_own_layouts_affects_the_result_of_the_fab(name: str) -> None:
+    """Two layouts of one shape must have different keys."""
     rng = np.random.default_rng(1)
     job = Job(id="P11", level=rng.integers(0, LEVELS, SHAPE).astype(np.uint8))
     value = getattr(job, name)

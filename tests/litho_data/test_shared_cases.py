@@ -1,4 +1,4 @@
-"""Files that were once read wrongly, from others: the map that their description promises, or why not."""
+"""Files from others that were once read wrongly give the described map, or a message that says why not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def cases(oracles: Path) -> Path:
     return folder
 
 
-# What a reader has to be told, how many pixels are missing, and whether the file states its size.
+# The arguments for the reader, the number of missing pixels, and whether the file states its size.
 READ: dict[str, tuple[dict, int, bool]] = {
     "scan.nhf": ({"channel": "Position Z, Forward"}, 0, True),
     "gwy_concat_plain.txt": ({"unit": "m", "channel": "block 1"}, 0, False),
@@ -39,12 +39,13 @@ READ: dict[str, tuple[dict, int, bool]] = {
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_case_that_is_a_map(cases: Path, name: str) -> None:
+def test_a_readable_case_gives_the_described_map(cases: Path, name: str) -> None:
     arguments, missing, has_size = READ[name]
     scan = read_scan(cases / name, **arguments)
     height = scan.height_um - np.nanmin(scan.height_um)
     assert scan.shape == SHAPE
-    # A mark in the upper left corner, and steps of 0.01 µm from row to row; Wyko's numbers are nm.
+    # The map has a mark in the upper left corner and steps of 0.01 µm from row to row. Wyko numbers are in
+    # nm.
     scale = 1e-3 if name == "wyko.asc" else 1.0
     assert height[:3, :3] == pytest.approx(0.9 * scale, rel=0.03)
     assert np.nanmedian(np.diff(height, axis=0)) == pytest.approx(0.01 * scale, rel=0.02)
@@ -63,7 +64,9 @@ def test_a_case_that_is_a_map(cases: Path, name: str) -> None:
         ("over12_a.png", "a picture"),
     ],
 )
-def test_a_case_that_is_asked_about(cases: Path, name: str, message: str) -> None:
+def test_a_case_that_cannot_be_read_as_it_stands_is_refused_with_a_reason(
+    cases: Path, name: str, message: str
+) -> None:
     with pytest.raises(InputError, match=message) as caught:
         read_scan(cases / name, **({} if name.endswith(("nhf", "nms", "png")) else {"unit": "um"}))
     assert "damaged" not in str(caught.value)
@@ -74,7 +77,7 @@ def test_park_states_unit_and_size(cases: Path) -> None:
     assert (scan.height_um.min(), scan.height_um.max()) == (0, pytest.approx(1))
     assert scan.pitch_um == pytest.approx((0.1, 0.1))
     scan = read_scan(cases / "card_park" / "scans" / "P1F1.tiff")
-    # What the store holds before levelling.
+    # These are the heights that the store holds before levelling.
     assert (scan.height_um.min(), scan.height_um.max()) == pytest.approx((0.126, 1.054), abs=5e-4)
     assert [one.is_height for one in list_channels(cases / "scan.nhf")] == [True, False, True, False]
 

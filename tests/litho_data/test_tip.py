@@ -1,4 +1,4 @@
-"""The tip of the microscope: laws of morphology, known tips, and where a tip did not touch."""
+"""Test the tip of the microscope: laws of morphology, known tips, and places that a tip did not touch."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _dilated(surface: np.ndarray, pitch_um: tuple[float, float], radius_um: floa
     return -paraboloid_erosion(-surface, pitch_um, radius_um).surface
 
 
-def test_a_paraboloid_axis_by_axis_is_the_paraboloid_at_once() -> None:
+def test_a_paraboloid_applied_axis_by_axis_equals_the_whole_paraboloid() -> None:
     rng, pitch = np.random.default_rng(1), (0.1, 0.07)
     field = rng.standard_normal((20, 26)) * 0.1
     field[3, 4] = np.nan
@@ -59,7 +59,7 @@ def test_a_paraboloid_axis_by_axis_is_the_paraboloid_at_once() -> None:
     known = np.where(measured, field, np.inf)
     eroded = scipy.ndimage.grey_erosion(known, structure=tip, mode="constant", cval=np.inf)
     assert np.allclose(found.surface[measured], eroded[measured], atol=1e-14)
-    # The owner of a pixel is where its height comes from.
+    # The owner of a pixel is the place from which its height comes.
     rows, columns = np.indices(field.shape)
     away = ((found.row - rows) * pitch[0]) ** 2 + ((found.column - columns) * pitch[1]) ** 2
     explained = field[found.row, found.column] + away / (2 * radius)
@@ -72,7 +72,7 @@ def test_a_surface_that_the_tip_follows_comes_back_and_an_image_stays_an_image()
     surface = 0.05 * np.sin(1.3 * rows) * np.cos(0.9 * columns)  # curvature below 0.13 / µm
     image = _dilated(surface, PITCH, 2.0)
     found = reconstructed(image, PITCH, 2.0)
-    # Contacts between pixels: at most (pitch/2)² (1/2R) per axis is lost, twice.
+    # Contacts lie between pixels, so the height is off by at most (pitch/2)² (1/2R) per axis, twice.
     assert np.abs(found - surface)[10:-10, 10:-10].max() < 2 * 0.05**2 / (2 * 2.0) * 2
     assert np.allclose(_dilated(found, PITCH, 2.0), image, atol=1e-14)
 
@@ -93,10 +93,10 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
 
 @pytest.mark.parametrize("seed", [5002, 5004, 5010, 5011])
 def test_a_few_tops_that_are_sharper_than_the_others_are_not_taken_for_the_tip(seed: int) -> None:
-    """Rounded bumps of many radii r: an image shows R + r, and where it ends few bumps decide."""
+    """For rounded bumps of many radii r, an image shows R + r, and a few bumps set its sharp end."""
     image, _ = print_under_tip("bumps", 0.15, 1.0, seed=seed)
     found = peak_radius(image + noise_of_snr(image.shape, 1.0, 50, seed), PITCH)
-    # Taken for estimates they would be 15 to 52 % too blunt.
+    # As estimates these radii would be 15 to 52 % too large.
     assert "parts of the scan" in found.reason
     assert found.radius_um is not None
     assert found.radius_um > 0.15
@@ -111,7 +111,7 @@ def test_a_tip_of_few_pixels_gets_an_upper_bound(kind: str, snr: float) -> None:
     assert found.radius_um > 0.06
 
 
-def test_the_end_of_a_sphere_is_found_as_well() -> None:
+def test_the_radius_of_a_spherical_tip_is_found() -> None:
     radius_um, fine_um = 2.0, PITCH[0] / OVER
     surface = fine_surface("pillars", 0.3, seed=11, size_px=64)
     reach = int(np.sqrt(2 * radius_um * 0.35) / fine_um)
@@ -122,13 +122,13 @@ def test_the_end_of_a_sphere_is_found_as_well() -> None:
         surface, footprint=np.isfinite(sphere), structure=sphere, mode="constant", cval=-np.inf
     )[OVER // 2 :: OVER, OVER // 2 :: OVER]
     found = estimate_tip([Scan(image, PITCH)])
-    # Along a line up the flank the curvature of a sphere is 1/R (1 + slope²)^1.5; the flanks end at 0.3 µm,
-    # where the slope is 0.62: up to 1.63 times as sharp. On the way there it is 1.23 times as sharp.
+    # Along a line up the flank the curvature of a sphere is 1/R (1 + slope²)^1.5. The flanks end at 0.3 µm,
+    # where the slope is 0.62 and the sphere 1.63 times as sharp. On the way there it is 1.23 times as sharp.
     assert found.radius_um is not None
     assert radius_um / 1.63 < found.radius_um < 1.1 * radius_um
 
 
-def test_a_flat_scan_sets_no_bound_and_a_rounded_surface_no_more_than_one() -> None:
+def test_a_flat_scan_gives_no_bound_and_a_rounded_surface_only_a_bound() -> None:
     rng = np.random.default_rng(3)
     flat = estimate_tip([Scan(0.003 * rng.standard_normal((128, 128)), PITCH)])
     assert (flat.kind, flat.radius_um, flat.radius_sd_um) == ("upper bound", None, None)
@@ -162,7 +162,7 @@ def test_an_estimate_is_refuted_by_a_sharper_scan() -> None:
     both = of_one_tip([said(0.5), wide, said(0.52)])
     assert both.radius_um == pytest.approx(0.51)
     assert not both.reason
-    # The third is 8 standard deviations blunter: not this tip but its surface.
+    # The third scan is 8 standard deviations blunter: it shows its surface, not this tip.
     assert of_one_tip([said(0.5), said(0.52), said(0.7)]).radius_um == pytest.approx(0.51)
     assert of_one_tip([said(0.5), tight]) == tight
 
@@ -178,7 +178,7 @@ def test_offsets_of_lines_and_turning_points_do_not_sharpen_the_bound() -> None:
     assert turned.radius_um == pytest.approx(found.radius_um, rel=1e-9)
 
 
-def test_gaps_say_nothing_about_the_tip() -> None:
+def test_gaps_do_not_affect_the_tip() -> None:
     scan = _scan("pillars", 0.5, 100)
     gaps = scan.height_um.copy()
     gaps[40:60, 70:100] = np.nan
@@ -207,7 +207,7 @@ def test_untouched_pixels_are_uncertain_and_most_of_the_touched_certain(
 
 @pytest.mark.parametrize("kind", ["pillars", "spikes", "bumps"])
 def test_valleys_as_narrow_as_the_disc_are_uncertain_too(kind: str) -> None:
-    """A sharp tip and much noise: the disc that a curvature needs is more than half the reach of the tip."""
+    """With a sharp tip and much noise, the disc that fits a curvature is over half the reach of the tip."""
     inner = (slice(15, -15),) * 2
     for seed in (5000, 5001, 5002):
         image, touched = print_under_tip(kind, 0.15, 1.0, seed=seed)
@@ -234,8 +234,9 @@ def test_the_lateral_resolution_follows_its_closed_form_and_surface_topography()
     base_um, bump_um, radius_um = 1.0, 0.5, 1.0
     away = (rows - 4.0) ** 2 + (columns - 5.0) ** 2
     image = np.maximum(base_um**2 - away, 0) / (2 * bump_um)
-    # At distances d beyond its base the top of this cap has the curvature 2h/d², h = b²/2ρ: half of 1/R at
-    # d = b √(2R/ρ). λ is twice that; between pixels the curvature is taken for straight.
+    # At a distance d beyond its base the top of this cap has the curvature 2h/d², with h = b²/2ρ. It is half
+    # of 1/R at d = b √(2R/ρ). λ is twice that distance. Between pixels the curvature is interpolated
+    # linearly.
     found = lateral_resolution_um(image, PITCH, radius_um)
     assert found == pytest.approx(2 * base_um * np.sqrt(2 * radius_um / bump_um), rel=0.01)
     theirs = Topography(image, (8.0, 12.0), unit="um", periodic=False)
@@ -279,7 +280,7 @@ def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path) ->
     assert row["tip_radius_um"] == scan.tip_radius_um == 0.1
     assert before.tip_radius_um is None
     assert row["tip_certain_fraction"] == pytest.approx(certain.mean())
-    # The scan lies 8 pixels around its layout, turned and scaled by next to nothing.
+    # The scan lies 8 pixels around its layout, with almost no rotation or change of scale.
     on_layout = certain[8:-8, 8:-8]
     inner = (slice(3, -3),) * 2
     clear = scipy.ndimage.uniform_filter(on_layout.astype(float), 3)
@@ -303,7 +304,7 @@ def test_a_blind_tip_is_the_same_for_all_scans(tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize("tip", ["-1", "0", "sharp", "nan"])
-def test_a_tip_that_is_no_radius_is_one_line(tmp_path, tip) -> None:
+def test_an_invalid_tip_radius_is_one_line(tmp_path, tip) -> None:
     card = write_campaign(tmp_path / "raw", count=1)
     with pytest.raises(InputError, match="wanted a radius in µm, or blind"):
         build_dataset(card, tmp_path / "out.zarr", tip=tip)

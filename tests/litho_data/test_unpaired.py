@@ -1,4 +1,4 @@
-"""Scans and layouts without their partner are counted where the build is reported."""
+"""Scans without a layout and layouts without a scan are counted in the report of the build."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_scan_without_layout_is_counted_and_refused_under_strict(tmp_path):
         litho_data.build_dataset(card, tmp_path / "strict.zarr", strict=True)
 
 
-def test_a_card_that_is_not_there_or_has_one_size_says_so_in_words(tmp_path):
+def test_a_missing_card_and_a_single_size_are_reported_in_words(tmp_path):
     with pytest.raises(InputError) as missing:
         litho_data.build_dataset(tmp_path / "no.toml", tmp_path / "s.zarr")
     assert "no such file or directory, wanted a TOML file" in str(missing.value)

@@ -1,4 +1,4 @@
-"""One flipped byte anywhere is named; replay gives the same numbers; history reaches the raw files."""
+"""Verify names any flipped byte, replay repeats all numbers, and history leads back to the raw files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_data.store.access import array_of, values_of
 
 
 def flip(path: Path, position: float = 0.5) -> None:
-    """Change one bit of one byte, at a fraction of the file's length."""
+    """Change one bit of the byte at this fraction of the length of the file."""
     content = bytearray(path.read_bytes())
     content[int(position * len(content))] ^= 1
     path.write_bytes(content)
@@ -30,7 +30,8 @@ def test_an_untouched_store_has_no_findings(campaign: Path) -> None:
     result = verify(campaign / "prints.zarr")
     assert result.findings == ()
     assert result.notes == ()
-    # Per scan: layout, raw, levelled, removed, transform, height, valid, sigma; six steps; two files.
+    # Each scan has layout, raw, levelled, removed, transform, height, valid, sigma, and six steps and two
+    # files.
     assert (result.n_arrays, result.n_steps, result.n_raw_files) == (24, 18, 6)
 
 
@@ -45,7 +46,7 @@ def test_a_missing_raw_file_is_named(own_campaign: Path) -> None:
     assert "raw file scans/P12.txt: is not in" in named(own_campaign)
 
 
-def test_without_raw_files_a_note_says_so(own_campaign: Path) -> None:
+def test_verify_notes_that_raw_files_are_missing(own_campaign: Path) -> None:
     for name in ("layouts", "scans"):
         (own_campaign / name).rename(own_campaign / f"moved-{name}")
     result = verify(own_campaign / "prints.zarr")
@@ -90,7 +91,7 @@ def test_a_flipped_byte_of_a_chunk_is_named(
 def test_a_changed_digit_of_metadata_is_named(own_campaign: Path, document: str) -> None:
     path = own_campaign / "prints.zarr" / document
     text = path.read_text()
-    # The first digit of a number: a shape, a version, a parameter.
+    # Change the first digit of a number: a shape, a version, a parameter.
     position = next(i for i, letter in enumerate(text) if letter.isdigit() and text[i - 1] in " [:")
     path.write_text(text[:position] + str((int(text[position]) + 1) % 10) + text[position + 1 :])
     assert named(own_campaign)
@@ -151,7 +152,7 @@ def test_values_that_decode_but_differ_are_named(own_campaign: Path) -> None:
     assert "P11" not in found
 
 
-def test_replay_gives_every_array_again(campaign: Path) -> None:
+def test_replay_reproduces_every_array(campaign: Path) -> None:
     table = replay(campaign / "prints.zarr", ["P12"])
     assert len(table) == 8
     assert (table["max_abs_difference"] == 0).all()
@@ -160,7 +161,7 @@ def test_replay_gives_every_array_again(campaign: Path) -> None:
     assert list(one["array"]) == ["height_um"]
 
 
-def test_replay_measures_what_was_changed(own_campaign: Path) -> None:
+def test_replay_measures_the_difference_of_a_changed_array(own_campaign: Path) -> None:
     root = zarr.open_group(own_campaign / "prints.zarr", mode="a", use_consolidated=False)
     before = float(values_of(root, "height_um")[0, 10, 10])
     array_of(root, "height_um")[0, 10, 10] = before + 0.125

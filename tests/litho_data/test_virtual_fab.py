@@ -1,4 +1,4 @@
-"""The virtual fab: physics of plain printing, noise figures, files, truth, determinism."""
+"""Test the virtual fab: physics of plain printing, noise figures, files, truth, determinism."""
 
 from __future__ import annotations
 
@@ -65,10 +65,11 @@ class TestPlainPrinting:
                 squared_distance = (y - row) ** 2 + (x - column) ** 2
                 intensity = np.exp(-squared_distance / (2 * printer.spot_sigma_um**2))
                 expected += intensity**2
-        # One squared spot integrates to π s² (s the sd of the intensity); 12 slices are full dose.
+        # One squared spot integrates to π s², where s is the sd of the intensity. 12 slices are the full
+        # dose.
         expected *= printer.pitch_um**2 / (np.pi * printer.spot_sigma_um**2) / 12
-        # The sampled Gaussian, sd 2 px, sums to its integral within 2 exp(−2π²·4).
-        # What the periodic transform wraps around the frame has passed 9 µm of spot: nothing but rounding.
+        # The sampled Gaussian, sd 2 px, sums to its integral within 2 exp(−2π²·4). Light that wraps around
+        # the periodic frame is 9 µm from the spot, so only rounding is left.
         np.testing.assert_allclose(cut_layout(dose), expected, rtol=0, atol=1e-10)
 
     def test_wide_blocks_print_from_base_to_full_height(self):
@@ -101,8 +102,8 @@ class TestPlainPrinting:
                 ]
             )
         gain = np.mean(transfer, axis=0)
-        # Measured prints: 0.69, 0.64 and 0.45 in these bands, with a spread of 0.085 between fields;
-        # the plain fab may lie one and a half spreads off.
+        # Measured prints have 0.69, 0.64 and 0.45 in these bands, with a spread of 0.085 between fields. The
+        # plain fab may be off by one and a half spreads.
         np.testing.assert_allclose(gain, [0.69, 0.64, 0.45], atol=0.13)
 
     def test_print_depends_on_the_neighbourhood_only(self):
@@ -112,7 +113,7 @@ class TestPlainPrinting:
         near, far = (
             cut_layout(print_clean(Job("a", level), Printer(), NO_KNOBS)) for level in (job.level, other)
         )
-        # Three sd of the widest kernel lie between: 0.1 % of a height of 0.6 µm is left beyond.
+        # The distance is three sd of the widest kernel. Beyond it 0.1 % of a height of 0.6 µm remains.
         assert np.abs(near - far)[:, :20].max() < 1e-3
         assert np.abs(near - far)[:, 85:].max() > 0.1
 
@@ -125,7 +126,8 @@ class TestDefaultNoise:
             ).height_um
             for use in ("flat", "substrate")
         )
-        # 15.96 nm and 1.25 nm; about 54²/(2 · 0.3 · 2.4) = 2000 pieces of line know an sd to 1.6 %.
+        # The figures are 15.96 nm and 1.25 nm. About 54²/(2 · 0.3 · 2.4) = 2000 pieces of line give an sd to
+        # 1.6 %.
         assert amplitude_parameters(flat).sq_nm == pytest.approx(15.96, rel=0.04)
         assert amplitude_parameters(bare).sq_nm == pytest.approx(1.25, rel=0.04)
 
@@ -133,7 +135,8 @@ class TestDefaultNoise:
         flat = scan_job(fab(noise=Noise(), seed=3), Job("a", np.full((512, 512), 6, np.uint8))).height_um
         correlation = autocorrelation(flat)
         along, across = correlation[0, correlation.shape[1] // 2 :], correlation[:, correlation.shape[1] // 2]
-        # Above 1/e over 0.8 µm along the lines, below it within 0.2 µm across them.
+        # The correlation stays above 1/e over 0.8 µm along the lines, and falls below it within 0.2 µm
+        # across.
         assert along[:9].min() > np.exp(-1) > across[:3].min()
 
     def test_steps_of_one_level_stay_readable(self):
@@ -145,17 +148,17 @@ class TestDefaultNoise:
         margin = (scan.height_um.shape[0] - 512) // 2
         height = scan.height_um[margin:-margin, margin:-margin]
         for step in stair_steps(height, 0.1, edges_um=(edges_px * 0.1).tolist()):
-            # The paper's criterion in numbers: twice the roughness, and known to a tenth.
+            # The paper's criterion in numbers: a step is twice the roughness, which is known to a tenth.
             assert step.height_nm > 2 * 15.96
             assert step.height_nm > 10 * step.uncertainty_nm
 
     def test_datum_is_the_only_offset(self):
         scans = [scan_job(fab(noise=Noise(), seed=seed), random_job(64)) for seed in range(40)]
         datums_nm = [1e3 * np.mean(scan.height_um - scan.noiseless_um) for scan in scans]
-        # 40 draws know an sd to 1/√80 = 11 %; roughness adds 1 nm.
+        # 40 draws give an sd to 1/√80 = 11 %. Roughness adds 1 nm.
         assert np.std(datums_nm) == pytest.approx(30, rel=0.35)
 
-    def test_off_is_off(self):
+    def test_noise_off_leaves_no_noise(self):
         scan = scan_job(fab(), random_job())
         assert np.array_equal(scan.height_um, scan.noiseless_um)
 
@@ -169,7 +172,7 @@ class TestDefaultNoise:
             1e3 * (white.ravel() - terms @ np.linalg.lstsq(terms, white.ravel(), rcond=None)[0]).std(),
             rel=1e-9,
         )
-        # Gaussian: mean absolute = √(2/π) sd; 7200 pixels.
+        # For a Gaussian the mean absolute value is √(2/π) sd; there are 7200 pixels.
         assert floor["floor_full_mae_nm"] / floor["floor_full_rmse_nm"] == pytest.approx(
             (2 / np.pi) ** 0.5, rel=0.02
         )
@@ -182,7 +185,7 @@ class TestGeometry:
         margin = round(14 * 128 / 512)
         assert scan.height_um.shape == (128 + 2 * margin,) * 2
         seen = scan.height_um[margin:-margin, margin:-margin]
-        # Cubic interpolation at whole positions: rounding only.
+        # At whole positions cubic interpolation is exact, up to rounding.
         np.testing.assert_allclose(seen, scan.clean_um, rtol=0, atol=1e-12)
         np.testing.assert_allclose(scan.frame.scan_to_layout[:2, 2], -margin * 0.1, atol=1e-12)
 
@@ -192,7 +195,7 @@ class TestGeometry:
         row, column = 40, 77
         x_um, y_um, _ = scan.frame.scan_to_layout @ [(column + 0.5) * 0.1, (row + 0.5) * 0.1, 1]
         surface = print_clean(job, Printer(), NO_KNOBS)
-        # Band-limited surface: direct evaluation of its Fourier series at the point.
+        # The surface is band-limited, so its Fourier series can be evaluated at the point.
         spectrum = np.fft.fft2(surface)
         size = surface.shape[0]
         phase = [np.fft.fftfreq(size) * (at / 0.1 - 0.5 + GUARD_PX) for at in (y_um, x_um)]
@@ -232,7 +235,7 @@ class TestFiles:
         with pytest.raises(InputError, match="finite"):
             write_text_matrix(tmp_path / "a.txt", np.array([[np.nan, 1.0]]))
 
-    def test_raw_is_an_ordinary_dataset_and_truth_is_apart(self, tmp_path):
+    def test_raw_is_an_ordinary_dataset_and_truth_lies_in_another_folder(self, tmp_path):
         card_path = simulate(
             tmp_path / "run", count=3, size_px=64, seed=2, knobs=["vignetting=0.2@9"], references=True
         )
@@ -305,7 +308,7 @@ class TestDeterminism:
 
 
 class OnePoint:
-    """In place of white noise: what it becomes has the squares of all that white noise adds up."""
+    """A generator that gives one point for white noise: its filtered squares add up to the noise variance."""
 
     def standard_normal(self, shape):
         point = np.zeros(shape)

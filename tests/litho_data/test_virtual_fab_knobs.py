@@ -1,4 +1,4 @@
-"""Laws that every knob of the virtual fab obeys, and a few signatures."""
+"""Test the laws that every knob of the virtual fab obeys, and the signatures of a few knobs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from litho_data.virtual_fab.geometry import place_scan
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
 
-# The effects catalogue has 35 entries; this is the list that a truth file may name besides `off-catalogue`.
+# The effects catalogue has 35 entries. These are the names that a truth file may use besides `off-catalogue`.
 CATALOGUE = {
     "elliptical-psf",
     "long-range-proximity",
@@ -104,12 +104,12 @@ def test_measurement_never_touches_the_print(name, jobs):
     assert np.array_equal(turned.clean_um, scan(jobs[0]).clean_um)
 
 
-def test_knobs_leave_each_others_draws_alone(jobs):
+def test_a_knob_does_not_change_the_random_draws_of_other_knobs(jobs):
     tilt, stripes = KnobSetting("tilt-bow", 20.0), KnobSetting("scan-line-stripes", 5.0)
     alone = [scan(jobs[0], one).height_um - scan(jobs[0]).height_um for one in (tilt, stripes)]
     for both in ((tilt, stripes), (stripes, tilt)):
         together = scan(jobs[0], *both).height_um - scan(jobs[0]).height_um
-        # Sums of a few µm in double precision.
+        # The differences are rounding of sums of a few µm in double precision.
         np.testing.assert_allclose(together, alone[0] + alone[1], atol=1e-14)
 
 
@@ -157,17 +157,17 @@ class TestSettings:
 
 class TestStrengthForRms:
     @pytest.mark.parametrize("name", ["vignetting", "slope-thinning", "elliptical-psf", "scan-line-stripes"])
-    def test_it_hits_the_target(self, name, jobs):
+    def test_the_strength_reaches_the_target_rms(self, name, jobs):
         found = strength_for_rms(name, 5.0, jobs=jobs)
         assert knob_rms_nm(found.setting, jobs) == pytest.approx(5.0, rel=0.0101)
         assert found.rms_nm == pytest.approx(5.0, rel=0.0101)
 
-    def test_it_stops_at_the_limit_and_says_so(self, jobs):
+    def test_a_strength_stops_at_its_limit_and_reports_it(self, jobs):
         found = strength_for_rms("long-range-proximity", 500.0, jobs=jobs)
         assert found.setting.strength == KNOBS["long-range-proximity"].limit
         assert found.rms_nm < 500
 
-    def test_of_noise_the_strength_is_the_rms(self, jobs):
+    def test_the_strength_of_a_noise_knob_is_its_rms(self, jobs):
         assert strength_for_rms("line-roughness", 5.0, jobs=jobs).setting.strength == 5.0
         highest = KNOBS["line-roughness"].limit
         assert strength_for_rms("line-roughness", 2 * highest, jobs=jobs).rms_nm == highest
@@ -177,7 +177,7 @@ class TestStrengthForRms:
             with pytest.raises(InputError, match="no trace"):
                 strength_for_rms(name, 5.0, jobs=jobs)
 
-    def test_bad_wishes_are_errors(self, jobs):
+    def test_bad_targets_of_a_strength_are_errors(self, jobs):
         for name, rms_nm in (("nosuch", 5.0), ("vignetting", 0.0)):
             with pytest.raises(InputError):
                 strength_for_rms(name, rms_nm, jobs=jobs)
@@ -187,9 +187,10 @@ class TestSignatures:
     def test_tip_widens_tops_and_only_adds(self, jobs):
         plain, dilated = scan(jobs[0]).height_um, scan(jobs[0], KnobSetting("tip-dilation", 0.5)).height_um
         assert (dilated - plain).min() > -1e-9
-        # Tops are touched by the apex: where the surface has its maximum nothing changes.
+        # The apex touches the tops, so nothing changes at the maximum of the surface.
         top = np.unravel_index(plain[10:-10, 10:-10].argmax(), plain[10:-10, 10:-10].shape)
-        # The top lies between pixels: up to slope²·R/2 of one curvature length, under 0.1 nm here.
+        # The top lies between pixels, so it is off by up to slope²·R/2 of one curvature length, under 0.1 nm
+        # here.
         assert (dilated - plain)[10:-10, 10:-10][top] < 1e-4
 
     def test_tip_on_a_slope_and_on_a_dome_have_closed_forms(self):
@@ -197,7 +198,8 @@ class TestSignatures:
         y_um, x_um = (np.indices(frame.shape) - 50) * 0.1
         radius_um = 0.4
         board = KnobBoard([KnobSetting("tip-dilation", radius_um)], 0)
-        # A paraboloid on a slope s rides R s²/2 above it; on a dome of radius A it draws one of radius A + R.
+        # A paraboloid on a slope s stays R s²/2 above it. On a dome of radius A it draws a dome of radius A +
+        # R.
         cases = (
             (0.1 * x_um - 0.2 * y_um, 0.1 * x_um - 0.2 * y_um + radius_um * (0.1**2 + 0.2**2) / 2),
             (-(x_um**2 + y_um**2) / 8, -(x_um**2 + y_um**2) / (2 * (4 + radius_um))),
@@ -205,7 +207,8 @@ class TestSignatures:
         for surface, expected in cases:
             job = Job("dome", np.zeros(frame.shape, np.uint8))
             found = scan_surface(surface, frame, Noise.off(), board, job, np.random.default_rng(0))
-            # Contact is searched on a grid of 0.01 µm per axis: (0.005 µm)²/2R short at most, twice.
+            # Contacts are searched on a grid of 0.01 µm per axis, so heights are low by at most (0.005
+            # µm)²/2R, twice.
             np.testing.assert_allclose(found[20:-20, 20:-20], expected[20:-20, 20:-20], atol=7e-5)
 
     def test_an_asymmetric_tip_has_another_radius_along_each_axis(self):
@@ -218,7 +221,8 @@ class TestSignatures:
             radii_um = []
             for slope in (0.2 * y_um, 0.2 * x_um):
                 found = scan_surface(slope, frame, Noise.off(), board, job, np.random.default_rng(0))
-                # On a slope s along one axis it rides R s²/2 above it, R the radius along that axis.
+                # On a slope s along one axis the tip stays R s²/2 above it, where R is the radius along that
+                # axis.
                 lifts = (found - slope)[30:-30, 30:-30]
                 radii_um.append(2 * float(lifts.mean()) / 0.2**2)
             # Contact is searched on a grid of 0.01 µm: (0.005 µm)²/2R short, 0.01 µm of a radius of 0.1 µm.
@@ -242,14 +246,14 @@ class TestSignatures:
             was, now = (
                 float(x_um @ h[near] / h[near].sum()) for h in (even - even.min(), uneven - uneven.min())
             )
-            # Its bow shortens a bar by 2 %; the window keeps 1.6 µm on either side of it.
+            # The bow shortens a bar by 2 %. The window keeps 1.6 µm on either side of the bar.
             assert now - was == pytest.approx(0.05 * was * (1 - was / 19.2), abs=0.02)
         across = np.ascontiguousarray(level[:, :96].T)
         plain, bent = (
             scan(Job("a", across), *knobs).clean_um
             for knobs in ((), (KnobSetting("galvo-nonlinearity", 0.05),))
         )
-        # Lines across the hatch are not moved.
+        # Lines that run across the hatch are not moved.
         np.testing.assert_allclose(bent, plain, atol=1e-9)
 
     def test_feedback_lag_trails_along_the_fast_axis_only(self):
@@ -260,10 +264,10 @@ class TestSignatures:
         assert changed[:, 68:75].min() > 0.02
         assert changed[:, 33:37].max() < -0.01
         across = scan(Job("a", level.T.copy()), step).height_um - scan(Job("a", level.T.copy())).height_um
-        # Rows are level there, so a feedback along the rows has nothing to lag behind.
+        # Rows are flat there, so a feedback along the rows has no lag.
         assert np.abs(across).max() < 1e-9
 
-    def test_memory_shades_what_is_written_later(self):
+    def test_write_order_memory_changes_what_is_written_later(self):
         level = np.full((96, 96), 2, np.uint8)
         level[40:50] = 12
         changed = scan(Job("a", level), KnobSetting("write-order-memory", 0.3, 1)).clean_um
@@ -274,19 +278,19 @@ class TestSignatures:
     def test_stripes_are_constant_along_the_fast_axis(self, jobs):
         change = scan(jobs[0], KnobSetting("scan-line-stripes", 9.0)).height_um - scan(jobs[0]).height_um
         assert np.ptp(change, axis=1).max() < 1e-12
-        # 100 draws know their sd to 7 %.
+        # 100 draws give their sd to 7 %.
         assert 1e3 * change[:, 0].std() == pytest.approx(9.0, rel=0.25)
 
     def test_quantisation_truncates_to_its_step(self, jobs):
         height_nm = 1e3 * scan(jobs[0], KnobSetting("quantisation", 4.0)).height_um
         np.testing.assert_allclose(height_nm / 4, np.round(height_nm / 4), atol=1e-9)
         lost_nm = 1e3 * scan(jobs[0]).height_um - height_nm
-        # Truncation loses half a step on average, between 0 and one step.
+        # Truncation lowers heights by half a step on average, by 0 to one step in each pixel.
         assert lost_nm.min() > -1e-9
         assert lost_nm.mean() == pytest.approx(2.0, rel=0.05)
 
     def test_a_displaced_write_field_shifts_its_grating_and_no_other(self):
-        # A grating of 16 px in fields of 96 px; the print lies off by what is drawn, field by field.
+        # The grating has 16 px in fields of 96 px. Each field of the print is displaced by the drawn amount.
         level = np.tile((6 + 4 * np.cos(2 * np.pi * np.arange(192) / 16)).round().astype(np.uint8), (96, 1))
         fab = Fab(
             Printer(stitch_field_um=9.6), Microscope.aligned(), Noise.off(),
@@ -297,11 +301,12 @@ class TestSignatures:
         offset_um = 0.2 * fab.knobs.scan_rng("stitching", 3).standard_normal((1, 2, 2))
         wave = np.exp(-2j * np.pi * np.arange(64) / 16)
         for number, left in enumerate((16, 112)):
-            # Middle rows and four periods, 1.6 µm from the seam: what the blur of 2 µm brings from there.
+            # Only middle rows and four periods count, 1.6 µm from the seam, where the blur of 2 µm has little
+            # effect.
             before, after = (one[40:56, left : left + 64].mean(0) @ wave for one in (plain, moved))
             expected = -2 * np.pi * offset_um[0, number, 1] / 1.6
             assert np.angle(after / before) == pytest.approx(expected, abs=0.03)
-        # Without the knob the size of a field means nothing.
+        # Without the knob the size of a field has no effect.
         off = Fab(Printer(stitch_field_um=9.6), Microscope.aligned(), Noise.off(), KnobBoard([], 4), 4)
         assert np.array_equal(scan_job(off, job).clean_um, plain)
 
@@ -322,7 +327,7 @@ class TestSignatures:
         shaded = scan(aside, KnobSetting("vignetting", 0.4)).clean_um
         assert shaded[48, 0] > shaded[48, -1]
 
-    def test_neighbours_are_seen_at_the_edge_only(self, jobs):
+    def test_neighbouring_fields_affect_the_edge_only(self, jobs):
         change = np.abs(
             scan(jobs[0], KnobSetting("unseen-neighbours", 1.0)).clean_um - scan(jobs[0]).clean_um
         )

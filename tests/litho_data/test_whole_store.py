@@ -1,4 +1,4 @@
-"""A store is complete or refused when it is opened, and ``verify`` answers whatever state it is in."""
+"""An incomplete store is refused when it is opened, and ``verify`` gives an answer for any damage."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def files_of(store: Path) -> list[Path]:
     return sorted(path for path in store.rglob("*") if path.is_file())
 
 
-def test_every_chunk_has_a_file_even_of_zeros(campaign: Path) -> None:
-    """Else what was lost could not be told from what was never there."""
+def test_every_chunk_has_a_file_even_if_it_is_all_zeros(campaign: Path) -> None:
+    """Otherwise a lost chunk could not be told from one that was never written."""
     root = zarr.open_group(campaign / "prints.zarr", mode="r", use_consolidated=False)
     stored: Any = [(path, one) for path, one in root.members(max_depth=None) if isinstance(one, zarr.Array)]
     assert len(stored) > 50
@@ -75,7 +75,7 @@ def test_a_packed_store_that_has_lost_a_file_is_refused(own_campaign: Path, tmp_
 
 
 def put(store: Path, name: str, value: Any, place: Any = 1) -> None:
-    """Write a value into an array, which takes the type of the value where it has to."""
+    """Write a value into an array, and change the type of the array where needed."""
     root = zarr.open_group(store, mode="a", use_consolidated=False)
     old = array_of(root, name)
     values: Any = old[...]
@@ -106,7 +106,7 @@ def put_attribute(store: Path, name: str, value: Any) -> None:
 
 
 Change = Callable[[Path], None]
-# What is wrong, and the words that name it.
+# Each damage with the words of the message that names it.
 IMPOSSIBLE: dict[str, tuple[Change, str]] = {
     "a level above the highest": (lambda s: put(s, "mask_level", 13, (1, 5, 7)), "level .*P12.*got 13"),
     "nothing measured": (lambda s: put(s, "valid", False), "measured pixels of scan P12"),
@@ -137,7 +137,7 @@ IMPOSSIBLE: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("what", IMPOSSIBLE)
-def test_what_can_not_be_is_refused_when_a_store_is_opened(what: str, own_campaign: Path) -> None:
+def test_impossible_values_are_refused_when_a_store_is_opened(what: str, own_campaign: Path) -> None:
     store = own_campaign / "prints.zarr"
     change, words = IMPOSSIBLE[what]
     change(store)
@@ -159,7 +159,7 @@ def test_a_document_of_another_kind_is_refused(part: str, document: str, own_cam
         assert verify(store).findings
 
 
-def test_a_result_records_the_hash_of_what_was_read(own_campaign: Path) -> None:
+def test_a_result_records_the_hash_of_the_arrays_that_were_read(own_campaign: Path) -> None:
     store = own_campaign / "prints.zarr"
     stated = json.loads((store / "zarr.json").read_text())["attributes"]["dataset_sha256"]
     assert open_store(store).dataset_id.sha256 == stated

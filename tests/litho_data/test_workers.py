@@ -1,6 +1,6 @@
-"""Jobs run once, wherever they run, few at a time; what goes wrong is one line.
+"""Each job runs once, on any worker, with few jobs at a time. An error is one line.
 
-On a cluster: tests/laws/test_cluster.py.
+Tests on a cluster: tests/laws/test_cluster.py.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_jobs_run_once_in_the_same_folder_for_the_same_command(
     assert sorted(job[0] for job, _ in done) == list(range(9))
     threads = before.get("OMP_NUM_THREADS", "1" if processes > 1 else None)
     for job, (whole, entry, facts) in done:
-        # The object of this process, though others had one of their own.
+        # The object is that of this process, although other processes have their own.
         assert whole is job[1]
         assert entry == job[0]
         assert facts == ("litho-data build card.toml", str(tmp_path), threads)
@@ -77,18 +77,18 @@ def test_jobs_are_taken_only_as_results_are_and_by_workers_that_come_later() -> 
     with ThreadPoolExecutor(1) as executor:
         results = _windowed(lambda job: executor.submit(double, job), jobs(), lambda: present)
         next(results)
-        # Four under way, and at most four more for those that finished meanwhile.
+        # Four jobs are running, and at most four more were submitted for those that finished meanwhile.
         assert len(taken) <= 8
         present = 5
         next(results)
         next(results)
-        # Three results are taken, and ten are under way or lie ready.
+        # Three results are taken. Ten jobs are running or finished.
         assert len(taken) >= 13
         results.close()
 
 
 @pytest.mark.parametrize("processes", [1, 2])
-def test_what_is_bad_there_is_said_here(processes: int) -> None:
+def test_an_input_error_of_a_worker_is_raised_in_the_main_process(processes: int) -> None:
     with pytest.raises(InputError, match=r"^job \d, got nothing, wanted something$"):
         list(run_jobs(refuse, range(3), Workers(processes), apart=True))
 
@@ -107,7 +107,7 @@ def test_a_job_that_always_kills_its_worker_is_named_and_no_other(
 def test_a_worker_that_dies_while_jobs_wait_costs_a_line_and_no_job(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Killed twice, in two jobs: the one start does them all, each once."""
+    """The worker is killed twice, in two jobs. One call completes all jobs, each once."""
     jobs = [(number, 1 if number in (3, 20) else 0, tmp_path) for number in range(40)]
     done = list(run_jobs(die_at_first, jobs, Workers(2), name=lambda job: f"scan {job[0]}"))
     assert sorted(answer for _, answer in done) == list(range(40))
@@ -129,8 +129,8 @@ def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: 
 
 
 @pytest.mark.parametrize("words", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
-def test_another_program_at_the_address_is_one_line_and_nothing_after(words: bytes, tmp_path: Path) -> None:
-    """In a process of its own: what Dask says too much, it says when it ends."""
+def test_another_program_at_the_address_is_one_line_without_a_traceback(words: bytes, tmp_path: Path) -> None:
+    """The command runs in a separate process, because Dask prints its surplus lines at exit."""
     pytest.importorskip("distributed")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -165,7 +165,7 @@ def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         list(run_jobs(double, [1], Workers(dask=NOBODY)))
 
 
-def test_no_worker_is_bad_input() -> None:
+def test_zero_workers_is_bad_input() -> None:
     with pytest.raises(InputError, match="workers"):
         Workers(0)
 

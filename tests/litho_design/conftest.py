@@ -1,4 +1,4 @@
-"""A small closed-form printer and settings that design in a second."""
+"""Provide a small closed-form printer and settings with which a design takes a second."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from litho_design.printers.printer import Printer
 
 
 class BlurPrinter(nn.Module):
-    """gain * (layout * Gaussian) + offset, as a frozen model would be called."""
+    """Return gain * (layout * Gaussian) + offset, with the interface of a frozen model."""
 
     def __init__(self, sigma_um=0.2, gain=0.62, offset_um=0.164, pitch_um=0.1, name="blur"):
         super().__init__()
@@ -49,9 +49,9 @@ def make_printer():
 
 @pytest.fixture(scope="session")
 def small_settings() -> HologramSettings:
-    """A hologram of 12.8 µm at 30 µm, 30 iterations from a random start, which leaves all to the search.
+    """Return a hologram of 12.8 µm at 30 µm, 30 iterations from a random start far from the optimum.
 
-    Its yield is of ten prints, not of a hundred, which would take longer than the search.
+    Its yield is that of ten prints. A hundred prints would take longer than the search.
     """
     default = hologram_settings("default")
     return default.model_copy(
@@ -68,7 +68,7 @@ def small_settings() -> HologramSettings:
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Bit-exact repeats need a fixed number of threads."""
+    """Use one thread: repeats are bit-exact only with a fixed number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -77,14 +77,14 @@ def one_thread():
 
 @pytest.fixture
 def refused(monkeypatch, capsys):
-    """What ``litho-design`` says to arguments that it has to refuse: one line, with exit code 2."""
+    """Return a function that runs ``litho-design`` on bad arguments and returns its one line of error."""
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, arguments)])
         with pytest.raises(SystemExit) as stop:
             main()
         assert stop.value.code == 2
-        # On a busy machine a command says after some seconds that it is at work.
+        # On a busy machine a command reports after some seconds that it is at work.
         lines = [line for line in capsys.readouterr().err.splitlines() if "is at work" not in line]
         said = "\n".join(lines).strip()
         assert len(said.splitlines()) == 1

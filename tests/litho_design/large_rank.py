@@ -1,4 +1,4 @@
-"""What one of several processes does in the tests of large elements, where each of them can import it."""
+"""The work of one of several processes in the tests of large elements, importable in each of them."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ SIZE, BAND, ITERATIONS = 160, 32, 20
 
 
 def settings(iterations: int = ITERATIONS) -> HologramSettings:
-    """A hologram of 16 µm at 30 µm."""
+    """Return the settings of a hologram of 16 µm at 30 µm."""
     changes = {"layout.size_px": SIZE, "optics.distance_um": 30.0}
     changes |= {"search.iterations": iterations, "search.checkpoint_every": 8, "search.evaluate_every": 5}
     return hologram_settings(changes=changes)
 
 
 def printer() -> Printer:
-    """A blur that reaches 8 px."""
+    """Return a printer whose blur reaches 8 px."""
     return Printer(BlurPrinter(), settings().layout, source="closed form")
 
 
 def work(folder: Path, ranks: Ranks) -> None:
-    """Field, gradient and layout of one process, for the parent to compare."""
+    """Write the field, gradient and layout of one process, for the parent to compare."""
     torch.set_num_threads(1)
     bands = Bands(SIZE, BAND, ranks, cell_px=4)
     rows = bands.rows()
@@ -57,19 +57,19 @@ def work(folder: Path, ranks: Ranks) -> None:
 
 
 def banded(bands: Bands) -> BandedHologram:
-    """The task of this process's bands."""
+    """Return the task of this process's bands."""
     target = load_target("ring", SIZE)
     given = {"inputs": {"target": target.pixels}, "record": target.record}
     return BandedHologram(settings(), printer(), bands, **given)
 
 
 def design(folder: Path, bands: Bands) -> None:
-    """The hologram of this process's bands."""
+    """Design the hologram of this process's bands."""
     run_design(banded(bands), folder, write_design_report, announce=False)
 
 
 def start(rank: int, count: int, port: int, folder: Path) -> None:
-    """Join the others and work."""
+    """Join the other processes and do the work."""
     os.environ |= {
         "RANK": str(rank),
         "WORLD_SIZE": str(count),

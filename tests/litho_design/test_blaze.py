@@ -38,8 +38,8 @@ def test_published_values():
 
 
 def test_orders_of_a_propagated_staircase():
-    # 12 steps of 0.8 µm under a beam of 15 µm: at 1500 µm the orders lie 99 µm apart and are 25 µm wide,
-    # so that a window of 90 µm around the place of one holds all but 1e-3 of it and nothing of the next.
+    # The grating has 12 steps of 0.8 µm under a beam of 15 µm. At 1500 µm the orders lie 99 µm apart and are
+    # 25 µm wide. A window of 90 µm around one order holds all but 1e-3 of its light and nothing of the next.
     steps, step_px, pitch, gain, z, waist = 12, 4, 0.2, 0.65, 1500.0, 15.0
     period_um = steps * step_px * pitch
     grid = centred_grid((288, 288), pitch)
@@ -52,12 +52,13 @@ def test_orders_of_a_propagated_staircase():
         window = centred_grid((120, 120), 0.75, (0.0, landing))
         propagate = RSPropagator(grid, window, z, WAVELENGTH_UM, dtype=torch.complex128)
         share = float(propagate(beam).abs().square().sum()) * 0.75**2 / incident
-        # Four samples stand for a step: what a sample sends into the order, the flat step damps by this.
+        # Each step has four samples. The flat step damps the contribution of a sample to the order by this
+        # factor.
         sample = np.sinc(order / (steps * step_px)) ** 2
         assert share * sample == pytest.approx(blaze_efficiency(steps, gain, order), abs=1e-3)
 
 
-def test_advice_closes_the_wave():
+def test_the_advised_number_of_steps_completes_one_wave():
     wave_height = Optics().wave_height_um
     assert wave_height == pytest.approx(1.1547, abs=5e-5)
     printed = [0.164 + 0.62 * 0.1 * level for level in range(13)]

@@ -1,4 +1,4 @@
-"""Corrections by judges that took no part in them: the benchmark on printers in closed form."""
+"""Corrections are scored by judges that took no part in them: the benchmark on printers in closed form."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEEDS = (5, 6, 7)
 
 
 class Hidden(BlurPrinter):
-    """A printer that its models do not know: steep places lose height along x, and dense ones shrink."""
+    """A printer that differs from its models: steep places lose height along x, and dense ones shrink."""
 
     def __init__(self, seed: int):
         draw = np.random.default_rng(seed)
@@ -33,7 +33,7 @@ class Hidden(BlurPrinter):
 
 
 def fitted(name: str, sigma_um: float, hidden: Hidden, layout) -> Printer:
-    """A blur whose gain and offset fit prints of smooth layouts, and whose card has its errors there."""
+    """Return a blur whose gain and offset fit prints of smooth layouts, with its errors there on its card."""
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(6, 1, 12, 12, generator=generator) * 1.2
     layouts = torch.nn.functional.interpolate(coarse, size=96, mode="bicubic").clamp(0, 1.2)
@@ -76,11 +76,11 @@ def test_a_correction_is_no_worse_than_none_by_a_judge_that_took_no_part(rows):
     assert all(over_idle(row) < 0.8 for row in rows if row["relief"] in ("freeform", "staircase"))
 
 
-def test_the_stated_width_holds_what_is_printed(rows):
+def test_the_stated_width_contains_the_printed_heights(rows):
     assert sum(map(holds, rows)) >= 14
-    # Not for being as wide as the relief, whose rms height is 170 nm and more.
+    # The width is not trivially large: the relief has an rms height of 170 nm and more.
     assert np.median([row["between_nm"][1] for row in rows]) < 100
-    # The models agree with each other: without their own errors the width would hold hardly any.
+    # The models agree with each other. Without their errors, the width would contain hardly any print.
     smooth = [row for row in rows if row["relief"] in ("cap", "freeform", "staircase")]
     assert sum(abs(row["printed_nm"]["corrected"] / row["stated_nm"] - 1) < 0.1 for row in smooth) < 4
 
@@ -103,7 +103,8 @@ def test_a_relief_is_corrected_for_the_expected_error_over_its_models():
     together = ReliefTask(settings, printers[0], inputs=inputs, ensemble=printers[1:])
     level = together.untouched()["uncorrected"].float()[None, None]
     alone = [float(ReliefTask(settings, one, inputs=inputs).objective(level)[0]) for one in printers]
-    # The models of equal weight add up in squares: neither the worst alone nor their mean.
+    # The squared errors of equally weighted models add up: the result is neither the worst model nor their
+    # mean.
     assert float(together.objective(level)[0]) == pytest.approx(
         math.sqrt(np.mean(np.square(alone))), rel=1e-5
     )

@@ -1,4 +1,4 @@
-"""Whole design runs: frozen printer, resume, optimum of a toy, bad input."""
+"""Test whole design runs: frozen printer, resume, optimum of a toy, bad input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def target():
 
 @pytest.fixture
 def tiny_settings(small_settings):
-    """A quarter of the pixels, for what does not look at the image."""
+    """A quarter of the pixels, for tests that do not look at the image."""
     changes = {"layout": LayoutSettings(size_px=64), "optics": Optics(distance_um=12.0)}
     return small_settings.model_copy(update=changes)
 
@@ -63,7 +63,7 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     assert levels.max() <= 12
     own = score_design(tmp_path, tmp_path / "score", judges=[printer]).scores[0]
     assert not own.independent
-    # The same layout through the same model: the stored expectation must come out again.
+    # The same layout through the same model must give the stored expectation again.
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     assert own.rms_height_difference_um == pytest.approx(0, abs=1e-7)
 
@@ -99,7 +99,7 @@ def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
     assert resumed.predicted == whole.predicted
 
 
-def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeypatch):
+def test_a_resumed_search_counts_the_time_of_the_interrupted_ones(tmp_path, monkeypatch):
     layout, seconds = LayoutSettings(size_px=16), [0]
     monkeypatch.setattr(search_module, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
     settings = SearchSettings(iterations=30, checkpoint_every=10, evaluate_every=1000)
@@ -116,8 +116,8 @@ def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeyp
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             run()
-    # An objective takes a second, and a step one objective; iteration 0 and the last are evaluated, too.
-    # Checkpoints keep 11 s of the first run and 10 s of the second.
+    # An objective takes one second, and a step needs one objective. Iteration 0 and the last one are
+    # evaluated too. Checkpoints keep 11 s of the first run and 10 s of the second.
     assert run().earlier_seconds == 21
 
 
@@ -151,7 +151,7 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
             search()
     checkpoint.unlink()
     checkpoint.mkdir()
-    # Nothing is said of a file to delete.
+    # The message names no file to delete.
     with pytest.raises(IsADirectoryError):
         search()
 
@@ -160,7 +160,10 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
 def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
     tmp_path, tiny_settings, make_printer, tiny_target, monkeypatch, where
 ):
-    """Fewer iterations than between two checkpoints, stopped between the arrays and the record."""
+    """The run has fewer iterations than lie between two checkpoints.
+
+    It stops between the arrays and the record.
+    """
     search = tiny_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
     settings = tiny_settings.model_copy(update={"search": search})
 
@@ -185,7 +188,7 @@ def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
     assert not (tmp_path / "cut" / "begun.json").exists()
 
 
-def test_a_model_that_changes_while_it_prints_leaves_no_design(
+def test_a_model_that_changes_while_it_prints_is_refused_without_a_design(
     tmp_path, tiny_settings, make_printer, tiny_target
 ):
     search = tiny_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
@@ -232,21 +235,21 @@ def test_a_killed_command_resumes_to_the_same_layout(tmp_path):
     assert Design.read(tmp_path / "cut").files == Design.read(tmp_path / "whole").files
 
 
-def test_the_estimate_of_a_resumed_run_leaves_out_what_is_done():
+def test_the_estimate_of_a_resumed_run_omits_finished_iterations():
     budget = Budget(seconds_per_iteration=2.0, seconds_per_evaluation=1.0, peak_memory_gib=0.5)
     search = SearchSettings(iterations=100, polish_rounds=5, evaluate_every=10)
-    # 40 iterations and 5 rounds of polish of 2 s, 4 evaluations of 1 s
+    # 40 iterations and 5 rounds of polish take 2 s each, 4 evaluations 1 s each.
     assert "40 more iterations" in budget.sentence(search, done=60)
     assert "about 1.6 min" in budget.sentence(search, done=60)
     assert "100 iterations" in budget.sentence(search)
-    # What comes after the search is waited for as well: 94 s and 146 s.
+    # The estimate includes the work after the search: 94 s and 146 s.
     assert "about 4.0 min" in budget.sentence(search, 60, 146.0)
 
 
-def test_what_comes_after_a_search_is_a_score_for_each_draw_and_print(
+def test_the_estimate_after_a_search_counts_each_draw_and_print(
     tiny_settings, make_printer, tiny_target, monkeypatch
 ):
-    """By a clock that each print moves by 2 s and each draw of the yield by 0.5 s."""
+    """The clock advances by 2 s for each print and by 0.5 s for each draw of the yield."""
     printer = make_printer(tiny_settings.layout)
     task = HologramTask(tiny_settings, printer, inputs={"target": tiny_target.pixels}, ensemble=[printer])
     now = [0.0]
@@ -286,8 +289,8 @@ def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
         score_design(tmp_path, tmp_path / "score", judges=[printer])
 
 
-def test_toy_reaches_the_true_optimum():
-    # 2 x 2 cells of 2 x 2 px, 12 levels: all 20736 layouts are listed by superposition of the cells.
+def test_the_search_finds_the_true_optimum_of_a_toy():
+    # With 2 x 2 cells of 2 x 2 px and 12 levels, all 20736 layouts are listed by superposition of the cells.
     layout = LayoutSettings(size_px=4, pitch_um=0.3, cell_um=0.6, levels=12)
     optics = Optics(distance_um=5.0)
     grid = centred_grid((4, 4), 0.3)
@@ -319,7 +322,7 @@ def test_toy_reaches_the_true_optimum():
         polished, losses = polish_levels(levels, cells, objective, level_count=12, rounds=10)
         assert losses == sorted(losses, reverse=True)
         index = int((combinations == polished.flatten()).all(1).nonzero())
-        # The listed value and the objective are the same number by two routes.
+        # The listed value and the objective are computed in two ways and must agree.
         assert float(efficiency[index]) == pytest.approx(1 - losses[-1], abs=1e-5)
 
 
@@ -337,11 +340,13 @@ def test_polish_of_many_cells_never_raises_the_loss(small_settings, make_printer
     )
 
 
-def test_none_prints_nominal_heights_and_a_guard_ring_isolates_the_element(small_settings, make_printer):
+def test_the_printer_none_prints_nominal_heights_and_a_guard_ring_isolates_the_element(
+    small_settings, make_printer
+):
     layout = small_settings.layout
     level = torch.randint(0, 13, (1, 1, 128, 128)).float()
     assert torch.equal(Printer(None, layout, source="none")(level), level * layout.level_height_um)
-    # A full block: its corner sees the substrate on two sides, a quarter of the Gaussian stays.
+    # The block is full. Its corner has substrate on two sides, so a quarter of the Gaussian remains.
     block = torch.full((1, 1, 128, 128), 10.0)
     printed = make_printer(layout, sigma_um=0.2, gain=1.0, offset_um=0.0)(block)
     half = float(torch.erf(torch.tensor(0.05 / (0.2 * 2**0.5)))) / 2 + 0.5  # pixel centre is 0.05 µm inside

@@ -28,7 +28,7 @@ def element(make_printer):
 
 
 def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
-    """Phase and amplitude by the closed form, of the layout that would be printed."""
+    """Phase and amplitude follow the closed form for the layout that would be printed."""
     levels = torch.from_numpy(element.levels())[None, None].float()
     height = make_printer(LAYOUT)(levels)[0, 0]
     assert torch.equal(element.height_um(), height)
@@ -44,7 +44,7 @@ def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
     assert torch.allclose(dark(wave, 0.5).abs().square(), kept, rtol=1e-5)
     assert dark.optics(0.5).index_step == pytest.approx(0.17)
     known = torch.full((40, 40), 0.5 / 0.17)
-    # One wave.
+    # The height is one wave.
     assert dark.transmission(0.5, known).angle().abs().max() < 1e-5
 
 
@@ -56,7 +56,7 @@ def test_a_thick_element_is_that_of_the_designs(make_printer):
 
 
 def test_the_gradient_passes_straight_through_rounding_and_limits(element):
-    """Whole levels have the gradient that real ones have at the same place, and none leave the range."""
+    """Whole levels have the gradient of real levels at the same place, and none leaves the range."""
 
     def slope():
         (found,) = torch.autograd.grad(element.height_um().square().sum(), element.free.height)
@@ -76,7 +76,7 @@ def test_the_gradient_passes_straight_through_rounding_and_limits(element):
         above = element.height_um().square().sum()
         element.free.height[place] -= 2 * step
         below = element.height_um().square().sum()
-    # A square is its own central difference.
+    # For a square the central difference is exact.
     assert float((above - below) / (2 * step)) == pytest.approx(float(middle), rel=1e-3)
     with torch.no_grad():
         element.free.height[0, 0], element.free.height[0, 1] = 99.0, -7.0
@@ -92,22 +92,23 @@ def test_tiles_print_the_same_with_the_same_gradient(element):
         (slope,) = torch.autograd.grad(height.square().sum(), element.free.height)
         return height.detach(), slope
 
-    # 40 px in tiles of 16: the last ones are smaller. The blur reaches 8 px.
+    # 40 px are split into tiles of 16, so the last ones are smaller. The blur reaches 8 px.
     for one, other in zip(found(16), found(None), strict=True):
         assert torch.allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
-def test_it_starts_from_a_layout_or_a_phase(element):
+def test_an_element_starts_from_a_layout_or_a_phase(element):
     levels = np.random.default_rng(0).integers(0, 13, (20, 20)).repeat(2, 0).repeat(2, 1)
     element.start_from_levels(levels)
     assert np.array_equal(element.levels(), levels)
-    # The wide printed level whose phase is nearest; printed levels are 0.62 x 0.1 µm apart.
+    # The start is the printed level of a wide area whose phase is nearest. These levels are 0.62 x 0.1 µm
+    # apart.
     element.start_from_phase(torch.full((40, 40), 1.0), 0.6328)
     assert len(np.unique(element.levels())) == 1
 
 
 def test_two_sources_of_a_resin_agree():
-    """Cauchy of 2017 and Sellmeier of 2019 are 0.004 apart all over the visible: the same dispersion."""
+    """Cauchy of 2017 and Sellmeier of 2019 differ by a constant 0.004 over the visible range."""
     um = np.linspace(0.45, 1.0, 24)
     older, newer = (
         np.array([refractive_index(name, one) for one in um]) for name in ("ip-dip", "ip-dip-2019")
@@ -116,7 +117,7 @@ def test_two_sources_of_a_resin_agree():
     assert refractive_index("ip-dip-2019", 0.6328) == pytest.approx(1.5494, abs=1e-4)
 
 
-def test_torchoptics_takes_it_as_its_own(element):
+def test_torchoptics_accepts_an_element(element):
     torchoptics = pytest.importorskip("torchoptics")
     data = torch.randn(40, 40, dtype=torch.complex128)
     field = torchoptics.Field(data, 532e-9, z=3e-6, spacing=0.1e-6)
@@ -137,7 +138,7 @@ def test_a_field_in_metres_is_refused_where_micrometres_are_meant(element):
 
 @pytest.mark.parametrize("model", ["blur", "zoo:physics", "zoo:pbl"])
 def test_gradients_of_torch_func_are_those_of_autograd(model, make_printer):
-    """Of one and of several layouts at once, through models with gradients of their own too."""
+    """Test one and several layouts at once, also through models with their own gradients."""
     layout = LayoutSettings(size_px=24, cell_um=0.4)
     element = Element(make_printer(layout) if model == "blur" else model, layout, seed=1)
     wave = torch.ones(24, 24, dtype=torch.complex64)
@@ -166,7 +167,7 @@ def test_batches_and_double_precision(element):
     element.float()
 
 
-def test_wrong_shapes_and_units_are_answered_in_one_line(element):
+def test_wrong_shapes_and_units_are_one_line(element):
     wave = torch.ones(40, 40, dtype=torch.complex64)
     for call in (
         lambda: element(wave[:39], 0.6),
@@ -214,7 +215,7 @@ def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch
     ],
 )
 def test_examples_train_through_the_printer(monkeypatch, capsys, name, options, better):
-    """Judged by the printer, the element designed through it beats the one for a perfect printer."""
+    """The printer judges both: the element designed through it beats the one for a perfect printer."""
     if name == "structured_light_4f":
         pytest.importorskip("torchoptics")
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

@@ -1,4 +1,4 @@
-"""Several models in one design: the penalty's formula, what it buys, and the check of the tiles."""
+"""Test several models in one design: the formula of the penalty, its effect, and the check of tiles."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from litho_design.workflows.design import design_hologram, design_lens
 
 def test_disagreement_is_the_rms_spread_without_the_datum():
     pattern = torch.tensor([[1.0, -1.0], [-1.0, 1.0]])
-    # Two models at +-0.1 of a pattern of unit rms, one of them 5 µm higher: the spread is 0.1 everywhere.
+    # Two models are at +-0.1 of a pattern of unit rms, one of them 5 µm higher. The spread is 0.1 everywhere.
     apart = torch.stack([0.1 * pattern, -0.1 * pattern + 5])
     assert float(disagreement_um(apart)) == pytest.approx(0.1, rel=1e-5)
 
 
-def test_rings_count_by_their_area():
+def test_rings_are_weighted_by_their_area():
     layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
     rings = torch.stack([torch.linspace(0, 1, 100), torch.linspace(0, 1, 100) ** 3])
     bench = RadialLensBench(layout, Optics(distance_um=40.0), LensView(window_px=64))
@@ -38,7 +38,7 @@ def test_rings_count_by_their_area():
     spread = torch.nn.functional.pad(rings, (0, plane.cells[0] - 100))
     pixels = torch.stack([plane(profile)[inside] for profile in spread])
     weighted = disagreement_um(rings, bench.propagator.ring_area_um2.float())
-    # Rings of whole pixels: the outermost ones hold a per cent more or less than their area.
+    # The rings consist of whole pixels. The outermost ones deviate by a per cent from their area.
     assert float(weighted) == pytest.approx(float(disagreement_um(pixels)), rel=0.01)
     assert abs(float(disagreement_um(rings)) / float(weighted) - 1) > 0.05
 
@@ -47,7 +47,7 @@ def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
     height = torch.rand(8, 8, requires_grad=True)
     spread = disagreement_um(torch.stack([height, height]))
     spread.backward()
-    # The floor of the root: 1e-6 µm, a thousandth of an ångström.
+    # The square root has a floor of 1e-6 µm, a thousandth of an ångström.
     assert float(spread.detach()) == pytest.approx(1e-6, rel=1e-3)
     assert torch.isfinite(height.grad).all()
 
@@ -82,7 +82,7 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         assert Design.read(tmp_path / f"{weight:g}") == design
         apart[weight] = waves(tmp_path / f"{weight:g}")
     assert apart[20.0] < 0.8 * apart[0.0]
-    # The worst of the members, and their disagreement in waves.
+    # Compare the worst member, and the disagreement in waves.
     main, other = models()
     inputs = {"target": target.pixels}
     level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
@@ -116,7 +116,7 @@ def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
     assert (tmp_path / "window.csv").exists()
 
 
-def test_tiles_with_their_halo_print_what_the_whole_does(make_printer):
+def test_tiles_with_a_halo_print_the_same_as_the_whole(make_printer):
     layout = LayoutSettings(size_px=320)
     level = torch.randint(0, 13, (1, 1, 320, 320), generator=torch.Generator().manual_seed(0)).float()
     check = make_printer(layout).tiling_check(level, tile_px=128)
@@ -128,7 +128,7 @@ def test_tiles_with_their_halo_print_what_the_whole_does(make_printer):
     assert Printer(None, layout, source="none").tiling_check(level, tile_px=128) is None
 
 
-def test_a_model_that_looks_at_the_whole_image_is_found_out():
+def test_a_model_that_depends_on_the_whole_image_is_detected():
     class Normalising(torch.nn.Module):
         name, reach_um = "normalising", None
 
@@ -138,15 +138,16 @@ def test_a_model_that_looks_at_the_whole_image_is_found_out():
     layout = LayoutSettings(size_px=256)
     level = torch.full((1, 1, 256, 256), 6.0)
     level[..., 100:104, 250:] = 12.0
-    # No height is none whatever it is divided by.
+    # A height of zero stays zero after division.
     level[..., 40:60, :] = 0.0
-    # Tiles away from the high corner normalise by half the height: 1 µm where the whole says 0.5 µm.
+    # Tiles away from the high corner divide by half the height. They print 1 µm where the whole prints 0.5
+    # µm.
     check = Printer(Normalising(), layout, source="test").tiling_check(level, tile_px=64)
     assert check.max_nm == pytest.approx(500, rel=1e-5)
 
 
 def test_models_disagree_most_on_the_level_whose_heights_are_farthest_apart():
-    """Each height is counted from its own level 0."""
+    """Each height counts from level 0 of its own model."""
     heights = {"one": [0.1, 0.3, 0.6, 0.7], "two": [0.5, 0.8, 1.4, 1.2]}
     width = Width(searched_with=1, figures={}, returned="", figure="", less=False, level_heights_um=heights)
     assert width.open_level == pytest.approx((2, 0.5, 0.9))

@@ -1,4 +1,4 @@
-"""Every format comes back level for level, at its size, the right way up."""
+"""Every format is read back level for level, at its size, the right way up."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
     assert np.array_equal(read_layout(file, levels=13), levels)
 
 
-def test_every_export_is_a_layout_for_a_model(tmp_path):
+def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
     """The model sees the heights of the sidecar, without the marks, and refuses another pitch."""
     from litho_models.frozen.files import load_frozen
     from litho_models.frozen.on_store import predict_file
@@ -116,7 +116,7 @@ def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
     write_gds(tmp_path / "f.gds", LETTER * 2, 0.13, layers)
     library = gdstk.read_gds(tmp_path / "f.gds")
     (cell,) = library.top_level()
-    # The F reaches all four sides; in ``exclusive`` level 0 fills the rest.
+    # The F reaches all four sides. In ``exclusive``, level 0 fills the rest.
     corners = np.array(cell.bounding_box()) * library.unit
     assert corners == pytest.approx(np.array([[0, 0], [4 * 0.13e-6, 5 * 0.13e-6]]), abs=1e-9)
     assert (library.unit, library.precision) == pytest.approx((1e-6, 1e-9), rel=1e-15)
@@ -126,7 +126,7 @@ def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
 
 
 @pytest.mark.parametrize("kind", ["png16", "bmp"])
-def test_a_changed_or_lonely_file_is_refused(tmp_path, design, kind):
+def test_a_changed_file_and_one_without_sidecar_are_refused(tmp_path, design, kind):
     file = export_design(design, kind, tmp_path / kind)
     with open(file, "ab") as stream:
         stream.write(b"x")
@@ -160,7 +160,7 @@ def test_exports_in_other_formats_stay(tmp_path, design):
     assert all(np.array_equal(import_levels(file)[0], levels) for file in (first, second, again))
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["layout.png", "layout.png.json", "layout.stl", "layout.stl.json"]
-    # A print job must not mix two layouts: the sidecar of the other format names another one.
+    # A print job must not mix two layouts: the sidecar of the other format names another layout.
     sidecar = sidecar_path(second)
     sidecar.write_text(sidecar.read_text().replace(import_levels(first)[1].layout_sha256, "0" * 64))
     with pytest.raises(InputError, match=r"layout\.stl\.json, an export of another layout"):
@@ -180,7 +180,7 @@ def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
     levels = np.kron(LETTER * 3, np.ones((2, 2), np.uint8)) + np.arange(8, dtype=np.uint8) % 3
     write_stl(tmp_path / "f.stl", levels, 0.4, 0.1, 1.0)
     triangles = read_stl_triangles(tmp_path / "f.stl").astype(np.float64)
-    # One corner of two columns that touch along an edge stands 1/128 of a cell aside.
+    # Where two columns touch along an edge, one corner is displaced by 1/128 of a cell.
     assert _volume(triangles) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=1e-4)
     # 8 x 10 cells of 0.4 µm, to 1e-9 m.
     assert triangles.reshape(-1, 3).min(0) == pytest.approx((0, 0, 0), abs=1e-3)
@@ -196,8 +196,8 @@ def test_stl_has_few_triangles(tmp_path):
     def triangles(levels):
         return write_stl(tmp_path / "f.stl", np.array(levels, np.uint8), 0.4, 0.1, 1.0)
 
-    # Two for the top of every cell and for every wall, one underneath along the rim, and one more where the
-    # side of a step meets the top of the step below it.
+    # There are two triangles for the top of each cell and for each wall, and one underneath along the rim.
+    # Another is needed where the side of a step meets the top of the step below it.
     for steps in (1, 2, 7):
         tops, walls, rim = 5 * steps, 5 * (steps - 1), 2 * (5 + steps)
         assert triangles([range(steps)] * 5) == 2 * tops + 2 * walls + 3 * rim + 2 * (steps - 1)
@@ -206,7 +206,7 @@ def test_stl_has_few_triangles(tmp_path):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_stl_is_watertight_where_columns_touch_at_corners(tmp_path, seed):
-    """Twenty random layouts, read by two parsers that share no code with the writer."""
+    """Two parsers that share no code with the writer read twenty random layouts."""
     generator = np.random.default_rng(seed)
     levels = generator.integers(0, 2 + seed % 12, generator.integers(1, 14, 2)).astype(np.uint8)
     file = tmp_path / "random.stl"
@@ -214,27 +214,27 @@ def test_stl_is_watertight_where_columns_touch_at_corners(tmp_path, seed):
     for corners in (_by_struct(file), _by_cells_of_bytes(file)):
         assert len(corners) == count
         _require_closed(corners)
-    # A corner that stands 1/128 aside takes a pyramid of 1/128 of a cell from its column.
+    # A corner displaced by 1/128 removes a pyramid of 1/128 of a cell from its column.
     most = levels.size * 0.16 * 0.1 * levels.max() / 3 / 128
     assert _volume(np.array(corners)) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, abs=most + 1e-6)
     assert np.array_equal(read_stl_levels(file, levels.shape, 0.4, 0.1, 1.0), levels)
 
 
 def _require_closed(corners) -> None:
-    """One sheet around a solid without holes, which faces outwards all round."""
+    """Check that the triangles form one closed surface that faces outwards."""
     points, places = np.unique(np.reshape(corners, (-1, 3)), axis=0, return_inverse=True)
     faces = places.reshape(-1, 3)
     ends = np.roll(faces, -1, axis=1)
     there, back = np.sort(faces * len(points) + ends, None), np.sort(ends * len(points) + faces, None)
-    # Every edge is met once in each direction.
+    # Every edge occurs once in each direction.
     assert np.array_equal(there, back)
     assert (np.diff(there) > 0).all()
-    # Euler.
+    # Euler's formula.
     assert len(points) - len(there) // 2 + len(faces) == 2
 
 
 def _volume(triangles: np.ndarray) -> float:
-    """By the divergence theorem."""
+    """Return the volume by the divergence theorem."""
     return np.einsum("ij,ij->i", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
 
 
@@ -269,13 +269,13 @@ def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
 
 
 def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tmp_path):
-    """Records by struct, references followed by hand: no code of gdstk or of the writer."""
+    """The test reads records by struct and follows references itself, with no code of gdstk or the writer."""
     tile = np.random.default_rng(0).integers(0, 4, (128, 128)).astype(np.uint8)
     levels = np.tile(tile, (3, 2))
     levels[300, 200] = 5
     assert write_gds(tmp_path / "f.gds", levels, 0.1, "exclusive") > 0
     cells = _gds_cells(tmp_path / "f.gds")
-    # Three rows of two blocks; of the six five are equal.
+    # There are three rows of two blocks. Five of the six are equal.
     rows = [name for name, _ in cells["ELEMENT"]["references"]]
     assert [len(cells[name]["references"]) for name in ("LAYOUT", *rows)] == [1, 2, 2, 2]
     assert len({name for row in rows for name, _ in cells[row]["references"]}) == 2
@@ -296,7 +296,7 @@ def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tm
 
 
 def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, design, monkeypatch):
-    """Pillow and libtiff in place of tifffile, which wrote it."""
+    """Pillow and libtiff read the file that tifffile wrote."""
     monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
     levels = np.kron(LETTER * 7, np.ones((50, 50), np.uint8))
     write_tiff(tmp_path / "f.tif", levels, 0.13, 0.1)
@@ -312,7 +312,7 @@ def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, desi
 
 
 class _Tall:
-    """Random levels 512 px wide, of which nothing but the rows asked for exists."""
+    """Random levels 512 px wide. Only the requested rows are ever in memory."""
 
     def __init__(self, height):
         self.shape = (height, 512)
@@ -343,13 +343,13 @@ def test_memory_of_an_export_does_not_grow_with_its_rows(tmp_path, kind, monkeyp
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert bands == 1 + 4 + 8
-    # The first has the modules that it imports. What grows are names of blocks, below 1 kB each, of 16 more;
-    # all levels would be 0.26 MB more, and their rectangles, 64 bytes for about sixteen pixels, 1 MB.
+    # The first export also loads modules. Growth comes from the names of 16 more blocks, below 1 kB each. All
+    # levels would add 0.26 MB, and their rectangles, 64 bytes for about sixteen pixels, 1 MB.
     assert peaks[2] - peaks[1] < 2e5
 
 
 def _gds_cells(file) -> dict[str, dict[str, list]]:
-    """Boundaries (layer, corners) and references (name, place) per cell of a GDSII stream, database units."""
+    """Return boundaries (layer, corners) and references (name, place) per cell of a GDSII, database units."""
     data, at, cells = file.read_bytes(), 0, {}
     while at < len(data):
         length, kind = struct.unpack_from(">HB", data, at)
@@ -372,7 +372,7 @@ def _gds_cells(file) -> dict[str, dict[str, list]]:
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_mark_and_a_witness_stand_beside_the_element(tmp_path, design, kind, monkeypatch):
-    # No printer, no reach: 6.4 µm hold an F of 0.8 µm strokes and a witness of 1.2 µm.
+    # Without a printer there is no reach. 6.4 µm hold an F of 0.8 µm strokes and a witness of 1.2 µm.
     monkeypatch.setattr(marks, "_STROKE_UM", 0.8)
     monkeypatch.setattr(marks, "_FLAT_UM", 1.2)
     file = export_design(design, kind, tmp_path, marks=True)
@@ -388,19 +388,20 @@ def test_a_mark_and_a_witness_stand_beside_the_element(tmp_path, design, kind, m
         parts = [whole[top:bottom, left:right] for top, bottom, left, right in found.parts().values()]
         assert np.array_equal(parts[0], levels)
         assert (parts[2] == 12).all()
-        # Nothing else is printed, and the F looks like itself in one of eight orientations only.
+        # Nothing else is printed, and the F has no symmetry.
         assert (whole > 0).sum() == sum((part > 0).sum() for part in parts)
         letter = np.pad(parts[1], ((0, 0), (0, 8)))
         turned = [np.rot90(side, turn) for side in (letter, letter.T) for turn in range(4)]
         assert sum(np.array_equal(letter, other) for other in turned) == 1
 
 
-def test_marks_keep_the_reach_of_the_printer():
+def test_marks_keep_a_distance_of_the_reach_of_the_printer():
     layout = LayoutSettings(size_px=512)
     levels = np.zeros((512, 512), np.uint8)
     canvas, found = marks.with_marks(levels, layout, 5.9, [0.1, 0.8])
     box = {name: np.array(part) for name, part in found.parts().items()}
-    # 5.9 µm are 59 px, 60 on whole cells: to the element, and from the F to the witness below it.
+    # 5.9 µm are 59 px, rounded to 60 on whole cells: the distance to the element, and from the F to the
+    # witness.
     assert box["ORIENTATION"][2] - 512 == box["WITNESS"][2] - 512 == 60
     assert box["WITNESS"][0] - box["ORIENTATION"][1] >= 60
     # The middle 4 µm are further than the reach from every edge.
@@ -417,7 +418,7 @@ def test_rectangles_cover_once():
     for mask, top, bottom, left, right in rectangles(masks).tolist():
         cover[mask, top:bottom, left:right] += 1
     assert np.array_equal(cover, masks)
-    # Two bars, the stem between them, and two rows of stem below, which are one.
+    # The rectangles are two bars, the stem between them, and two rows of stem below, which are merged.
     assert len(rectangles(masks[:1])) == 4
 
 
@@ -431,7 +432,7 @@ def test_rectangles_cover_once():
     ],
 )
 def test_gwl_writes_the_volume_of_the_layout_voxel_by_voxel(tmp_path, design, job, hatching_um):
-    """Another parser follows the stage and paints every line into voxels of a pixel and a slice."""
+    """Another parser follows the stage and paints every line into voxels of one pixel and one slice."""
     asked = {"pedestal_um": 0.3, "hatching_um": hatching_um, "gwl": dict(job)}
     file = export_design(design, "gwl", tmp_path / "out", **asked)
     levels = np.load(design / "layout_level.npy")
@@ -477,7 +478,7 @@ def test_gwl_refuses_what_it_cannot_write_exactly(tmp_path, design):
 
 
 def test_dxf_has_a_closed_polyline_on_the_layer_of_its_grey(tmp_path):
-    """Group codes read in pairs by code of the test: corners, layers, unit; areas add up."""
+    """The test reads pairs of group codes itself: corners, layers, unit, and the sum of areas."""
     file = export_design(LETTER * 7, "dxf", tmp_path, pitch_um=0.13)
     words = file.read_text().split()
     pairs = list(zip(words[::2], words[1::2], strict=True))
@@ -523,7 +524,7 @@ def test_bare_levels_heights_and_elements_are_exported(tmp_path, kind):
 
 
 def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
-    """A quadratic curve: height = (grey / 100)^2 / 4 + 0.5 µm."""
+    """The curve is quadratic: height = (grey / 100)^2 / 4 + 0.5 µm."""
     grey = np.arange(0, 256, 5)
     rows = [f"{g},{(g / 100) ** 2 / 4 + 0.5:.9g}" for g in grey]
     (tmp_path / "curve.csv").write_text("grey,height_um\n" + "\n".join(rows))

@@ -1,4 +1,4 @@
-"""The virtual fab as a judge: it prints what the machine would have printed, and nothing else."""
+"""The virtual fab as a judge prints the layout exactly as a run of the fab does."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def printed_um(truth, level: np.ndarray) -> np.ndarray:
     return printer(torch.from_numpy(level)[None, None].float())[0, 0].numpy()
 
 
-def test_it_prints_what_the_fab_prints(tmp_path):
+def test_a_fab_judge_prints_what_the_fab_prints(tmp_path):
     # With level 0 along its edge a layout continues into nothing, as the fab's own frame does.
     level = bordered_layout()
     board = KnobBoard([KnobSetting.parse(knob) for knob in KNOBS], 3)
@@ -53,7 +53,7 @@ def test_it_prints_what_the_fab_prints(tmp_path):
 def test_an_element_stands_alone_on_the_substrate(tmp_path):
     full = np.full((64, 64), 12, np.uint8)
     height = printed_um(truth_folder(tmp_path / "fab", knobs=()), full)
-    # The same edge level continued outwards would print flat.
+    # If the edge level continued outwards, the print would be flat.
     assert height[32, 32] - height[0, 32] > 0.2
 
 
@@ -62,11 +62,11 @@ def test_roughness_is_the_default_noise_and_the_same_for_every_layout(tmp_path):
     flat, other = np.full((64, 64), 6, np.uint8), bordered_layout()
     difference = printed_um(rough, flat) - printed_um(smooth, flat)
     assert np.allclose(difference, printed_um(rough, other) - printed_um(smooth, other), atol=1e-6)
-    # 15.9 nm rms over an infinite field; its slow part (µm) leaves 6.4 µm with few independent patches.
+    # The rms is 15.9 nm over an infinite field. 6.4 µm hold few independent patches of its slow part (µm).
     assert difference.std() == pytest.approx(0.0159, rel=0.35)
 
 
-def test_designs_are_scored_by_it_and_never_made_through_it(tmp_path, small_settings, make_printer):
+def test_a_fab_judge_scores_designs_and_is_refused_for_designing(tmp_path, small_settings, make_printer):
     truth = truth_folder(tmp_path / "fab", noise="default")
     layout, target = small_settings.layout, load_target("ring", 128)
     fab = load_printer(str(truth), layout, name="fab")
@@ -89,7 +89,7 @@ def test_fabs_with_other_knobs_have_other_hashes(tmp_path):
     assert len(hashes) == 3
 
 
-def test_it_refuses_layouts_that_it_cannot_print(tmp_path):
+def test_a_fab_judge_refuses_layouts_that_it_cannot_print(tmp_path):
     truth = truth_folder(tmp_path / "fab")
     with pytest.raises(InputError, match="pitch_um"):
         load_printer(str(truth), LayoutSettings(size_px=64, pitch_um=0.2))

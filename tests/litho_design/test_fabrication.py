@@ -1,4 +1,4 @@
-"""What a printer can make as a penalty, and what staying inside the training layouts costs."""
+"""Test the penalty on layouts unlike those of training, and the cost of staying like them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_tails_beyond_the_training_layouts_pull_inwards():
     card = {"training_level_share": np.eye(13)[5].tolist(), "training_step_share": [0.9, 0.1]}
     level = torch.full((1, 1, 16, 16), 11.0, requires_grad=True)
     found = outside(level, 13, card)
-    # All pixels six levels above the only one of training; no steps.
+    # All pixels lie six levels above the only level of training, without steps.
     assert float(found.detach()) == pytest.approx(6, rel=1e-5)
     found.backward()
     assert (level.grad > 0).all()
@@ -32,7 +32,8 @@ def test_tails_beyond_the_training_layouts_pull_inwards():
     assert float(found.detach()) == pytest.approx(3, rel=1e-5)
     found.backward()
     assert (level.grad < 0).all()
-    # Steps of two between all columns: half of the pairs, 0.5 - 0.2 at one level and 0.5 at two.
+    # All columns differ by steps of two, half of the pairs. The excess is 0.5 - 0.2 at one level and 0.5 at
+    # two.
     stripes = torch.tensor([5.0, 7.0]).repeat(8).expand(1, 1, 16, 16)
     only_steps = {"training_step_share": [0.9, 0.1]}
     assert float(outside(stripes, 13, only_steps)) == pytest.approx(0.8, rel=1e-5)
@@ -40,11 +41,12 @@ def test_tails_beyond_the_training_layouts_pull_inwards():
     assert float(outside(stripes, 13, {})) == 0
 
 
-def test_what_is_unusual_is_said():
+def test_unusual_levels_and_steps_are_reported():
     card = {"training_level_share": np.eye(13)[4:7].mean(0).tolist(), "training_step_share": [0.9, 0.1]}
     levels = np.tile(np.repeat([0, 5], 8), (16, 1)).astype(np.uint8)
     found = out_of_distribution(levels, LAYOUT, card)
-    # Half of the pixels are at 5, a third in training: not twice as many. One step of 5 in 15 along x.
+    # Half of the pixels are at level 5, in training a third, which is not twice as many. One step of 5 in 15
+    # lies along x.
     assert found.unusual == [
         "level 0: 50 % of the pixels, 0 % in the training layouts",
         "steps of 5 levels: 3.3 % of the neighbouring pixels, 0 % in the training layouts",
@@ -84,7 +86,7 @@ def test_a_flagged_design_says_so_and_a_search_that_stays_inside_is_closer(tmp_p
     ("source", "files", "told"),
     [("folder", [LEVELS_FILE], True), ("folder", [], False), ("none", [LEVELS_FILE], False)],
 )
-def test_an_unknown_distance_is_told_of_levels_that_a_model_prints(source, files, told):
+def test_an_unknown_distance_to_training_is_reported(source, files, told):
     printer = SimpleNamespace(source=source, name="own")
     design: Any = SimpleNamespace(out_of_distribution=None, printer=printer, files=files)
     assert ("model own does not describe" in distribution_warning(design)) is told

@@ -1,4 +1,4 @@
-"""The far field and light that is no even plane wave, against closed forms."""
+"""Test the far field, and light that is not an even plane wave, against closed forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FAR = Optics(distance_um=100.0, propagation="far-field")
 
 
 def test_orders_of_a_blaze_have_the_power_of_the_formula():
-    """Periods of whole pixels and a window of whole diffraction orders: every order is one pixel."""
+    """Periods are whole pixels and the window holds whole diffraction orders, so each order is one pixel."""
     size, period, levels = 96, 8, 8
     grid = centred_grid((size, size), 0.2)
     height = (torch.arange(size) % period * (FAR.wave_height_um / levels)).repeat(size, 1)
@@ -34,7 +34,8 @@ def test_orders_of_a_blaze_have_the_power_of_the_formula():
     power = intensity_share(wave, odd)
     first = power[size // 2 - 1, size // 2 - 1 + size // period]
     assert float(first) == pytest.approx(blaze_efficiency(levels, 1.0), rel=1e-4)
-    # Other orders of eight steps of one wave lie 8 orders away: the rest of the light is beyond the window.
+    # With eight steps per wave the other orders lie 8 orders away, so the rest of the light misses the
+    # window.
     assert float(power.sum() - first) < 1e-5
 
 

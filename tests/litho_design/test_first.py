@@ -1,4 +1,4 @@
-"""The first result: both designs judged alike, and a word where diffraction blurs the target."""
+"""The first result judges both designs alike and warns where diffraction blurs the target."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_pa
         shown = pd.read_csv(tmp_path / table).set_index("designed with")
         for one in (one for one in result.summary if one.figure == figure):
             assert shown.loc[one.arm, f"printed by {one.judge}"] == pytest.approx(one.judged_mean, abs=6e-4)
-    # By the model that took no part, and with a word on chance.
+    # The judge is the model that took no part. The page comments on chance.
     assert "Printed by physics, layouts designed with" in page
     assert "1 seed cannot tell that from chance" in page
     for arm in ("none", "pbl"):
@@ -58,7 +58,7 @@ def test_the_width_of_strokes_is_found(width):
 
 
 def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path, capsys):
-    """Strokes against wavelength x distance / side: the first result must not be a picture of failure."""
+    """Compare strokes with wavelength x distance / side: the first result must be resolvable."""
     settings = small_hologram()
     finest_um = settings.optics.wavelength_um * settings.optics.distance_um / settings.layout.size_um
     assert stroke_width_px(load_target("text", settings.layout.size_px).pixels) * 0.1 > 1.2 * finest_um
@@ -81,7 +81,7 @@ def test_holograms_start_from_gerchberg_saxton_except_as_published():
     assert starts == ["gs", "random", "random"]
 
 
-def test_a_folder_of_another_design_says_what_differs(tmp_path):
+def test_for_a_folder_of_another_design_the_message_names_the_difference(tmp_path):
     made = hologram_settings(changes=TINY | {"search.start": "random"})
     design_hologram("ring", "none", tmp_path, settings=made, announce=False)
     again = design_hologram("ring", "none", tmp_path, settings=made, announce=False)

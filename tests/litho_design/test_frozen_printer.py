@@ -64,7 +64,8 @@ def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigm
             parameter.add_(0.1)
     layout = LayoutSettings(size_px=32)
     printer = load_printer(str(save_frozen(simulator, tmp_path / "mtf")), layout)
-    # The guard is the reach itself, 12, 26 and 33 px, whatever a pitch of 0.1 does to a quotient.
+    # The guard ring equals the reach, 12, 26 and 33 px, whatever the rounding of a quotient by a pitch of
+    # 0.1.
     assert printer.guard_px == simulator.reach_px
     level = torch.randint(0, 13, (1, 1, 32, 32), generator=torch.Generator().manual_seed(0)).float()
     wide = torch.nn.functional.pad(level * 0.1, (60,) * 4)
@@ -76,7 +77,7 @@ def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        # The same words in `score`, which has no such option.
+        # The message is the same in `score`, which has no such option.
         (
             {"pitch_um": 0.2, "cell_um": 0.4},
             r"pitch_um of the layout, .*; design with --pitch-um 0\.1, or take a model of 0\.2 µm$",
@@ -124,9 +125,9 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert "judged by its own model" in output
     record = Design.read(design)
     assert record.printer.name == "affine"
-    # The model as it lies on disk, before and after.
+    # Compare the model on disk before and after.
     assert record.printer.sha256 == load_printer(str(affine_folder), record.layout).weights_sha256()
-    # The card of this model names no training levels: nothing can be said about its extrapolation.
+    # The card of this model names no training levels, so its extrapolation is unknown.
     assert "extrapolation" not in stroke_advice(record)
     assert "the card of the model affine does not describe" in distribution_warning(record)
     seen = OutOfDistribution(
@@ -153,7 +154,7 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert {record.run.commit, judged["commit"], gap["commit"]} == {run_facts()["commit"]}
 
 
-def test_printers_are_given_as_words_or_as_they_are(make_printer):
+def test_printers_are_given_by_name_or_as_objects(make_printer):
     layout = LayoutSettings(size_px=16)
     own = make_printer(layout, name="own")
     found = load_printers(["none", " flat=none ", own], layout)
@@ -164,8 +165,8 @@ def test_printers_are_given_as_words_or_as_they_are(make_printer):
             load_printers(words, layout)
 
 
-def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeypatch):
-    """And says how far they are apart: as stated, in the median and at worst."""
+def test_a_score_without_a_judge_uses_the_available_models(tmp_path, monkeypatch):
+    """The score also states how far the models disagree: as stated, in the median and at worst."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
     spreads = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um")
     steady = {f"window.{one}": 0.0 for one in spreads}
@@ -200,14 +201,14 @@ def test_a_score_without_a_judge_is_that_of_the_models_at_hand(tmp_path, monkeyp
     assert alone.printer.dataset_sha256 == ""
     with pytest.raises(InputError, match="nothing to judge with"):
         score(tmp_path / "none", tmp_path / "empty")
-    # Those of another printer are left out by their cards, before any weights are read.
+    # Models of another printer are excluded by their cards, before any weights are read.
     foreign = design.printer.model_copy(update={"dataset_sha256": 64 * "f"})
     monkeypatch.setattr("litho_design.printers.source.load_printer", None)
     assert models_at_hand([foreign], settings.layout) == []
 
 
 def require_figures_of_a_design(folder, design):
-    """Its tables beside the scores: models, levels, draws, and the distance from the training layouts."""
+    """Check the tables beside the scores: models, levels, draws, and distance from the training layouts."""
     tables = {name: pd.read_csv(folder / f"{name}.csv") for name in ("width", "levels", "window", "distance")}
     named = tables["width"].set_index(["layout", "printed by"])
     wanted = {(name, by): own for name, of in design.width.figures.items() for by, own in of.items()}
@@ -219,7 +220,7 @@ def require_figures_of_a_design(folder, design):
     assert tables["distance"].loc[0, [*distance]].to_dict() == pytest.approx(distance)
     extreme = np.isin(np.load(folder / "layout_level.npy"), (0, design.layout.levels - 1))
     assert distance["extreme_level_share"] == pytest.approx(extreme.mean())
-    # A print that does not vary is the print as modelled; its loss is that of the search.
+    # Without variation the print equals the modelled one, and its loss is that of the search.
     wanted = {"loss": design.polished_loss, **design.predicted}
     assert len(tables["window"]) == 2
     for draw in tables["window"].to_dict("records"):
@@ -233,7 +234,7 @@ def require_figures_of_a_design(folder, design):
         ("lens", "--focal-length-um", "60", "--window-px", "64", "--cell-um", "0.2"),
     ],
 )
-def test_a_model_of_another_pitch_designs_on_its_own(tmp_path, monkeypatch, task):
+def test_a_model_of_another_pitch_designs_at_its_own_pitch(tmp_path, monkeypatch, task):
     simulator_class = model_class("affine")
     coarse = save_frozen(simulator_class(simulator_class.Config(pitch_um=0.2)), tmp_path / "coarse")
     common = (
@@ -255,7 +256,7 @@ def test_a_model_of_another_pitch_designs_on_its_own(tmp_path, monkeypatch, task
     layout = Design.read(tmp_path / "d").layout
     assert (layout.pitch_um, layout.size_um) == (0.2, pytest.approx(19.2))
     levels = np.load(tmp_path / "d" / "layout_level.npy")
-    # A hologram's free cell of 0.4 µm is two of these pixels wide, a lens has its symmetry.
+    # A hologram's free cell of 0.4 µm is two of these pixels wide. A lens keeps its symmetry.
     same = (levels[::2, ::2], levels[1::2, 1::2]) if task[0] == "hoe" else (levels, levels[::-1].T)
     assert np.array_equal(*same)
 
@@ -281,7 +282,7 @@ def test_a_model_that_changes_itself_is_refused_and_leaves_no_design(
     assert not (tmp_path / "d" / "design.json").exists()
 
 
-def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, monkeypatch):
+def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tmp_path, capsys, monkeypatch):
     picture = np.zeros((40, 90), np.uint8)
     picture[10:30, 20:70] = 200
     cv2.imwrite(str(tmp_path / "wide.png"), picture)

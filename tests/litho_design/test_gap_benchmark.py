@@ -1,4 +1,4 @@
-"""The large comparison: its budgets are equal, its designs are found again, its claims about the fab hold."""
+"""Test the large comparison: equal budgets, reuse of finished designs, and its statements about the fab."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TINY = Effort.small(64)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRINT_KNOBS)
-def test_every_hidden_effect_is_ten_nanometres(name):
+def test_every_hidden_effect_has_an_rms_of_ten_nanometres(name):
     rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0))
     # Strengths are stated with three digits and were searched to 1 %.
     assert rms == pytest.approx(10.0, rel=0.02)
@@ -152,7 +152,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     }  # fmt: skip
     text = as_markdown(record)
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
-    # 6 and 4 dB below the ceiling: the error is 10^(6/20) and 10^(4/20) times as large.
+    # The scores are 6 and 4 dB below the ceiling, so the error is 10^(6/20) and 10^(4/20) times as large.
     assert "| 100 % |" in text
     assert "| 58 % |" in text
     assert "pbl is best" in text

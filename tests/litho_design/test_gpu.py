@@ -1,4 +1,4 @@
-"""The same on a GPU as on the processor: waves, whole designs, scores."""
+"""A GPU and the processor give the same waves, designs and scores."""
 
 from __future__ import annotations
 
@@ -86,7 +86,8 @@ def test_a_hologram_is_designed_and_scores_the_same(
     )
     assert design.run.device.startswith(GPU)
     assert design.polished_loss < design.start_loss
-    # Convolutions on a GPU may round their factors to 10 bits: a nanometre of height, a per cent of a figure.
+    # Convolutions on a GPU may round their factors to 10 bits. Heights may differ by a nanometre, figures by
+    # a per cent.
     (score,) = score_design(tmp_path / "d", tmp_path / "s", judges=[make_printer(settings.layout)]).scores
     assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)
 
@@ -107,6 +108,6 @@ def test_a_lens_is_designed_and_scores_the_same(tmp_path, make_printer, path):
     design = design_lens(make_printer(layout).to(GPU), tmp_path / "d", settings=settings, announce=False)
     assert design.run.device.startswith(GPU)
     assert design.polished_loss <= design.start_loss
-    # As above.
+    # The same tolerances as for the hologram apply.
     (score,) = score_design(tmp_path / "d", tmp_path / "s", judges=[make_printer(layout)]).scores
     assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)

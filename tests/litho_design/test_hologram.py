@@ -1,4 +1,4 @@
-"""From levels to a scored image: gradients, normalisation, and scores against independent code."""
+"""Test the way from levels to a scored image: gradients, normalisation, scores against independent code."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def test_gradient_from_mask_through_print_and_field_to_loss(make_printer):
 
 
 @pytest.mark.parametrize("scale", ["paper", "least-squares"])
-def test_the_efficiency_term_is_alive(scale):
-    # The published loss divides the efficiency twice; here half the light must be worth half.
+def test_half_the_light_halves_the_efficiency_term(scale):
+    # The published loss divides by the efficiency twice. Here half the light must count half.
     target = torch.zeros(8, 8).double()
     target[2:4, 2:4] = 1
     share = torch.rand(8, 8).double() / 64
@@ -88,9 +88,10 @@ def test_fully_developed_speckle_has_unit_contrast():
     speckle = torch.randn(256, 256, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
     grid = centred_grid((256, 256), 0.1)
     score = hologram_score([(1.0, speckle)], speckle, target, grid, Optics())
-    # 32768 independent samples of an exponential distribution: sd of the contrast about 0.006.
+    # There are 32768 independent samples of an exponential distribution: the sd of the contrast is about
+    # 0.006.
     assert score.speckle_contrast == pytest.approx(1, abs=0.03)
-    # Of a target without greys both figures count the same half of the light.
+    # For a target without greys both figures select the same half of the light.
     assert score.eff_paper == score.eff_signal == pytest.approx(score.eff_window / 2, rel=0.03)
 
 
@@ -99,9 +100,9 @@ def test_the_light_of_four_pixels():
     wanted = {
         "eff_signal": 4.0,
         "eff_window": 4.5,
-        # They lie 1 from their mean of 2.
+        # Each of the four values is 1 from their mean of 2.
         "speckle_contrast": 0.5,
-        # Between 1.1 and 2.9, a twentieth from either end.
+        # The range is 1.1 to 2.9, a twentieth from either end.
         "uniformity": 1 - 1.8 / 4,
         "background_ratio": 8.0,
     }
@@ -123,7 +124,7 @@ def test_psnr_equals_scikit_image(kind):
     target, seen = torch.from_numpy(image), torch.from_numpy(other)
     scaled = (matched_scale(seen, target) * seen).numpy()
     reference = peak_signal_noise_ratio(image, scaled, data_range=1.0) if image.any() else 300.0
-    # A dark target is met exactly by the scale 0: the error's floor of 1e-30 is 300 dB.
+    # The scale 0 meets a dark target exactly. The floor of the error, 1e-30, is 300 dB.
     assert si_psnr_db(seen, target) == pytest.approx(reference, abs=1e-6)
     figures = similarity(seen, target, "seen")
     assert figures["psnr_seen_db"] == pytest.approx(
@@ -156,7 +157,8 @@ def test_ssim_equals_torchmetrics(kind):
             data_range=1.0,
             return_full_image=True,
         )
-        # Its own mean includes windows that reach into reflected padding; the definition does not.
+        # The mean of the reference includes windows that reach into reflected padding. The definition does
+        # not.
         edge = SSIM_WINDOW_PX // 2
         reference = float(similarity[..., edge:-edge, edge:-edge].mean())
         assert ssim(*pair) == pytest.approx(reference, abs=1e-4)
@@ -167,7 +169,7 @@ def test_an_aperture_passes_what_is_inside_it_and_nothing_else():
     grid = centred_grid((200, 200), 0.1)
     x = torch.from_numpy(grid.x_um)
     for angle_sine, passed in ((0.2, 1.0), (0.45, 0.0)):
-        # A cosine that fits the mirrored window: whole half periods.
+        # The cosine has whole half periods in the window, so it fits the mirrored window.
         half_periods = round(2 * 20.0 * angle_sine / WAVELENGTH_UM)
         wave = (
             torch.cos(math.pi * half_periods * (x - x[0] + 0.05) / 20.0).expand(200, 200).to(torch.complex128)

@@ -1,4 +1,4 @@
-"""Incoherent imaging and Richardson-Lucy."""
+"""Test incoherent imaging and Richardson-Lucy deconvolution."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def test_richardson_lucy_finds_the_object_for_any_psf_energy(energy, size):
     psf = gaussian_psf(9, 0.9, energy)
     seen = Blur(psf, (size, size)).forward(wanted)
     estimate = richardson_lucy(seen, psf, iterations=2000)
-    # Flux is conserved by every step; a global factor of the energy would show here at once.
+    # Every step conserves flux, so a wrong global factor of the energy is noticed at once.
     assert float(Blur(psf, (size, size)).forward(estimate).sum()) == pytest.approx(
         float(seen.sum()), rel=1e-4
     )
     assert float(estimate.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
-    # 2000 steps leave a thousandth of the brightest pixel, whatever the energy.
+    # After 2000 steps the error is a thousandth of the brightest pixel, whatever the energy.
     assert float((estimate - wanted).abs().max()) < 0.01
     rows = torch.arange(size).double()
     for axis in (0, 1):
@@ -71,7 +71,7 @@ def test_richardson_lucy_equals_scikit_image_away_from_the_border():
     seen = Blur(psf, (64, 64)).forward(torch.from_numpy(wanted)) + 1e-3
     ours = richardson_lucy(seen, psf, iterations=10)
     theirs = reference(seen.numpy(), psf.numpy(), num_iter=10, clip=False)
-    # Different flat starts fade; the reference ignores H^T 1, which is 1 only inside.
+    # The effect of different flat starts decays. The reference ignores H^T 1, which is 1 only inside.
     middle = slice(20, 44)
     assert np.abs(ours.numpy() - theirs)[middle, middle].max() < 0.05 * theirs.max()
 

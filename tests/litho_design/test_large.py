@@ -1,4 +1,4 @@
-"""Large elements: bands of rows give what one piece gives, on any number of processes."""
+"""Bands of rows give the result of one piece for large elements, on any number of processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.litho_design.large_rank import BAND, SIZE
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> Path:
-    """The folder of one process."""
+    """Return the folder of a run in one process."""
     folder = tmp_path_factory.mktemp("one")
     large_rank.work(folder, Ranks())
     return folder
@@ -105,7 +105,7 @@ def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
         for name in ("field", "back", "gradient"):
             joined = np.concatenate([part[name] for part in parts])
             assert np.abs(joined - wanted[name]).max() <= 1e-6 * np.abs(wanted[name]).max(), name
-        # The sum over the pixels is in double: only what it is made of is rounded to float32.
+        # The sum over the pixels is in double precision. Only its terms are rounded to float32.
         assert [float(part["loss"]) for part in parts] == pytest.approx(
             [float(wanted["loss"])] * count, rel=1e-9
         )
@@ -146,10 +146,10 @@ def test_a_score_in_bands_is_that_of_the_whole(alone, tmp_path):
     (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
     assert len(streamed.figures) == 10
     for name, value in streamed.figures.items():
-        # Waves differ by rounding, 1e-6 of the largest amplitude; figures are sums of squares of them.
+        # The waves differ by rounding, 1e-6 of the largest amplitude. The figures are sums of their squares.
         assert value == pytest.approx(whole.figures[name], rel=1e-4, abs=1e-7), name
     assert streamed.rms_height_difference_um == pytest.approx(whole.rms_height_difference_um, abs=1e-7)
-    # The record of the design has the same figures, but for the zero order.
+    # The record of the design has the same figures, except for the zero order.
     predicted = Design.read(design).predicted
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
@@ -169,7 +169,7 @@ def test_what_a_large_element_cannot_have_is_refused():
         BandedHologram(settings, printer, wide, inputs=inputs)
 
 
-def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
+def test_a_lens_in_rings_equals_the_lens_of_the_plane(tmp_path):
     changes = {
         "layout.size_px": 256,
         "optics.distance_um": 40.0,
@@ -182,13 +182,13 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     free = 12 * torch.rand(plane.cells.cells, generator=torch.Generator().manual_seed(0))
     radius = rings.cells(free[: rings.cells.cells[0]])[None, None]
     printed = rings.search_print(radius, printer)
-    # Beyond the aperture the plane has corners, which the print reaches for 8 px: 1e-5 µm is rounding.
+    # Beyond the aperture the plane has corners, which affect the print over 8 px. 1e-5 µm is rounding.
     assert (printed - plane.printed_rings(plane.cells(free)[None, None], printer))[:-8].abs().max() < 1e-5
     found, whole = (
         (one.objective(two)[0], one.score(one.bench.ideal_height_um()))
         for one, two in ((rings, radius), (plane, plane.cells(free)[None, None]))
     )
-    # A circle of square pixels against true rings: a pixel of the edge in 128, twice, in power.
+    # A circle of square pixels is compared with true rings: one edge pixel in 128, twice, in power.
     assert found[1].focusing_efficiency == pytest.approx(whole[1].focusing_efficiency, rel=1 / 64)
     assert found[1].fwhm_um == pytest.approx(whole[1].fwhm_um, rel=1 / 64)
     design = design_lens(printer, tmp_path, settings=settings, tile_px=48, announce=False)
@@ -198,13 +198,13 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     again = rings.score(rings.printed_um(torch.from_numpy(level))).model_dump()
     assert design.predicted == pytest.approx(again, rel=1e-6)
     assert 0.2 < design.predicted["strehl"] <= 1
-    # Its plane: what the map of a plane makes of the same rings, the last one in the corners.
+    # The plane repeats the rings, with the last ring in its corners.
     cells = CellMap(settings.layout)
     ring = torch.from_numpy(level[:: settings.layout.cell_px])
     whole = cells(torch.cat([ring, ring[-1:].expand(cells.cells[0] - len(ring))])).numpy()
     for kind in ("tiff", "gds", "png16"):
         np.testing.assert_array_equal(import_levels(export(tmp_path, kind, tmp_path / kind))[0], whole)
-    # One's own model repeats the prediction; nominal heights are off by what the print loses.
+    # The model of the design repeats the prediction. Nominal heights lack the losses of the print.
     own, nominal = score(tmp_path, tmp_path / "score", judges=[printer, "none"]).scores
     assert own.figures == pytest.approx(design.predicted, rel=1e-6)
     assert own.rms_height_difference_um < 1e-6

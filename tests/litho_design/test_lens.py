@@ -1,4 +1,4 @@
-"""Lenses: the ring path against the plane path, figures against theory, a whole design."""
+"""Test lenses: the ring path against the plane path, figures against theory, a whole design."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def settings():
 
 @pytest.mark.parametrize("aperture", ["circle", "square"])
 def test_perfect_lens_reaches_the_diffraction_limit(aperture):
-    # 30 µm at f = 200: a/f = 0.075, where the paraxial formulas hold to 1 %.
+    # A lens of 30 µm at f = 200 has a/f = 0.075, where the paraxial formulas hold to 1 %.
     bench = LensBench(LAYOUT, Optics(distance_um=200.0), LensView(aperture=aperture, window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
     assert score.strehl == pytest.approx(1, abs=1e-12)
@@ -50,10 +50,10 @@ def test_perfect_lens_reaches_the_diffraction_limit(aperture):
     area = math.pi * 15**2 if aperture == "circle" else 30**2
     assert float(psf.max()) / LAYOUT.pitch_um**2 == pytest.approx(area / (0.6328 * 200) ** 2, rel=0.01)
     if aperture == "circle":
-        # Airy: full width at half maximum 1.029 lambda f / D.
+        # The full width at half maximum of an Airy disc is 1.029 lambda f / D.
         assert score.fwhm_um == pytest.approx(1.029 * 0.6328 * 200 / 30, rel=0.01)
     else:
-        # A square's section is sinc^2 with half width 0.443 lambda f / D.
+        # The section of a square's focus is sinc^2 with half width 0.443 lambda f / D.
         row = psf[127] / psf.max()
         half = 0.443 * 0.6328 * 200 / 30
         position = int((half + 0.05) / 0.1)
@@ -63,7 +63,8 @@ def test_perfect_lens_reaches_the_diffraction_limit(aperture):
 def test_airy_power_inside_the_focusing_radius():
     bench = LensBench(LAYOUT, OPTICS, LensView(window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
-    # Encircled energy 1 - J0^2(v) - J1^2(v) at v = pi D r / (lambda f), r = 3 FWHM = 3.08 lambda f / D.
+    # The encircled energy is 1 - J0^2(v) - J1^2(v) at v = pi D r / (lambda f), with r = 3 FWHM = 3.08 lambda
+    # f / D.
     from scipy.special import j0, j1
 
     v = math.pi * 30 * score.focusing_radius_um / (0.6328 * 100)
@@ -71,7 +72,7 @@ def test_airy_power_inside_the_focusing_radius():
 
 
 @pytest.mark.parametrize(("levels", "step_um"), [(13, 0.1), (8, 0.1443), (2, 0.57735)])
-def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
+def test_a_staircase_lens_loses_as_much_as_the_blaze_formula_states(levels, step_um):
     layout = LAYOUT.model_copy(update={"size_px": 600, "levels": levels, "level_height_um": step_um})
     base = lens_settings("direct")
     task = lens_task(
@@ -87,12 +88,12 @@ def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
     parameters = task.free_parameters()
     height = task.printer(task.cells(parameters.best_levels())[None, None].float())[0, 0]
     strehl = lens_score(task.bench, height).strehl
-    # One wave is 11.5 steps of 0.1 µm; a lens of seven zones scatters a per cent or two beside the rule.
+    # One wave is 11.5 steps of 0.1 µm. A lens of seven zones loses one or two per cent more than the formula.
     steps = {13: 12, 8: 8, 2: 2}[levels]
     assert strehl == pytest.approx(blaze_efficiency(steps, 1.0), abs=0.03)
 
 
-def test_ring_path_sees_what_the_plane_path_sees(make_printer):
+def test_ring_path_and_plane_path_give_the_same_wave(make_printer):
     view = LensView(window_px=128, path="radial")
     bench, rings = LensBench(LAYOUT, OPTICS, view), RadialLensBench(LAYOUT, OPTICS, view)
     base = lens_settings("direct")
@@ -106,8 +107,8 @@ def test_ring_path_sees_what_the_plane_path_sees(make_printer):
     level = task.cells(smooth)[None, None]
     plane = bench(task.printer(level)[0, 0])
     strip = rings(task.printed_rings(level, task.printer))
-    # What differs: the disc's edge is a staircase of pixels (1e-3), the layout ends where its circle
-    # touches the sides, and rings are flat across 0.1 µm where this rough print is not.
+    # Three things differ: the edge of the disc is a staircase of pixels (1e-3), the layout ends where its
+    # circle touches the sides, and rings are flat across 0.1 µm where this rough print is not.
     assert float((plane - strip).abs().sum() / plane.sum()) < 0.04
 
 
@@ -118,7 +119,7 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
     assert not task.radial
     assert "whole plane" in task.notes[0]
     level = torch.full((1, 1, 300, 300), 3.0)
-    # The objective sees the print of the element itself, not of a strip.
+    # The objective gets the print of the whole element, not of a strip.
     centre_px = round(CENTRE_UM / LAYOUT.pitch_um)
     ratio = centre_to_background(task.bench(printer(level)[0, 0]), centre_px, 300)
     assert float(task.objective(level)[0]) == pytest.approx(-math.log(float(ratio)), rel=1e-6)
@@ -126,7 +127,7 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
 
 
 def test_errors_of_a_computational_lens_by_independent_code(settings, make_printer):
-    """Print, PSF, sensor image and Richardson-Lucy once more, in NumPy and SciPy and float64."""
+    """Compute print, PSF, sensor image and Richardson-Lucy again, in NumPy, SciPy and float64."""
     computational = settings.model_copy(update={"task": "computational"})
     imaging, n, window, z, wavelength = computational.imaging, 300, 128, 100.0, 0.6328
     bench = LensBench(LAYOUT, OPTICS, settings.view)
@@ -168,9 +169,9 @@ def test_errors_of_a_computational_lens_by_independent_code(settings, make_print
                     estimate *= fftconvolve(ratio, mirrored, "same").clip(0) / weight
                 errors[name].append(np.abs(estimate - truth).mean())
     for name, values in errors.items():
-        # float32 in ours, through ten divisions by dark images.
+        # Our code uses float32 through ten divisions by dark images.
         assert getattr(found, f"mae_{name}") == pytest.approx(np.mean(values), rel=1e-4), name
-    # Another PSF leaves another error, by far more than the tolerance.
+    # Another PSF changes the error by far more than the tolerance.
     assert found.mae_design != pytest.approx(found.mae_calibrated, rel=0.01)
 
 
@@ -189,15 +190,15 @@ def test_width_of_a_gaussian():
 
 
 def test_width_of_a_gaussian_in_an_odd_window():
-    # 17 px are padded to 65, not 68: a pitch of a quarter pixel would make it 4.6 % too narrow.
+    # 17 px are padded to 65, not 68. A pitch of a quarter pixel would make the width 4.6 % too small.
     x = torch.arange(-8, 9).double() * 0.1
     psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.2**2))
-    # Half the samples along the rim of a circle of 0.24 µm radius: 2 % of its diameter.
+    # Half of the samples on the rim of a circle of 0.24 µm radius count: 2 % of its diameter.
     assert half_maximum_width_um(psf, 0.1) == pytest.approx(2.3548 * 0.2, rel=0.02)
 
 
-def test_a_window_that_cuts_the_focus_is_said(settings, make_printer):
-    # Radius 3 * 0.514 * 0.6328 / NA = 6.6 µm at NA 0.148: 128 px are 12.8 µm, 133 hold the circle.
+def test_a_window_that_cuts_the_focus_is_reported(settings, make_printer):
+    # The radius is 3 * 0.514 * 0.6328 / NA = 6.6 µm at NA 0.148. 128 px are 12.8 µm; 133 px hold the circle.
     (note,) = lens_task(settings, make_printer(LAYOUT)).notes
     assert "--window-px 132" in note
     wide = settings.model_copy(update={"view": settings.view.model_copy(update={"window_px": 132})})
@@ -235,7 +236,7 @@ def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, m
     assert foreign.independent
     assert foreign.figures["strehl"] < own.figures["strehl"]
     if task == "computational":
-        # One PSF on both sides in design; after another print only calibration knows the right one.
+        # The design uses one PSF on both sides. After another print only calibration gives the right one.
         assert own.figures["mae_design"] == pytest.approx(own.figures["mae_calibrated"], rel=1e-6)
         assert foreign.figures["mae_design"] != foreign.figures["mae_calibrated"]
     assert LoadedDesign(tmp_path / "design").target is None
@@ -254,8 +255,8 @@ def test_ring_path_needs_rings(settings, make_printer, change, message):
         lens_task(changed, make_printer(changed.layout))
 
 
-def test_an_mtf_between_two_samples_is_on_the_line_between_them():
-    """Of a spot that is wider along one axis: a mean of both, zero frequency first."""
+def test_an_mtf_is_interpolated_linearly_between_samples():
+    """For a spot that is wider along one axis, the MTF is the mean of both axes, zero frequency first."""
     y, x = np.meshgrid(*(np.arange(32) - 16.0,) * 2, indexing="ij")
     psf, pitch_um = torch.from_numpy(np.exp(-(x**2) / 18 - y**2 / 4.5)), 0.2
     curve = mtf(psf)
@@ -263,6 +264,6 @@ def test_an_mtf_between_two_samples_is_on_the_line_between_them():
     for share in (0.0, 0.25, 0.75):
         wanted = (1 - share) * samples[2] + share * samples[3]
         assert mtf_at(psf, (2 + share) / (32 * pitch_um), pitch_um) == pytest.approx(float(wanted), rel=1e-9)
-    # Gaussian spots of 3 and 1.5 px have Gaussian transfers.
+    # Gaussian spots of 3 and 1.5 px have Gaussian transfer functions.
     closed = [np.exp(-2 * (np.pi * sd * 2 / 32) ** 2) for sd in (3.0, 1.5)]
     assert float(samples[2]) == pytest.approx(np.mean(closed), rel=1e-6)

@@ -32,13 +32,13 @@ from litho_design.workflows.score import score as score_design
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160
-# Camera pixels that count nothing, by the window pixel (x, y) on the L that they see; and hot ones (y, x).
+# Dead camera pixels, by the window pixel (x, y) on the L that they see, and hot ones (y, x).
 DEAD, HOT = ((23, 40), (23, 60), (40, 73)), ((10, 12), (80, 140), (61, 90))
 
 
 @pytest.fixture(scope="module")
 def lens(tmp_path_factory):
-    """A lens of 20 µm, f = 40 µm: full width at half maximum 1.4 µm, seven sensor pixels."""
+    """Return a lens of 20 µm, f = 40 µm, with a full width at half maximum of 1.4 µm, seven sensor pixels."""
     layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
     default = lens_settings("direct")
     settings = default.model_copy(
@@ -58,7 +58,7 @@ def lens(tmp_path_factory):
 
 @pytest.fixture
 def picture(tmp_path):
-    """An object without symmetry: an L, a grey bar and a bright dot."""
+    """Draw an object without symmetry: an L, a grey bar and a bright dot."""
     drawn = np.zeros((72, 72), np.uint8)
     drawn[6:66, 6:16] = drawn[56:66, 16:50] = 220
     drawn[10:20, 40:60] = 120
@@ -68,7 +68,10 @@ def picture(tmp_path):
 
 
 def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
-    """Write the photograph of ``wanted`` (n, n) behind a print; returns the PSF and photo-to-window map."""
+    """Write the photograph of ``wanted`` (n, n) behind a print.
+
+    Return the PSF and the photo-to-window map.
+    """
     psf = sensor_psf(loaded.bench(height_um), 2)
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted).double().numpy()
     turn = np.deg2rad(turn_degrees)
@@ -90,7 +93,7 @@ def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.0
 
 
 def estimate(loaded, recorded, psf, wanted):
-    """What deconvolution makes of an image that needs no registration, at the scale of least error."""
+    """Return the deconvolved image, without registration, at the scale of least error."""
     found = richardson_lucy(recorded, psf, loaded.task.settings.imaging.iterations)
     return found * matched_scale(found, wanted)
 
@@ -99,7 +102,7 @@ def estimate(loaded, recorded, psf, wanted):
 def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_path, lens, picture):
     loaded = LoadedDesign(lens)
     wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
-    # The print is too low towards its rim, so that its PSF is wider and lower than the designed one.
+    # The print is too low towards its rim, so its PSF is wider and lower than the designed one.
     radius = torch.from_numpy(np.hypot(*np.mgrid[-99.5:100, -99.5:100]) / 100).float()
     printed = loaded.expected_um * (1 - 0.5 * radius.square())
     np.savetxt(tmp_path / "scan.txt", (printed.double().numpy() + 0.2) * 1e-6)
@@ -110,21 +113,21 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
     assert (measured.kind, score.kind) == ("scan", "camera")
     assert ScoreResult.read(tmp_path / "score").scores[1] == score
     assert score.judge.imaged.sha256 == file_sha256(picture)
-    # Dead pixels lie on the L, where they are far from their neighbours; hot ones are so everywhere.
+    # Dead pixels on the L differ most from their neighbours. Hot pixels differ everywhere.
     assert score.judge.replaced_pixels >= len(DEAD) + len(HOT)
     assert score.judge.dark_level == DARK
     assert score.judge.saturated_share == pytest.approx(len(HOT) / PHOTO_PX**2)
 
-    # Registration: corners of the lit part go to the photograph and back. The images are compared after a
-    # blur of 2 px, and a quarter of a pixel is 0.05 µm, a 28th of the PSF's width.
+    # To check the registration, corners of the lit part go to the photograph and back. The images are
+    # compared after a blur of 2 px. A quarter of a pixel is 0.05 µm, a 28th of the width of the PSF.
     displaced_px = 0.25
     corners = np.array([[12, 84, 12, 84], [12, 12, 84, 84], [1, 1, 1, 1]])
     found = np.array(score.judge.photo_to_window) @ corners
     assert np.hypot(*(to_window @ (found / found[2]) - corners[:2])).max() < displaced_px
 
-    # A displacement by d changes an image by at most d times its gradient, and so its mean absolute
-    # error and its root of the mean square, whose distances obey the triangle inequality. The noise, 0.3 %
-    # of white, is taken as it is: deconvolution amplifies it, more camera than sensor pixels average it.
+    # A displacement by d changes an image by at most d times its gradient. The mean absolute error and the
+    # rms error obey the triangle inequality, so they change by no more. Noise of 0.3 % of white is taken as
+    # it is: deconvolution amplifies it, and averaging over camera pixels reduces it.
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted)
     design_psf = sensor_psf(loaded.bench(loaded.expected_um), 2)
     for name, image in {
@@ -139,7 +142,7 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
         rms, rms_ideal = (10 ** (-one[f"psnr_{name}_db"] / 20) for one in (score.figures, ideal))
         change = float(displaced_px * np.sqrt(np.square(gradient).mean()) + NOISE / WHITE)
         assert rms == pytest.approx(rms_ideal, abs=change)
-    # Only calibration knows the PSF that made the photograph.
+    # Only calibration gives the PSF of this photograph.
     assert score.figures["mae_calibrated"] < score.figures["mae_design"] < score.figures["mae_direct"]
     assert score.figures["ssim_calibrated"] > score.figures["ssim_design"] > score.figures["ssim_direct"]
 
@@ -153,12 +156,12 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     verdict = score_lens_photo(loaded, photo)
     score, record = verdict.figures, verdict.record
     assert record.imaged == "text"
-    # The percentile of a dark surround with noise: two or three of its standard deviations below the level.
+    # In a dark surround with noise the percentile is two or three standard deviations below the level.
     assert DARK - 3 * NOISE < record.dark_level < DARK + NOISE
     assert score.mae_calibrated is None
     assert list(verdict.pictures) == ["object text", "photograph", "deconvolved, design PSF"]
     assert score.mae_design < score.mae_direct
-    # It is this object that was photographed: another one does not match, or is further off.
+    # This object was photographed. Another object does not match, or has a larger error.
     with pytest.raises(InputError, match=r"correlation|proportional to the light"):
         score_lens_photo(loaded, replace(photo, imaged="spots"))
 

@@ -1,4 +1,4 @@
-"""A printed part and a photographed image as judges."""
+"""A measured print and a photographed image serve as judges."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FINER = 4
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera: how it stands, and what it does to the light."""
+    """A camera: its position and its effect on the light."""
 
     pitch_um: float = 0.15
     turn_deg: float = 0.0
@@ -44,7 +44,7 @@ class Camera:
     gamma: float = 1.0
 
     def counts(self, light: np.ndarray, pitch_um: float, seed: int) -> np.ndarray:
-        """The photograph uint16 of light (n, n) on pixels of ``pitch_um``."""
+        """Return the photograph, uint16, of light (n, n) on pixels of ``pitch_um``."""
         step = self.pitch_um / pitch_um / self.scale
         side = round(1.15 * len(light) / step)
         place = (np.arange(side * _FINER) + 0.5) / _FINER - side / 2
@@ -91,12 +91,12 @@ def test_a_measured_print_scores_like_the_print_it_is(tmp_path, printed_design):
     assert score.kind == "scan"
     assert score.judge.coverage > 0.9
     assert score.judge.height_offset_um == pytest.approx(0.3, abs=2e-3)
-    # 2 nm of noise is 0.002 wave: nothing but the registration's own error may show.
+    # 2 nm of noise is 0.002 wave, so only the error of registration may be visible.
     assert score.figures["si_psnr_db"] == pytest.approx(loaded.record.predicted["si_psnr_db"], abs=0.5)
 
 
 def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, printed_design):
-    """A tilt of 0.05 µm/µm once took 1.8 dB, without a word."""
+    """Such a scan must not lose score: a tilt of 0.05 µm/µm once cost 1.8 dB without a warning."""
     loaded = LoadedDesign(printed_design)
     expected = loaded.expected_um.numpy().astype(np.float64)
     generator = np.random.default_rng(3)
@@ -106,7 +106,7 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
     tilt, bow = (0.05, -0.03), 0.002
     flat = printed + bow * (x * x + y * y) + 0.003 * generator.standard_normal(expected.shape)
     scan = flat + tilt[0] * x + tilt[1] * y
-    # The truth is the print without what levelling takes of its own roughness.
+    # The reference is the print minus the part of its roughness that levelling removes.
     own = fitted_background(printed, expected, np.ones_like(printed, bool), 0.1, "bow").map_um
     truth = loaded.score(torch.from_numpy(printed - own).float())
     source = MeasuredSource(tmp_path / "scan.txt", "m", (12.8, 12.8))
@@ -118,9 +118,9 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
         assert score.figures["si_psnr_db"] == pytest.approx(truth.si_psnr_db, abs=0.15)
         assert score.judge.noise_um == pytest.approx(0.003, rel=0.2)
         assert (score.judge.orientation == "identity") == (orientation == "identity")
-        # A height scale known to 2 % leaves more open than the noise does.
+        # A height scale known to 2 % adds more uncertainty than the noise.
         assert 0.01 < score.uncertainty["si_psnr_db"] < 1
-    # What the reports say of the first, which lies as the layout does.
+    # Check the report of the first scan, which lies as the layout does.
     score = ScoreResult.read(tmp_path / "identity").scores[0]
     assert score.judge.tilt_um_per_um == pytest.approx(tilt, abs=0.002)
     # 2 bow 6.35^2 from the middle to the corners.
@@ -133,7 +133,7 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
 
 @dataclass(frozen=True)
 class Widened:
-    """What a scan has that a tip is taken off."""
+    """The fields of a scan that tip correction needs."""
 
     height_um: np.ndarray
 
@@ -144,13 +144,13 @@ class Widened:
 def test_a_pillar_is_narrower_without_its_tip_and_as_high():
     y, x = np.meshgrid(0.1 * np.arange(-20, 21), 0.2 * np.arange(-10, 11), indexing="ij")
     radius_um = 0.5
-    # A needle of 1 µm, as a paraboloid shows it.
+    # The scan of a needle of 1 µm is a paraboloid.
     scan = Widened(np.maximum(1 - (x**2 + y**2) / (2 * radius_um), 0))
     freed, found_um, change_um = _without_tip(scan, radius_um)
     assert (found_um, freed.height_um[20, 10]) == (radius_um, pytest.approx(1))
     for beside in ((21, 10), (19, 10), (20, 11), (20, 9)):
         off_um = np.hypot(y[beside], x[beside])
-        # Carried by the needle's foot, √(2R) away.
+        # At a distance of √(2R) the foot of the needle carries the tip.
         assert freed.height_um[beside] == pytest.approx((1 - off_um) ** 2, abs=1e-6)
     assert change_um == pytest.approx(np.std(freed.height_um - scan.height_um))
     assert _without_tip(scan, 0.0) == (scan, 0, 0)
@@ -174,8 +174,8 @@ def test_a_scan_of_something_else_is_refused(tmp_path, printed_design):
 def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design):
     loaded = LoadedDesign(printed_design)
     image = loaded.image(loaded.expected_um)
-    # Camera of 0.2 µm pixels, turned by 2 degrees, moved by (1.3, -0.8) µm, dark level 300, two hot pixels
-    # and a dead one in the light.
+    # The camera has 0.2 µm pixels, is turned by 2 degrees and moved by (1.3, -0.8) µm, with a dark level of
+    # 300. Two hot pixels and a dead one lie in the light.
     turn = np.deg2rad(2.0)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     to_window = np.hstack([2 * matrix, (63.5 - 2 * matrix @ np.array([56.0, 45.5]))[:, None]])
@@ -195,7 +195,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 200
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
-    # photograph = matrix^-1 window / 2: the linear part found must undo what was done.
+    # photograph = matrix^-1 window / 2: the linear part of the found map must invert the true one.
     found = np.array(score.judge.photo_to_window)[:2, :2]
     assert found == pytest.approx(np.linalg.inv(2 * matrix), abs=0.01)
     blurred = torch.from_numpy(cv2.GaussianBlur(image, (0, 0), 1.4)).double()
@@ -204,7 +204,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
 
 
 @pytest.mark.parametrize("target", ["text", "ring"])
-def test_a_mirrored_or_turned_photograph_is_never_scored_in_silence(tmp_path, small_settings, target):
+def test_a_mirrored_or_turned_photograph_is_never_scored_without_a_warning(tmp_path, small_settings, target):
     printer = Printer(None, small_settings.layout, source="none")
     design_hologram(target, printer, tmp_path / "design", settings=small_settings, announce=False)
     loaded = LoadedDesign(tmp_path / "design")
@@ -217,7 +217,7 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_in_silence(tmp_path, sm
         cv2.imwrite(
             str(tmp_path / "p.png"), np.ascontiguousarray(orient(counts, orientation)).astype(np.uint16)
         )
-        # One count of the camera is this share of the light, spread over the 2.25 window pixels it covers.
+        # One count of the camera is this share of the light, spread over 2.25 window pixels.
         power = 40000 / seen.max() / 2.25
         source = PhotoSource(tmp_path / "p.png", 0.15, 300.0, power_counts=power)
         try:
@@ -237,7 +237,7 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_in_silence(tmp_path, sm
 
 
 def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp_path, small_settings):
-    """Seen at an angle, turned, noisy, dark in its corners; and what no score could stand."""
+    """Photographs are seen at an angle, turned, noisy, dark in the corners, or too bad for any score."""
     printer = Printer(None, small_settings.layout, source="none")
     design_hologram("text", printer, tmp_path / "design", settings=small_settings, announce=False)
     loaded = LoadedDesign(tmp_path / "design")
@@ -266,8 +266,8 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
-def test_the_end_of_a_range_is_found_in_the_pixels_and_not_in_the_container(bits):
-    """A camera of 12 bits writes files of 16, whose largest value no pixel has."""
+def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
+    """A camera of 12 bits writes 16-bit files. No pixel reaches the largest value of the file."""
     light = np.random.default_rng(0).uniform(0, 1, (100, 100)) ** 2 * 2**bits
     assert _saturated(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
         0.046, abs=0.01
@@ -276,14 +276,14 @@ def test_the_end_of_a_range_is_found_in_the_pixels_and_not_in_the_container(bits
 
 
 class Power(Record):
-    """A figure that is linear in what is measured, and one that is not."""
+    """A figure that is linear in the measured values, and one that is not."""
 
     mean: float
     power: float
 
 
-def test_figures_are_freed_of_what_noise_adds_on_average():
-    """Noise of sd s adds s^2 to a mean of squares and nothing to a mean, whatever the figure it falls on."""
+def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
+    """Noise of sd s adds s^2 to a mean of squares and nothing to a mean, whatever figure it affects."""
     generator = np.random.default_rng(0)
     truth, sd = generator.uniform(0, 1, 4000), 0.3
     drawn, freed = [], []
@@ -316,7 +316,7 @@ def test_baselines_stand_beside_every_score(printed_design, tmp_path):
     assert limited["si_psnr_db"] > design.predicted["si_psnr_db"]
     assert weighted["speckle_contrast"] < phase["speckle_contrast"]
     assert design.predicted["eff_signal"] < design.reference_efficiency <= 1
-    # What cannot be resolved does not count against an image.
+    # Details that cannot be resolved do not count against an image.
     assert all(one["si_psnr_resolved_db"] > one["si_psnr_db"] for one in design.baselines.values())
     assert score_design(printed_design, tmp_path / "s", judges=["none"]).baselines == design.baselines
 

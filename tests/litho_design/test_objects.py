@@ -1,4 +1,4 @@
-"""Objects of a lens that the user brings: conversion, split, identity, and what is refused."""
+"""Test the objects of a lens that the user provides: conversion, split, identity, refusals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def settings():
 
 @pytest.fixture
 def folder(tmp_path):
-    """Five pictures whose names are not in the order in which they were written."""
+    """Write five pictures. Their names sort in another order than they were written."""
     place = tmp_path / "pictures"
     place.mkdir()
     for seed, name in enumerate("cebda"):
@@ -58,7 +58,7 @@ def folder(tmp_path):
     return place
 
 
-def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
+def test_drawings_and_pictures_have_a_dark_border(folder, settings):
     brought, inputs = with_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
     ring, picture = object_stack(("ring", *brought.imaging.objects), 32, inputs[PICTURES])
     inside = slice(4, 28)
@@ -70,7 +70,8 @@ def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
 
 
 def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
-    # Red and twice as wide as high: a square of 48 px with dark bands above and below, then 24 px.
+    # The picture is red and twice as wide as high: a square of 48 px with dark bands above and below, then 24
+    # px.
     colour = np.zeros((24, 48, 3), np.uint8)
     colour[:, :24, 2], colour[:, 24:, 2] = 200, 100
     cv2.imwrite(str(tmp_path / "wide.png"), colour)
@@ -88,8 +89,8 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
     assert deep.adaptation == "divided by its brightest value; dark border of 4 px"
     seen, dark = inputs[PICTURES]
     assert seen.shape == (32, 32)
-    # 12 of the 24 rows are light: full on the left, half on the right. Luma is 59.8 against 29.9, and a
-    # decoder may round or cut its counts: one in 59.
+    # 12 of the 24 rows are light: full on the left, half on the right. The luma is 59.8 against 29.9. A
+    # decoder may round or cut its counts, by one in 59.
     assert np.allclose(seen[10:22, 4:16], 1)
     assert np.allclose(seen[10:22, 16:28], 0.5, atol=1 / 59)
     assert seen.sum() == pytest.approx(seen[10:22, 4:28].sum())
@@ -109,7 +110,7 @@ def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_ou
 
 
 def test_transparent_pixels_are_dark(tmp_path):
-    """A logo is white all over, and its shape stands in the alpha channel."""
+    """A logo may be white everywhere, with its shape in the alpha channel."""
     shape = np.zeros((40, 40), np.uint8)
     shape[8:16, 4:30] = 255
     logo = np.dstack([np.full((40, 40, 3), 255, np.uint8), shape])
@@ -131,7 +132,7 @@ def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, 
         file.unlink()
     own = score_design(tmp_path / "d", tmp_path / "score", judges=[printer]).scores[0]
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
-    # The same print images the drawings with another error.
+    # The same print images the built-in drawings with another error.
     drawn = lens_task(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
     assert drawn.mae_calibrated != pytest.approx(design.predicted["mae_calibrated"], rel=0.01)
 

@@ -1,4 +1,4 @@
-"""A task of one's own: the example runs from design to score, and what it rests on."""
+"""A user-defined task: the example runs from design to score, and its parts are tested."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TINY = {
 
 @register_task
 class Corner(Task):
-    """Light into one corner, at two angles of incidence."""
+    """Light is sent into one corner, at two angles of incidence."""
 
     name = "corner"
 
@@ -48,12 +48,12 @@ class Corner(Task):
 
 
 def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, capsys):
-    """In fifteen lines at most, as promised; yield and report as for the built-in tasks."""
+    """The example has fifteen lines at most, as promised. Yield and report are as for the built-in tasks."""
     text = (ROOT / "examples" / "own_task.py").read_text("utf-8")
     body = text.split("class ColoursInPlanes")[1].split("def spots")[0].splitlines()
     assert len([line for line in body if line.strip() and '"""' not in line]) <= 15
     out = tmp_path / "rgb"
-    # A hundred prints for a yield take longer than all the rest.
+    # A yield of a hundred prints takes longer than everything else.
     few = {"window.yield_draws": 2}
     monkeypatch.setattr(litho_design, "design_settings", lambda changes: design_settings(changes | few))
     known = dict(task_module._TASKS)
@@ -68,7 +68,7 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
     assert result.task == "colours-in-planes"
     assert {entry.judge for entry in result.entries} == {"none", "model"}
     place = out / "designs" / "model" / "seed0"
-    # Yield, report and what is seen are kept as for holograms and lenses.
+    # Yield, report and images are kept as for holograms and lenses.
     assert "worst_on_spots" in (place / "window.csv").read_text("utf-8")
     assert np.load(place / "image_share.npy").shape == (9, 64, 64)
     with pytest.raises(InputError, match=r"colours-in-planes.*register_task"):
@@ -76,7 +76,7 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
 
 
 def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsys, refused):
-    """``--plugin`` runs the file with its task; without it, or if the file fails, the command says so."""
+    """``--plugin`` runs the file with its task. Without it, or if the file fails, the command says so."""
     file, out = tmp_path / "far_corner.py", tmp_path / "design"
     file.write_text(
         "import litho_design\n@litho_design.register_task\nclass FarCorner(litho_design.Task):\n"
@@ -111,7 +111,8 @@ def test_search_improves_an_own_loss_and_resumes_only_the_same_task(tmp_path):
     assert made.polished_loss == pytest.approx(1 - made.predicted["worst"], abs=1e-5)
     assert made.polished_loss < made.start_loss - 0.1
     flat = made.baselines["no element"]["worst"]
-    # A flat plate leaves the light where it is, 20 x 20 of 64 x 64 pixels, or moves it out.
+    # A flat plate leaves the light in place or moves it out of the corner, which is 20 x 20 of 64 x 64
+    # pixels.
     assert 0 < flat < 400 / 4096
     assert made.predicted["worst"] > 2 * flat
     judged = score(tmp_path, tmp_path.with_name("s"), judges=["none"]).scores[0]
@@ -135,7 +136,7 @@ def test_robust_and_ensemble_losses_serve_an_own_task(tmp_path, make_printer):
 
 
 def test_an_oblique_wave_goes_where_its_angle_says():
-    """At the sine s the shadow moves by z tan(asin s), with the phase of a tilted plane wave."""
+    """At the sine s the shadow moves by z tan(asin s), and its phase is that of a tilted plane wave."""
     layout = Printer(None, design_settings(TINY).layout, source="none").layout
     sine, distance_um = 0.3, 10.0
     bench = ElementBench(layout, Optics(distance_um=distance_um, incidence_x=sine))

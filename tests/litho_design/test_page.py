@@ -1,4 +1,4 @@
-"""The Python on the page of this package runs as it stands there (smaller)."""
+"""The Python code on the page of this package runs as written, at a smaller size."""
 
 from __future__ import annotations
 

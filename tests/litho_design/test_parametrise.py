@@ -29,7 +29,7 @@ def test_rings_are_symmetric_and_a_pixel_wide():
     picture = cells(torch.arange(cells.cells[0]))
     for same in (picture.T, picture.flip(0), picture.flip(1)):
         assert torch.equal(picture, same)
-    # Odd size: the middle pixel is ring 0, and along an axis the ring number counts pixels.
+    # For an odd size the middle pixel is ring 0, and along an axis the ring number counts pixels.
     assert picture[7, 7:].tolist() == list(range(8))
 
 
@@ -40,7 +40,8 @@ def test_gumbel_samples_follow_the_softmax():
         parameters.logits.copy_(logits[:, None, None].expand_as(parameters.logits))
     sample = parameters.sample(0.001, seed=5).round()
     share = torch.stack([(sample == level).double().mean() for level in range(4)])
-    # Gumbel-max: cold samples are exact draws from softmax(logits); 40000 draws, 4 sigma = 0.01.
+    # By the Gumbel-max trick cold samples are exact draws from softmax(logits). For 40000 draws 4 sigma =
+    # 0.01.
     assert (share - logits.softmax(0)).abs().max() < 0.01
 
 
@@ -58,7 +59,7 @@ def test_straight_through_gradient_is_that_of_the_unrounded_height():
     parameters.start_random(0)
     weight = torch.randn(16, 16)
     sample = parameters.sample(hard=True)
-    # Straight-through adds and removes the real part; what is left of it is rounding.
+    # The straight-through estimator adds and removes the real part, which leaves its rounding.
     assert (sample - sample.round()).abs().max() < 1e-5
     (sample * weight).sum().backward()
     expected = weight.unflatten(1, (4, 4)).unflatten(0, (4, 4)).sum((1, 3))
@@ -66,14 +67,14 @@ def test_straight_through_gradient_is_that_of_the_unrounded_height():
 
 
 @pytest.mark.parametrize("kind", [GumbelLevels, DirectLevels])
-def test_a_start_is_its_own_best_layout(kind):
+def test_the_best_layout_of_a_start_is_the_start(kind):
     parameters = kind(SQUARE)
     levels = torch.randint(0, 5, (4, 4))
     parameters.start_from(levels.float())
     assert torch.equal(parameters.best_levels(), levels)
 
 
-def test_heights_that_left_the_range_come_back():
+def test_heights_outside_the_range_return_to_it():
     parameters = DirectLevels(SQUARE)
     parameters.start_from(torch.full((4, 4), 7.5))
     parameters.project()
@@ -95,7 +96,7 @@ def test_cells_must_fill_the_element():
 
 @pytest.mark.parametrize("layout", [SQUARE.model_copy(update={"size_px": 44}), RINGS])
 def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient(layout):
-    """One free cell moves its neighbours by the kernel, and takes its gradient from them by the same."""
+    """One free cell moves its neighbours by the kernel. Its gradient sums theirs with the same kernel."""
     filtered = layout.model_copy(update={"cell_filter_um": 0.8 * layout.cell_um})
     parameters = DirectLevels(filtered)
     middle = tuple(side // 2 for side in parameters.cells.cells)
@@ -106,14 +107,14 @@ def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient
     kernel = kernel / kernel.sum()
     wanted = 4 * (kernel if level.dim() == 1 else kernel[:, None] * kernel)
     around = tuple(slice(one - 4, one + 5) for one in middle)
-    # The kernel ends at four sigma, where 6e-5 of it is left.
+    # The kernel ends at four sigma, where 6e-5 of the Gaussian remains.
     assert torch.allclose(level[around], wanted, atol=1e-3)
     sample = parameters.sample(hard=True)
     assert torch.equal(sample, sample.round())
     assert sample.min() >= 0
     assert sample.max() <= 4
     (gradient,) = torch.autograd.grad(sample[0, 0].sum(), parameters.height)
-    # Every pixel counts once: a filter of sum 1 hands all of it on.
+    # Every pixel counts once, and a filter of sum 1 passes on the whole gradient.
     assert float(gradient.sum()) == pytest.approx(sample.numel(), rel=1e-5)
     assert torch.equal(DirectLevels(layout)._kept(), DirectLevels(layout).height)
 

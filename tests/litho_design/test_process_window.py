@@ -1,4 +1,4 @@
-"""Prints and optics that differ: depth of focus of a perfect lens, draws, measured spreads."""
+"""Test varying prints and optics: depth of focus of a perfect lens, draws, measured spreads."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_perfect_lens_has_the_depth_of_focus_of_its_aperture():
         moved = LensBench(layout, Optics(distance_um=100.0 + defocus_um), LensView(window_px=64))
         # The focus also falls off as 1 / z^2: 4 % over the depth.
         assert float(moved(ideal).max()) / peak == pytest.approx(0.8, rel=0.06)
-    # Gain g leaves sinc^2(1 - g) in the first order of a blazed zone.
+    # A gain of g leaves sinc^2(1 - g) in the first order of a blazed zone.
     for gain in (0.85, 1.15):
         assert float(bench(gain * ideal).max()) / peak == pytest.approx(np.sinc(1 - gain) ** 2, abs=0.02)
 
@@ -41,7 +41,7 @@ def test_rings_are_blurred_like_a_plane_wave_of_their_radius():
     ring = torch.cos(2 * torch.pi * (torch.arange(400) + 0.5) * 0.1 / 1.6).double()
     blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(ring, 0.1)
     expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
-    # The mirror at the centre continues a cosine as it is; the outer end is left out.
+    # The mirrored centre continues a cosine exactly. The outer end is left out.
     assert torch.allclose(blurred[:360], expected * ring[:360], atol=1e-3)
 
 
@@ -82,7 +82,7 @@ def test_spreads_of_measured_prints_come_back_without_the_locked_ones():
     assert window.offset_sd_um == pytest.approx(kept_offsets.std(ddof=1), rel=1e-6)
     together = np.corrcoef(kept_gains, kept_offsets)[0, 1]
     assert window.gain_offset_correlation == pytest.approx(together, rel=1e-6)
-    # Whatever the locked print measures changes nothing.
+    # Heights of the locked print change nothing.
     gains[locked], offsets[locked] = 40.0, -3.0
     assert measured_window(_store(gains, offsets), ProcessWindow(samples=4)) == window
 
@@ -112,7 +112,7 @@ def test_a_yield_counts_prints_and_has_the_interval_of_a_share():
     bad = [good | {"si_psnr_db": 18.9}, good | {"eff_signal": 0.44}, good | {"rms_nm": 11.2}]
     found = measure_yield([good] * 90 + bad * 3 + bad[:1], modelled, ["rms_nm"])
     assert (found.draws, found.passed, found.share) == (100, 90, 0.9)
-    # Wilson's interval of 90 in 100, as in tables.
+    # Tables give this Wilson interval of 90 in 100.
     assert found.ci95 == pytest.approx((0.8256, 0.9448), abs=1e-4)
     assert found.figures == ["si_psnr_db", "eff_signal", "rms_nm"]
 

@@ -38,7 +38,7 @@ def test_on_axis_field_behind_a_circular_aperture(pitch, reported):
     exact = np.exp(1j * WAVENUMBER * z) - z / distance * np.exp(1j * WAVENUMBER * distance)
     propagate = RSPropagator(grid, point(), z, WAVELENGTH_UM, dtype=torch.complex128)
     error = abs(complex(propagate(field)) - exact) / abs(exact)
-    # What is left is the staircase edge of the pixelated circle.
+    # The rest is the error of the staircase edge of the pixelated circle.
     assert error == pytest.approx(reported, rel=0.1)
     if pitch == 0.1:
         assert error < 1e-3
@@ -85,8 +85,8 @@ def test_gaussian_beam(propagator):
 
 
 def test_fresnel_zone_plate_focus_grows_with_the_square_of_its_zones():
-    # n open zones whose boundaries are whole half wavelengths: every zone adds twice the incident
-    # amplitude, and only the obliquity (z/r, within 1 % here) makes the later ones weaker.
+    # The boundaries of n open zones are whole half wavelengths. Every zone adds twice the incident amplitude,
+    # and only the obliquity (z/r, within 1 % here) weakens the later ones.
     z, zones = 300.0, 5
     edges = [math.sqrt((z + m * WAVELENGTH_UM / 2) ** 2 - z**2) for m in range(2 * zones + 1)]
     grid = centred_grid((900, 900), 0.1)
@@ -150,7 +150,7 @@ def test_radial_path_equals_the_closed_forms_and_the_plane_path():
     distance = math.hypot(a, z)
     exact = np.exp(1j * WAVENUMBER * z) - z / distance * np.exp(1j * WAVENUMBER * distance)
     flat = propagate(torch.ones(400, dtype=torch.complex128))
-    # Two Gauss nodes on a 0.1 µm ring: phase span 0.13 rad, error below span^4 / 4320.
+    # With two Gauss nodes on a 0.1 µm ring the phase span is 0.13 rad, and the error is below span^4 / 4320.
     assert abs(complex(flat[0]) - exact) / abs(exact) < 1e-6
     fine, aperture = circular_aperture(0.05, a)
     for index, r in enumerate(radii.tolist()):

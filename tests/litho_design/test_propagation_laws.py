@@ -1,4 +1,4 @@
-"""Propagators against the laws that any linear wave propagation obeys, and against a reference."""
+"""Test propagators against the laws of any linear wave propagation and against a reference."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_adjoint_and_gradient(name):
 
 
 @pytest.mark.parametrize(("here", "there"), [(34, 31), (31, 34), (33, 33), (1, 40), (40, 1)])
-def test_every_separation_lies_where_a_circular_convolution_looks_for_it(here, there):
+def test_every_separation_lies_at_its_index_of_a_circular_convolution(here, there):
     order = wrapped_order(here, there).tolist()
     for separation in range(1 - here, there):
         assert order[separation % len(order)] == separation
@@ -112,8 +112,8 @@ def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offs
 @pytest.mark.parametrize(
     ("there", "offset"), [((70, 41), (3, -9)), ((25, 90), (0, 0)), ((31, 32), (-11, 20))]
 )
-def test_asm_to_a_part_of_a_plane_is_the_part_of_asm_to_the_plane(there, offset):
-    """Whatever its size and place, the target does not decide what arrives there."""
+def test_asm_to_a_part_of_a_plane_equals_that_part_of_asm_to_the_whole_plane(there, offset):
+    """The size and place of the target do not change the wave that arrives there."""
     source = centred_grid((34, 45), 0.4)
     whole = centred_grid((160, 170), 0.4)
     row, column = ((n - m) // 2 + shift for n, m, shift in zip(whole.shape, there, offset, strict=True))
@@ -124,7 +124,7 @@ def test_asm_to_a_part_of_a_plane_is_the_part_of_asm_to_the_plane(there, offset)
     everywhere = ASMPropagator(source, whole, **options)(field)
     part = ASMPropagator(source, PixelGrid(there, (0.4, 0.4), origin), **options)(field)
     wanted = everywhere[row : row + there[0], column : column + there[1]]
-    # Nine decimals of the beam lie within the source, and all its rays within the band.
+    # The source holds nine decimals of the beam, and the band holds all its rays.
     assert (part - wanted).abs().max() < 1e-6 * everywhere.abs().max()
 
 
@@ -154,13 +154,13 @@ def test_asm_and_rs_agree_where_both_hold():
     arguments = (source, target, 10.0, WAVELENGTH_UM)
     rs = RSPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
     asm = ASMPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
-    # The beam is band-limited to well inside the band; both are then exact.
+    # The beam is band-limited to well inside the band, so both methods are exact.
     assert (rs - asm).abs().max() < 1e-5 * rs.abs().max()
 
 
 def test_asm_and_rs_agree_on_a_rough_element():
-    # Padding to twice the grid left 6 to 13 %. Pixels below half a wavelength have grazing rays, which
-    # no period holds: 1 % is promised.
+    # With padding to twice the grid the error was 6 to 13 %. Pixels below half a wavelength have grazing
+    # rays, which no period holds. 1 % is promised.
     source = centred_grid((96, 96), 0.1)
     cells = torch.randint(0, 13, (24, 24), generator=torch.Generator().manual_seed(0)) * 0.1
     height = torch.nn.functional.avg_pool2d(
@@ -218,7 +218,7 @@ def test_asm_semigroup_and_reversal():
     assert (asm(0.0)(u) - u).abs().max() < 1e-12
 
 
-# Pitch above half a wavelength: no evanescent waves; below it: a beam that has none.
+# With a pitch above half a wavelength there are no evanescent waves. Below it, this beam has none.
 @pytest.mark.parametrize("pitch", [0.35, 0.1])
 def test_energy_is_kept_by_asm(pitch):
     grid = centred_grid((360, 360), pitch)
@@ -273,7 +273,7 @@ def test_transfer_is_cached_on_the_device_but_not_saved():
 def test_distance_below_the_sampling_limit_is_refused():
     coarse = centred_grid((256, 256), 0.4)
     limit = sampling_limit_um(coarse, coarse, WAVELENGTH_UM)
-    # Largest separation 255 pixels; Nyquist wants x / (wavelength r) <= 1 / (2 pitch).
+    # The largest separation is 255 pixels. The Nyquist limit demands x / (wavelength r) <= 1 / (2 pitch).
     assert limit == pytest.approx(255 * 0.4 * math.sqrt((0.8 / WAVELENGTH_UM) ** 2 - 1))
     with pytest.raises(InputError, match="angular spectrum"):
         RSPropagator(coarse, coarse, 0.99 * limit, WAVELENGTH_UM)
@@ -284,8 +284,8 @@ def test_distance_below_the_sampling_limit_is_refused():
 
 
 def test_draft_pitch_is_close_inside_the_window():
-    # 0.2 µm pixels that average 2 x 2 heights, for a layout of 0.4 µm cells: the heights are the
-    # same, only the source sampling differs; angles inside the window stay below 19 degrees.
+    # Pixels of 0.2 µm average 2 x 2 heights of a layout of 0.4 µm cells. The heights are the same; only the
+    # source sampling differs. Angles inside the window stay below 19 degrees.
     cells = torch.randint(0, 13, (64, 64), generator=torch.Generator().manual_seed(0)) * 0.1
     optics = Optics()
     images = []

@@ -1,4 +1,4 @@
-"""The presets ``paper`` and ``authors`` are what paper and published code state, and work as named."""
+"""The presets ``paper`` and ``authors`` equal the settings of the paper and the published code, and run."""
 
 from __future__ import annotations
 
@@ -80,17 +80,17 @@ def test_presets_are_as_stated(preset, stated):
 
 
 def test_the_display_is_imaged_at_its_scale():
-    """36 mm of display at 140 mm; the published code draws objects as wide as its lens of 120 µm."""
+    """A display of 36 mm stands at 140 mm. The published code draws objects as wide as its lens of 120 µm."""
     for variant, image_um in (("paper", 36e3 * 0.4 / 140), ("authors", 120.0)):
         made = lens_settings("computational", variant)
         frame_px, pixel_um = made.imaging.object_px, made.imaging.pixel_px * made.layout.pitch_um
-        # Inside the dark border, an eighth on each side. Whole pixels of 1 µm.
+        # The object lies inside the dark border, an eighth on each side, in whole pixels of 1 µm.
         assert (frame_px - 2 * (frame_px // 8)) * pixel_um == pytest.approx(image_um, abs=0.5)
         (chart,) = object_stack(["chart"], frame_px)
         lit = chart.amax(0).nonzero()
         assert lit.max() - lit.min() < image_um / pixel_um
         assert made.view.window_px * made.layout.pitch_um == pytest.approx(image_um, abs=0.5)
-        # Two pixels or more for a period of the cut-off.
+        # A period of the cut-off frequency has two pixels or more.
         cut_off_um = made.optics.wavelength_um / (2 * 60 / math.hypot(60, 400))
         assert pixel_um < cut_off_um / 2
 
@@ -124,7 +124,7 @@ def test_a_strip_along_a_radius_has_the_rings_of_the_plane(cell_um):
     cells = CellMap(layout)
     strip = strip_rings(layout, 3, cells.cells[0])
     assert torch.equal(strip[3:5, 3:43], cells.ring[39:41, 40:])
-    # Of a large lens, where the two central rows are the radius.
+    # For a large lens, the radius runs along the two central rows.
     along = RadiusMap(layout)
     radius_px = torch.arange(40) + 0.5
     assert torch.equal(along(torch.arange(40)), (radius_px / (cell_um / 0.1)).floor().long())
@@ -147,7 +147,7 @@ def test_a_soft_sample_is_the_expected_level_of_equation_a2(temperature):
     assert (sample - level).abs().max() < 1e-5
 
 
-def test_the_rate_halves_by_time_or_falls_where_nothing_is_gained():
+def test_the_learning_rate_falls_at_fixed_times_or_without_progress():
     def rates(losses, **schedule):
         optimiser = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=8.0)
         rate = rate_schedule(optimiser, SearchSettings(**schedule))
@@ -160,7 +160,7 @@ def test_the_rate_halves_by_time_or_falls_where_nothing_is_gained():
 
     halved = rates([1.0] * 7, rate_schedule="step", rate_factor=0.5, rate_iterations=3)
     assert halved == [8, 8, 8, 4, 4, 4, 2]
-    # Better at first, then three without progress: one more than two.
+    # The loss first improves. Then it makes no progress for three steps, one more than the allowed two.
     waited = rates([3, 2, 1, 1, 1, 1, 1], rate_schedule="plateau", rate_factor=0.1, rate_iterations=2)
     assert waited == pytest.approx([8] * 6 + [0.8])
     # A direct lens has a loss below zero.
@@ -184,7 +184,7 @@ def test_a_resumed_search_goes_on_with_its_rate(schedule, tmp_path):
             if len(calls) == stop_at:
                 raise KeyboardInterrupt
             error = (level - 5.3).abs().mean()
-            # A slope without progress.
+            # The gradient is constant, but the loss makes no progress.
             return error - error.detach() + 1, {}
 
         calls.clear()
@@ -200,13 +200,13 @@ def test_a_resumed_search_goes_on_with_its_rate(schedule, tmp_path):
 
 
 def test_photon_noise_grows_with_the_signal_and_leaves_the_gradient_alone():
-    """A point as PSF keeps half of the light; the variance of an image is b² + a · image."""
+    """A point PSF keeps half of the light. The variance of an image is b² + a · image."""
     grey = torch.tensor([0.25, 1.0])[:, None, None].expand(2, 400, 400).clone().requires_grad_()
     imaging = ImagingSettings(read_noise=0.02, photon_noise=0.004)
     seen = record(grey, torch.full((1, 1), 0.5), imaging, seed=1)
     for image, wanted in zip(seen.detach(), (0.125, 0.5), strict=True):
         variance = 0.02**2 + 0.004 * wanted
-        # Of 160,000 draws: five standard errors of mean and variance.
+        # From 160,000 draws, mean and variance are known to five standard errors.
         assert float(image.mean()) == pytest.approx(wanted, abs=5 * math.sqrt(variance / 160_000))
         assert float(image.var()) == pytest.approx(variance, rel=5 * math.sqrt(2 / 160_000))
     seen.sum().backward()

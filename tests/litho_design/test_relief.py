@@ -1,4 +1,4 @@
-"""The layout whose print is a wanted relief."""
+"""Test the search for a layout whose print is a wanted relief."""
 
 from __future__ import annotations
 
@@ -37,41 +37,41 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     with torch.no_grad():
         printed = printer(cells.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None])[0, 0].numpy()
     made = correct(printed - 0.4, printer, tmp_path, settings=settings, announce=False)
-    # The zero of a relief is free by whole levels, of 62 nm in print.
+    # The zero of a relief is free in whole levels, each 62 nm in print.
     levels_off = (made.predicted["offset_nm"] - 400) / 62
     assert levels_off == pytest.approx(round(levels_off), abs=0.1)
-    # Each cell that is a level off costs 62 nm x its share: a tenth of the cells would give 6 nm as blurred.
+    # Each cell that is one level off costs 62 nm x its share. A tenth of the cells gives 6 nm after the blur.
     assert made.predicted["rms_nm"] < 6
     assert made.baselines["free levels"]["rms_nm"] < 6
     assert made.baselines["best affine"]["rms_nm"] > 3 * made.predicted["rms_nm"]
     assert made.baselines["uncorrected"]["rms_nm"] > made.baselines["best affine"]["rms_nm"]
-    # Scored again from its folder, as any other design.
+    # The design is scored again from its folder, as any other design.
     loaded = load_design(tmp_path)
     assert loaded.score(loaded.expected_um).rms_nm == pytest.approx(made.predicted["rms_nm"], rel=1e-4)
     assert np.abs(np.load(tmp_path / "unprintable_um.npy")).mean() < 0.006
 
 
-def test_nominal_is_nominal_and_the_best_affine_is_the_best_over_gain_and_zero(make_printer):
-    """A printer of gain 1/2 and no blur, with a floor of 0.1 µm: all figures follow by hand."""
+def test_the_baselines_use_nominal_heights_and_the_best_gain_and_offset(make_printer):
+    """A printer of gain 1/2 without blur has a floor of 0.1 µm, so all figures follow by hand."""
     settings = relief_settings({"layout.size_px": 48, "layout.levels": 13})
     printer = make_printer(settings.layout, sigma_um=1e-3, gain=0.5, offset_um=0.1)
     wanted = np.repeat(0.1 * (np.arange(48) // 12), 48).reshape(48, 48).astype(np.float32)
     found = ReliefTask(settings, printer, inputs={"relief_um": wanted}).untouched()
-    # Levels 0 to 3 as they are, not lifted to the middle of the levels.
+    # Levels 0 to 3 stay as they are and are not moved to the middle of the range.
     assert torch.equal(found["uncorrected"], torch.from_numpy(np.rint(wanted / 0.1)).long())
-    # Twice the steps, from any level, print the relief to the last bit of a float.
+    # Twice the steps, starting at any level, print the relief to the last bit of a float.
     task = ReliefTask(settings, printer, inputs={"relief_um": wanted})
     baselines = {name: task.figures(task.printed_um(level)) for name, level in found.items()}
     assert baselines["best affine"]["rms_nm"] < 1e-3
     assert baselines["uncorrected"]["rms_nm"] == pytest.approx(0.5e3 * wanted.std(), rel=1e-4)
-    # A relief that stands on 0.3 µm keeps its foot, one that reaches below 0 is lifted to it.
+    # A relief on a base of 0.3 µm keeps this base. One that reaches below 0 is lifted to 0.
     for shift_um, foot in ((0.3, 3), (-0.2, 0)):
         task = ReliefTask(settings, printer, inputs={"relief_um": wanted + np.float32(shift_um)})
         assert int(task.untouched()["uncorrected"].min()) == foot
 
 
-def test_doing_nothing_is_returned_where_the_models_at_hand_prefer_it(tmp_path, make_printer):
-    """A model that believes in a gain of 0.4 corrects by 2.5; two judges print at nominal height."""
+def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, make_printer):
+    """A model with a gain of 0.4 corrects by a factor of 2.5. Two judges print at nominal height."""
     settings = relief_settings({"layout.size_px": 48, "search.iterations": 10, "height_um": 0.4})
     layout = settings.layout
     model = make_printer(layout, sigma_um=0.05, gain=0.4, offset_um=0.0, name="low")
@@ -85,19 +85,20 @@ def test_doing_nothing_is_returned_where_the_models_at_hand_prefer_it(tmp_path, 
     width = judged.width
     assert width.returned == "uncorrected"
     assert list(width.level_heights_um) == ["low", "j1.0", "j1.1"]
-    # The steps lie between levels: a third of a step is rounded off; judges err by no more and a tenth.
+    # The steps lie between levels, so a third of a step is lost by rounding. The judges err by no more than
+    # this and a tenth.
     assert width.values("searched").max() > 3 * np.delete(width.values(), 0).max()
     assert "models at hand print the layout “uncorrected” better" in judged.notes[-1]
     said = width_sentence(judged)
     assert "3 models of this printer" in said
     assert "level 12 (0.480 to 1.320 µm)" in said
-    # Searched for the worst of all, the layout is a compromise that beats both.
+    # If the search minimises the worst error, the layout is a compromise that beats both.
     robust = correct("staircase", model, tmp_path / "robust", judges=judges, **fit)
     assert robust.width.searched_with == 3
     assert robust.width.values().max() <= min(width.values().max(), width.values("best affine").max()) + 1e-3
 
 
-def test_the_zero_of_a_print_decides_no_yield(make_printer):
+def test_the_offset_of_a_print_does_not_affect_the_yield(make_printer):
     changes = {"window.gain_sd": 0.0, "window.blur_sd_um": 0.0, "window.offset_sd_um": 0.5}
     settings = relief_settings(TINY | changes)
     printer = make_printer(settings.layout)
@@ -119,12 +120,12 @@ def test_the_zero_of_a_print_decides_no_yield(make_printer):
     assert [one["rms_nm"] for one in drawn] == pytest.approx(
         [1e3 * (printed.numpy() - wanted).std()] * 20, abs=0.01
     )
-    # A gain is no offset: 5 % of a staircase of 0.2 µm rms is more than the error as modelled.
+    # A gain is not an offset: 5 % of a staircase of 0.2 µm rms is more than the modelled error.
     assert passed(settings.window.model_copy(update={"gain_sd": 0.05}))[1].share < 0.5
 
 
-def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_printer, refused):
-    """A printer that its model does not know: smoothly less gain to one side, by up to 20 %."""
+def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_printer, refused):
+    """The model does not know its printer, whose gain falls smoothly to one side by up to 20 %."""
     settings = relief_settings(TINY | {"off_blur_um": 0.2})
     model = make_printer(settings.layout, sigma_um=0.15)
     cells = torch.from_numpy(np.random.default_rng(0).integers(3, 10, (24, 24))).float()
@@ -147,15 +148,15 @@ def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_pr
     def rms_nm(folder):
         return 1e3 * (printed_um(folder) - wanted).std()
 
-    # What a level costs stays, 62 nm for a tenth of the cells; the slope of 50 nm rms goes.
+    # The error of the levels remains, 62 nm for a tenth of the cells. The slope of 50 nm rms is removed.
     assert rms_nm(first) > 20
     assert rms_nm(again) < rms_nm(first) / 3
-    # Figures are those of the print as the model has it, against what is wanted.
+    # The figures compare the print as modelled with the wanted relief.
     expected = np.load(again / "predicted_height_um.npy")
     assert made.predicted["rms_nm"] == pytest.approx(1e3 * (expected - wanted).std(), rel=1e-4)
     assert made.predicted["rms_nm"] > 20
     assert made.baselines["uncorrected"] == load_design(first).record.baselines["uncorrected"]
-    # So small an element cannot be registered, and one of another size does not lie on its pixels.
+    # So small an element cannot be registered. A scan of another size does not lie on its pixels.
     with pytest.raises(InputError, match="--scan-aligned"):
         measured_print(load_design(first), replace(scan, aligned=False))
     with pytest.raises(InputError, match="pixels of the element"):
@@ -169,8 +170,8 @@ def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_pr
     assert "a scan without its element" in refused(*words, "--scan", tmp_path / "scan.txt")
 
 
-def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys):
-    """A step of one pixel cannot be printed, and neither can more than the levels reach."""
+def test_the_part_of_a_relief_that_no_layout_prints_is_shown(tmp_path, monkeypatch, capsys):
+    """A step of one pixel cannot be printed. Neither can heights beyond the range of the levels."""
     words = ["correct", "staircase", "--model", "zoo:physics", "--size-px", "48", "--iterations", "10"]
     words += ["--set", "search.polish_rounds=0", "--set", "window.yield_draws=2", "--height-um", "1.5"]
     words += ["--judge", "none", "--out", str(tmp_path / "out")]

@@ -1,4 +1,4 @@
-"""The process window: its draws, its risk, and what a robust search gains."""
+"""Test the process window: its draws, its risk, and the gain of a robust search."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
 def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     tmp_path, small_settings, make_printer
 ):
-    # A third of a standard deviation below 1 µm lies the element: some of 16 draws are behind it.
+    # The element lies a third of a standard deviation below 1 µm, so some of 16 draws are behind it.
     settings = small_settings.model_copy(update={"optics": Optics(distance_um=1.0)})
     with pytest.raises(InputError, match=r"defocus spread of 3 µm.*defocus-sd-um"):
         design_hologram(
@@ -86,7 +86,7 @@ def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, 
     robust = nominal.model_copy(update={"window": spread})
     target = load_target("ring", 128)
     risks = {}
-    # Other draws than those of the search: what it gained must hold for prints it has not seen.
+    # These draws differ from those of the search: the gain must hold for unseen prints.
     unseen = robust.model_copy(update={"window": spread.model_copy(update={"seed": 1})})
     judge = HologramTask(unseen, make_printer(robust.layout), inputs={"target": target.pixels})
     for name, settings in (("nominal", nominal), ("robust", robust)):

@@ -1,4 +1,4 @@
-"""What a search reports is what can be printed: whole levels, the kept ones and the history alike."""
+"""A search reports only printable results: kept layout and history are of whole levels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 LAYOUT = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
-# Between two levels, so that a layout of fractions is worth more than any that can be printed.
+# The target lies between two levels, so a layout of fractions scores better than any printable one.
 WANTED = torch.linspace(0.6, 3.4, 16)[:, None].expand(16, 16)
 
 
@@ -22,10 +22,10 @@ def objective(level):
 @pytest.mark.parametrize("keep", ["best", "last"])
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
 def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
-    """Runs of 1, 2 … iterations end where a longer one was after as many, whatever it says of itself."""
+    """Runs of 1, 2 … iterations end where a longer run was after as many iterations."""
     told, shown = [], []
     for iterations in range(1, 6):
-        # Soft samples to the end: a score of them would fall far below that of the printable layout.
+        # Soft samples are used to the end. Their score would be far below that of the printable layout.
         settings = SearchSettings(
             parametrisation=parametrisation, keep=keep, iterations=iterations, evaluate_every=1,
             learning_rate=0.3, temperature_start=1.0, temperature_end=1.0,
@@ -42,12 +42,12 @@ def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
         assert state.best_loss == pytest.approx(kept)
         assert kept == pytest.approx(min(told) if keep == "best" else told[-1])
     samples = [entry["sample_loss"] for entry in state.history]
-    # The law is not vacuous: samples and layouts do differ here.
+    # The test can fail: samples and layouts differ here.
     assert max(abs(one - other) for one, other in zip(samples, told, strict=True)) > 0.01
 
 
-def test_a_search_takes_the_same_way_whatever_the_number_of_levels():
-    """Levels only divide the height: a gradient in levels shrinks as a step in levels grows."""
+def test_a_search_takes_the_same_steps_in_height_for_any_number_of_levels():
+    """More levels only divide the same height: a gradient in levels shrinks as their number grows."""
     ways = []
     for levels in (2, 13, 121):
         layout = LayoutSettings(size_px=16, cell_um=0.4, levels=levels)

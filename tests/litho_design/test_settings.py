@@ -29,13 +29,13 @@ from litho_design.reliefs.task import ReliefTask
 
 ROOT = Path(__file__).parents[2]
 PRESETS = {"hoe": HologramSettings(), "lens": LensSettings(), "relief": ReliefSettings()}
-# Choosing another preset or kind of lens changes more than the one value.
+# Another preset or another kind of lens changes more than one value.
 CHOOSE = ("variant", "task")
 of_each_task = pytest.mark.parametrize("task", PRESETS)
 
 
 def other(leaf: Leaf):
-    """Another value that the field accepts."""
+    """Return another value that the field accepts."""
     if get_origin(leaf.kind) is Literal:
         return next(choice for choice in get_args(leaf.kind) if choice != leaf.value)
     if isinstance(leaf.value, tuple):
@@ -52,7 +52,7 @@ def other(leaf: Leaf):
 
 @functools.cache
 def printed(task, *words):
-    """Settings by path, as `litho-design settings` prints them."""
+    """Return the settings by path, as `litho-design settings` prints them."""
     result = CliRunner().invoke(app, ["settings", task, *map(str, words)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return flat(tomllib.loads(result.stdout))
@@ -66,7 +66,7 @@ def flat(content, prefix=""):
 
 
 def single(task):
-    """The settings that can each be another without the rest."""
+    """Return the settings that can change without changing others."""
     return [leaf for leaf in leaves(PRESETS[task]) if leaf.path not in CHOOSE]
 
 
@@ -77,7 +77,7 @@ def test_every_setting_is_reached_by_its_path(task):
     for path, value in values.items():
         after = flat(json.loads(changed(PRESETS[task], {path: value}).model_dump_json()))
         assert {one: after[one] for one in before if before[one] != after[one]} == {path: value}
-    # The command passes paths and values on as they are.
+    # The command passes paths and values on unchanged.
     words = [
         f"{path}={value if isinstance(value, str) else json.dumps(value)}" for path, value in values.items()
     ]
@@ -86,7 +86,7 @@ def test_every_setting_is_reached_by_its_path(task):
 
 @of_each_task
 def test_every_option_sets_the_field_that_states_it(task):
-    """All at once: what one of them sets elsewhere would show."""
+    """All options are set at once, so that an option that sets a wrong field is noticed."""
     given = [leaf for leaf in single(task) if leaf.options]
     for number in range(max(len(leaf.options) for leaf in given)):
         having = [leaf for leaf in given if len(leaf.options) > number]
@@ -103,7 +103,7 @@ def test_what_chooses_a_preset_is_reached_by_path_and_option(task):
 
 
 @of_each_task
-def test_every_setting_says_what_it_is_and_in_which_unit(task):
+def test_every_setting_has_a_description_and_a_unit(task):
     for leaf in leaves(PRESETS[task]):
         assert leaf.help, leaf.path
         assert not leaf.help.endswith("."), leaf.path
@@ -113,7 +113,7 @@ def test_every_setting_says_what_it_is_and_in_which_unit(task):
 
 @of_each_task
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -1e300, 1e300, 10**400])
-def test_no_setting_takes_a_number_that_cannot_be(task, wrong):
+def test_no_setting_accepts_an_impossible_number(task, wrong):
     for leaf in leaves(PRESETS[task]):
         with pytest.raises(InputError) as said:
             changed(PRESETS[task], {leaf.path: wrong})
@@ -122,7 +122,7 @@ def test_no_setting_takes_a_number_that_cannot_be(task, wrong):
 
 
 @of_each_task
-def test_no_length_is_beyond_all_lengths(task):
+def test_no_setting_accepts_a_length_above_the_limit(task):
     for leaf in leaves(PRESETS[task]):
         if leaf.unit == "µm":
             with pytest.raises(InputError, match="wanted less than"):
@@ -252,8 +252,8 @@ def test_help_needs_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-def test_designs_with_choices_that_are_gone_stay_readable():
-    """And nothing else that is unknown is taken in silence."""
+def test_designs_with_removed_choices_stay_readable():
+    """Any other unknown choice is refused."""
     now = hologram_settings().model_dump(mode="json")
     older = {
         **now,

@@ -1,4 +1,4 @@
-"""The signal window of a hologram: beyond it light is free, which buys likeness inside."""
+"""Outside the signal window of a hologram the light is free, which improves the likeness inside."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_light_beyond_the_signal_window_is_free():
     target[8:12, 8:12] = 1
     settings = HologramLoss(signal_window_um=0.35, efficiency_weight=0.0)
     counted = counted_pixels(target, settings, 0.1)
-    # Three pixels away along the axes, not along the diagonal.
+    # The window reaches three pixels beyond the target along the axes, and less along the diagonal.
     assert counted[10, 5]
     assert not counted[10, 4]
     assert not counted[5, 5]
@@ -36,8 +36,8 @@ def test_light_beyond_the_signal_window_is_free():
     assert float(hologram_loss(image, target, settings)[0]) > 0.1
 
 
-def test_a_signal_window_buys_likeness_inside_with_light(tmp_path):
-    """The start and the search use the freedom; both figures are told, for the baselines too."""
+def test_a_signal_window_gives_more_likeness_inside_for_less_light(tmp_path):
+    """The start and the search use this freedom. Both figures are reported, also for the baselines."""
     made, size = {}, {"layout.size_px": 64, "optics.distance_um": 12, "search.iterations": 15}
     for name, window_um in (("whole", 0.0), ("window", 0.5)):
         loss = {"loss.signal_window_um": window_um, "loss.efficiency_weight": 0}

@@ -43,11 +43,12 @@ def test_a_wide_source_blurs_the_image_by_its_disc(height):
     disc = (np.hypot(x[:, None], x) < z_um * sine).astype(np.float32)
     middle = np.s_[20:-20, 20:-20]
     expected = cv2.filter2D(point, -1, disc / disc.sum())[middle]
-    # Few directions stand for the disc, closer than lambda z / D = 2 um; without it the error is far larger.
+    # A few directions represent the disc, closer than lambda z / D = 2 um. Without the disc the error is far
+    # larger.
     error = np.abs(wide[middle] - expected).mean() / expected.mean()
     assert error < 0.05
     assert np.abs(point[middle] - expected).mean() / expected.mean() > 4 * error
-    # The variance of a disc along one axis is a quarter of its radius squared; the middle stays where it was.
+    # The variance of a disc along one axis is a quarter of its squared radius. The centre does not move.
     parts = coherent_parts(OPTICS.model_copy(update={"source_sine": sine, "incidence_x": 0.1}), 100.0)
     sines = np.array([part.incidence_x for _, part in parts])
     assert sines.mean() == pytest.approx(0.1, abs=1e-12)
@@ -69,7 +70,7 @@ def test_a_bandwidth_is_the_mean_over_a_gaussian_spectrum(height):
 
 
 def test_scores_add_up_the_light_of_the_source(height):
-    """Speckle of a wide source is averaged away; power is kept, but for what leaves the window."""
+    """A wide source averages speckle away. Power is kept, except for light that leaves the window."""
     target = torch.zeros(128, 128)
     target[30:100, 30:100] = 1
     contrast, power = {}, {}
@@ -82,7 +83,7 @@ def test_scores_add_up_the_light_of_the_source(height):
 
 
 def test_a_hologram_is_designed_for_its_source(tmp_path):
-    """A setting of the scene: search, score, yield and a reopened design see the same light."""
+    """The source is a setting of the scene: search, score, yield and a reopened design use the same light."""
     changes = {
         "layout.size_px": 64, "optics.distance_um": 20, "optics.source_sine": 0.05, "search.iterations": 4,
         "search.polish_rounds": 0, "window.yield_draws": 2,
@@ -96,7 +97,7 @@ def test_a_hologram_is_designed_for_its_source(tmp_path):
     assert np.abs(point(loaded.expected_um).numpy() - seen).mean() > 0.1 * seen.mean()
 
 
-def test_a_source_is_refused_where_one_plane_wave_is_computed():
+def test_a_wide_source_is_refused_where_only_one_plane_wave_is_computed():
     wide = OPTICS.model_copy(update={"source_sine": 0.02})
     with pytest.raises(InputError, match="source of a lens"):
         LensBench(LAYOUT, wide, LensView(window_px=64))

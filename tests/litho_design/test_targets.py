@@ -25,7 +25,7 @@ def test_ring_area():
     assert draw_target("ring", 256).mean() == pytest.approx(np.pi * (0.28**2 - 0.2**2), abs=1e-3)
 
 
-def test_another_size_and_shape_are_adapted_and_said(tmp_path):
+def test_another_size_and_shape_are_adapted_and_reported(tmp_path):
     picture = np.zeros((60, 100), np.uint8)
     picture[10:30, 20:60] = 200
     cv2.imwrite(str(tmp_path / "wide.png"), picture)
@@ -55,7 +55,7 @@ def test_a_colour_is_its_luma_and_what_is_transparent_is_black(tmp_path, depth):
         assert ("alpha channel composed on black" in notes) is (channels == 4)
 
 
-def test_what_is_no_image_or_has_no_light_is_refused(tmp_path):
+def test_a_file_without_an_image_or_without_light_is_refused(tmp_path):
     (tmp_path / "note.txt").write_text("not an image")
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((8, 8), np.uint8))
     for name, message in (("note.txt", "an image"), ("black.png", "bright pixels")):

@@ -1,4 +1,4 @@
-"""A frozen PBL is the trained one, as a whole and without its border."""
+"""A frozen PBL predicts the same print as the trained PBL, with and without the border."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The background that all scans share: learned on training scans, scored openly, never in a design."""
+"""The background that all scans share is learned on training scans, reported, and never in a design."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ def some_background(**changes):
 
 def test_a_planted_bow_is_learned_whatever_each_scan_s_datum(scans):
     learned = learn_background(scans, [truth(scan) for scan in scans])
-    # 6 · 128² heights with 4 nm of white noise: standard error 4/√(6 · 128²)/0.3 = 0.04 nm for a term of
-    # standard deviation 0.3; five of them.
+    # 6 · 128² heights with 4 nm of white noise: the standard error is 4/√(6 · 128²)/0.3 = 0.04 nm for a term
+    # whose standard deviation is 0.3. The tolerance is five standard errors.
     assert learned.yy_nm == pytest.approx(BOW_NM, abs=0.2)
     for other in (learned.x_nm, learned.y_nm, learned.xx_nm, learned.xy_nm):
         assert abs(other) < 0.2
     assert (learned.scans, learned.field_um) == (6, pytest.approx((12.8, 12.8)))
 
 
-def test_a_background_moves_no_datum_and_is_what_its_terms_say():
+def test_a_background_has_zero_mean_and_is_the_sum_of_its_terms():
     background = some_background()
     field = background.map_um((90, 110))
     assert abs(field.mean()) < 1e-12
@@ -81,12 +81,12 @@ def test_no_fit_of_a_benchmark_takes_its_background_from_the_scans_that_it_is_ju
     plan = plan_folds(development, [], "grouped", folds=2)
     for fit in (fit for fit in record.fits if fit.model == "identity"):
         fold = next(fold for fold in plan if [scan.id for scan in fold.held_out] == fit.held_out_ids)
-        # Identity has nothing to fit: its heights are the layouts.
+        # Identity has nothing to fit, so its heights equal the layouts.
         learned = learn_background(fold.training, [scan.layout_um for scan in fold.training])
         assert fit.diagnostics.background == learned
 
 
-def test_both_figures_are_told_and_only_policies_without_smooth_terms_differ(result, store, tmp_path):
+def test_the_background_changes_only_errors_by_policies_without_smooth_terms(result, store, tmp_path):
     record, out = result
     assert record.nuisance.background == "training"
     plain = benchmark(store, tmp_path / "plain", models=("identity", "affine"), folds=2, background="none")
@@ -97,7 +97,7 @@ def test_both_figures_are_told_and_only_policies_without_smooth_terms_differ(res
         assert stated == {e.policy: e.mae_nm for e in without.by_policy if e.policy not in SMOOTH}
         for ours, theirs in zip(with_it.by_policy, without.by_policy, strict=True):
             if ours.policy in SMOOTH:
-                # Their own terms span the background: least squares finds the same residual.
+                # The terms of these policies span the background, so least squares finds the same residual.
                 assert ours.mae_nm == pytest.approx(theirs.mae_nm, abs=1e-6)
             elif ours.policy != "none":
                 assert ours.mae_nm < theirs.mae_nm
@@ -107,13 +107,13 @@ def test_both_figures_are_told_and_only_policies_without_smooth_terms_differ(res
         compare(out, tmp_path / "plain")
 
 
-def test_shared_predictions_go_through_what_the_training_scans_say(result, scans, store, tmp_path):
-    """Nothing but the bow is shared: the error is that with the background; no held-out height has a part."""
+def test_the_shared_part_of_a_prediction_is_learned_on_training_scans_only(result, scans, store, tmp_path):
+    """Scans share only a bow: the error is as with a background, and held-out heights do not matter."""
     shared = benchmark(store, tmp_path / "shared", models=("affine",), folds=2, background="shared")
     (scores,) = shared.scores
     usual = next(one for one in result[0].scores if one.model == "affine")
     plain = next(error for error in usual.without_background if error.policy == "offset")
-    # A bow of 40 nm that is left has a mean absolute value of 10.3 nm; a tenth of what it adds here is lost.
+    # At most a tenth of the error that the bow of 40 nm would add may remain.
     lost = scores.mae_datum_free_nm - usual.mae_datum_free_nm
     assert abs(lost) < 0.1 * (plain.mae_nm - usual.mae_datum_free_nm)
     fold = plan_folds(scans, [], "grouped", folds=2)[0]
@@ -156,7 +156,7 @@ def test_the_height_that_a_design_gets_is_the_same_bit_for_bit(tmp_path):
     assert ModelCard.read(with_it).background == some_background(yy_nm=500.0)
 
 
-def test_training_puts_it_into_the_card_and_freezing_keeps_it(store, tmp_path):
+def test_training_writes_the_background_into_the_card_and_freezing_keeps_it(store, tmp_path):
     run = train(store, "affine", tmp_path / "run")
     card = freeze(tmp_path / "run", tmp_path / "model")
     assert card.background == ModelCard.read(tmp_path / "run" / "model").background
@@ -169,7 +169,7 @@ def test_training_puts_it_into_the_card_and_freezing_keeps_it(store, tmp_path):
     assert (off.nuisance.background, off.scores.without_background) == ("none", [])
 
 
-def test_a_card_without_one_or_of_another_field_size_adds_none_and_says_so(store, tmp_path):
+def test_a_card_without_a_background_for_this_field_size_adds_none_and_says_so(store, tmp_path):
     for name, fields in {"none": {}, "small": {"background": some_background(field_um=(6.4, 6.4))}}.items():
         save_frozen(build_model("identity"), tmp_path / name, **fields)
         scored: Result = evaluate(tmp_path / name, store, tmp_path / f"{name}-out")

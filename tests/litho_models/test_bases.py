@@ -1,4 +1,4 @@
-"""A base that is trained without each fold, or taken as it is: nothing leaks, and what it lacks is found."""
+"""A base that is trained without each fold, or frozen: nothing leaks, and effects it lacks are found."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ STRENGTH = {"strength": 0.04}
 
 @pytest.fixture(autouse=True)
 def no_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cause and no law is looked for: that takes time and has its own tests."""
+    """Switch off the search for causes and laws, which takes time and has its own tests."""
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "TABLES", {})
@@ -58,7 +58,7 @@ def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:
 
 
 def trained(scans: Sequence[PrintedScan]) -> Simulator:
-    """The base with gain and offset of these scans; it has too many numbers to be fitted in a loop."""
+    """Return a base with gain and offset of these scans, as a network comes trained from outside the loop."""
     model = base_model()
     with torch.no_grad():
         own = [model(torch.from_numpy(scan.layout_um)[None, None]).numpy().ravel() for scan in scans]
@@ -77,10 +77,10 @@ def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]
 
 
 @pytest.mark.parametrize("base", ["fitted here", "trained per fold"])
-def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
+def test_no_height_of_a_held_out_scan_changes_its_prediction(
     base: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the training of the base to the law, the print and what scans share."""
+    """The base, the law, the print and what scans share are all found without the held-out scan's heights."""
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
     study = study_of(scans)
@@ -89,12 +89,12 @@ def test_no_height_of_a_held_out_scan_moves_what_it_should_show(
     maps, fitted = [], []
     for own in (scans, with_heights(scans, other)):
         closed = close(study_of(own), {base: bases_of(own, study)[base]})
-        # With a law in the model: its number is fitted too.
+        # Add a law to the model, so that its strength is fitted too.
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1].vector)
         maps.append(np.stack([HeldOut(closed).maps_um(state)[i] for i in out]))
-    # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left; the
-    # heights were changed by up to 0.2 µm.
+    # The fit without a fold starts from the fit to all scans and stops when a step reduces the error by less
+    # than 1e-4 of it. So a trace of the common start may stay; the heights were changed by up to 0.2 µm.
     assert np.abs(maps[1] - maps[0]).max() < 1e-4
     np.testing.assert_allclose(fitted[1], fitted[0], atol=1e-3)
 
@@ -117,7 +117,7 @@ def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
 
 
 class Carrying(nn.Module):
-    """The base with the law in it, trained elsewhere."""
+    """The base with the law built in, as if trained elsewhere."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,14 +128,14 @@ class Carrying(nn.Module):
         return get_effect(LAW)(self.base(layout), STRENGTH, context)
 
 
-def test_what_a_trained_model_lacks_is_added_and_what_it_carries_is_not() -> None:
+def test_the_search_adds_a_law_that_a_trained_model_lacks_and_none_that_it_has() -> None:
     study = study_of(planted([(LAW, ALL, {"": STRENGTH})]))
     for base, names in ((base_model().requires_grad_(False), [LAW]), (Carrying(), [])):
         start = fit_state(Twin.bare(base), study)
         found = search(start, [get_effect(LAW), get_effect("height-power-2")])
         assert found.names == names
         assert found.state.twin.own == 0
-        # White noise of 4 nm is all that is left.
+        # The residual is the white noise of 4 nm.
         assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.05)
         if names:
             assert found.state.twin.values({})[LAW] == pytest.approx(STRENGTH, rel=0.03)
@@ -148,7 +148,7 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
     coarse = [replace(scan, pitch_um=0.2) for scan in scans]
     with pytest.raises(InputError, match=r"pitch of zoo:pbl, got 0.1 µm, wanted 0.2 µm"):
         chosen("zoo:pbl", coarse, tmp_path)
-    # Nothing can be chosen anew of what is not fitted here.
+    # A frozen base is not fitted, so nested selection has nothing to choose anew.
     store = write_store(tmp_path / "s.zarr", scans)
     with pytest.raises(InputError, match="--nested with zoo:pbl"):
         close_loop(store, tmp_path / "out", base="zoo:pbl", nested="prints")
@@ -156,22 +156,22 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
-    """On a network trained per fold the same fits have the same error in both, to the bit of a float."""
+    """For a network trained per fold, loop and benchmark use the same fits and state the same error."""
     store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=56, bow_um=0.02)), tmp_path / "l"
     scored = benchmark(store, tmp_path / "b", models=["features"], folds=2).scores[0]
     loop = close_loop(store, out, base="features", folds=2, cache=tmp_path / "b" / "cache")
     first = loop.error("base", "offset", "published")
     assert first is not None
-    # The same predictions, pixels, terms and background; sums in another order.
+    # Predictions, pixels, terms and background are the same; only the order of summation differs.
     assert first.mae_nm == pytest.approx(scored.mae_datum_free_nm, abs=1e-6)
     assert first.rmse_nm == pytest.approx(
         np.sqrt(np.mean([row.rmse_datum_free_nm**2 for row in scored.scans])), abs=1e-6
     )
     assert first.by_scan_nm == pytest.approx({row.scan: row.mae_datum_free_nm for row in scored.scans})
-    # Not for want of a difference: without the background the same fits have another error.
+    # The background matters for this: without it the same fits have another error.
     bare = loop.error("base", "offset", "print alone")
     assert bare is not None
     assert abs(bare.mae_nm - first.mae_nm) > 0.1
-    # Nothing new was trained, and the model trained on all scans is saved.
+    # The saved model is the one that was trained on all scans.
     assert ModelCard.read(out / "model").model == "features"
     assert build_model("features").parameter_count == ModelCard.read(out / "model").parameters

@@ -1,4 +1,4 @@
-"""Benchmark, evaluation and comparison: held out is held out, cached is cached, protocols must match."""
+"""Benchmarks and evaluations: no leak of held-out scans, no repeated fit, no mix of protocols."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_better_model_scores_better_and_the_truth_bounds_it(result):
     record, _ = result
     error = {scores.model: scores.mae_datum_free_nm for scores in record.scores}
     assert error["identity"] > error["affine"] > error["linear"]
-    # White noise of 4 nm has a mean absolute value of 3.19 nm; the features add about 1 nm.
+    # White noise of 4 nm has a mean absolute error of 3.19 nm. The model's own error adds about 1 nm.
     assert 3.0 < error["linear"] < 4.2
     absolute = {scores.model: scores.mae_abs_nm for scores in record.scores}
     assert absolute["linear"] > 20  # the datum of ±30 nm per scan
@@ -107,12 +107,12 @@ def test_the_report_shows_the_result_in_words_tables_and_pictures(result):
     )
     assert all(f">{scan_id}<" in page for scan_id in [*record.split.scored_ids, *MODELS])
     assert all(f">{scores.mae_abs_nm:.2f}<" in page for scores in record.scores)
-    # Errors, one scan as maps and as a profile, levels, frequencies.
-    # tests/test_reports.py looks at such in a browser.
+    # Five figures: errors, one scan as maps and as a profile, levels, frequencies.
+    # tests/test_reports.py checks such a report in a browser.
     assert page.count("data:image/svg+xml;base64,") == 5
 
 
-def test_over_fitting_shows_because_three_errors_are_alike(result):
+def test_errors_of_training_and_of_held_out_scans_are_defined_alike(result):
     record, _ = result
     for scores in record.scores:
         fits = [fit for fit in record.fits if fit.model == scores.model and fit.fold < record.split.folds]
@@ -120,7 +120,7 @@ def test_over_fitting_shows_because_three_errors_are_alike(result):
         plain = next(error for error in scores.without_background if error.policy == "offset")
         assert np.mean([held_out[row.scan] for row in scores.scans]) == pytest.approx(plain.mae_nm)
         assert all(fit.diagnostics.training_nm > 0 for fit in fits)
-        # Fitted by Gauss-Newton: no checkpoint to choose.
+        # Gauss-Newton fits have no checkpoint to choose, so no inner validation.
         assert all(fit.diagnostics.inner_validation_nm is None for fit in fits)
 
 
@@ -205,7 +205,7 @@ def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_re
 
 
 def listed_store(path, scans, lab, name):
-    """A store that lists, per scan, a raw file of its own and a layout that all have in common."""
+    """Write a store that lists a separate raw file for each scan, and one layout file for all."""
     write_store(path, scans, name=name)
     rows = [{"scan": scan.id, "sha256": f"{lab} {scan.id}", "read": '{"unit": "um"}'} for scan in scans]
     rows += [{"scan": scan.id, "sha256": "one layout", "read": "{}"} for scan in scans]
@@ -214,7 +214,7 @@ def listed_store(path, scans, lab, name):
     return path
 
 
-# A print more, which is drawn instead; a scan fewer, so that a sixth is one scan and no longer two.
+# One scan more, so that another one is drawn; one fewer, so that a sixth is one scan and no longer two.
 @pytest.mark.parametrize(("before", "after"), [(4, 5), (9, 8)])
 def test_locked_files_stay_locked_in_a_store_of_more_or_fewer_scans(tmp_path, before, after):
     first = listed_store(tmp_path / "first.zarr", make_scans(before, size_px=48), "ours", "first")
@@ -260,7 +260,7 @@ def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_fil
         build_dataset(card, tmp_path / f"{name}.zarr")
         return tmp_path / f"{name}.zarr"
 
-    # The scan more is one that the new store draws, instead of the one that the first drew.
+    # The new store draws the added scan, instead of the scan that the first store drew.
     first, anew = built("first", 4, 0, "affine"), built("anew", 5, 0, "homography")
     run = train(first, "identity", tmp_path / "run")
     drawn = locked_ids(open_store(anew).scans())
@@ -337,7 +337,7 @@ def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, 
     analyse_noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
     scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=tmp_path / "noise")
     assert scored.noise_floor.kind == "measured"
-    # 64² independent heights: relative standard error of σ is 1/√(2 · 64²) = 1.1 %; three of them.
+    # 64² independent heights: the relative standard error of σ is 1/√(2 · 64²) = 1.1 %; three are allowed.
     assert scored.noise_floor.rmse_nm == pytest.approx(16, rel=0.034)
     assert "flat print" in (tmp_path / "b" / "report.html").read_text()
     train(store, "identity", tmp_path / "run")

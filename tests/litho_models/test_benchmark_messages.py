@@ -1,4 +1,4 @@
-"""What a benchmark says of few scans, of too many folds, and of a folder that holds another one."""
+"""What a benchmark says of few scans, too many folds, and a folder that holds another benchmark."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A board that anyone's loop can enter: what it hides, what the judge makes of answers, and a plain loop."""
+"""A blind board for anyone's loop: what it hides, how the judge rates answers, and a plain loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXAMPLE = f"{sys.executable} {Path(__file__).parents[2] / 'examples' / 'plain_lo
 
 
 def at_half_its_limit(draw: Draw, jobs: object) -> list[Planted]:
-    """Strong, without a search for the strength."""
+    """Plant every cause at half its limit, which is strong, without a search for the strength."""
     return [
         Planted(draw=one, names=[*names_of(one.name)], strength=0.5, unit="1", at_limit=False, rms_nm=40.0)
         for one in draw.causes
@@ -43,13 +43,13 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_loop_gets_stores_and_the_judge_what_they_hide(board):
+def test_a_board_gives_stores_to_the_loop_and_hides_the_causes(board):
     assert sorted(path.name for path in (board / STORES).iterdir()) == ["00.zarr", "01.zarr"]
     planted = Hidden.read(board / HIDDEN / "00").planted
     assert [one.names for one in planted] == [["vignetting"]]
     assert Hidden.read(board / HIDDEN / "01").planted == []
     for store in (board / STORES).iterdir():
-        # So small a field may fail to be registered.
+        # Registration may fail on fields this small.
         assert len(open_store(store).scans()) >= 4
         # Neither the name of a cause nor its strength is in any file of a store.
         texts = [file.read_bytes() for file in store.rglob("*.json")]
@@ -68,7 +68,7 @@ def test_a_board_of_other_settings_is_refused(board):
         (Answer(found=[Found(names=["vignetting"], knowledge="cause")]), ["right", "false-positive"], [0, 1]),
         (Answer(left=True), ["noticed", "false-positive"], [0, 0]),
         (Answer(), ["missed", "clean"], [0, 0]),
-        # One error alone is compared with nothing.
+        # One error alone has nothing to be compared with.
         (Answer(after_nm=20), ["missed", "clean"], [0, 0]),
     ],
 )
@@ -78,8 +78,8 @@ def test_the_judge_compares_names_with_what_is_hidden(board, tmp_path, answer, w
     assert [len(trial.false_names) for trial in scoreboard.trials] == false
 
 
-def test_what_a_loop_states_stands_beside_the_true_models(board, tmp_path):
-    """Their error is that of the noise, which is the same for every loop."""
+def test_the_error_that_a_loop_states_stands_beside_that_of_the_true_models(board, tmp_path):
+    """The error of the true models is that of the noise, which is the same for every loop."""
     said = iter([Answer(before_nm=30, after_nm=20), Answer(before_nm=30, after_nm=10)])
     first, second = judge_board(board, tmp_path / "one", lambda store, folder: next(said)).trials
     assert first.errors is not None
@@ -112,7 +112,7 @@ def test_an_error_in_a_loop_is_its_result_and_a_judged_trial_is_kept(board, tmp_
 
 
 def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monkeypatch, capsys):
-    """As anyone's is run; what the command prints is what the scoreboard says."""
+    """Run the example as a user would. The command prints the figures of the scoreboard."""
     words = ["litho-models", "board", "judge", str(board), "--out", str(tmp_path / "j"), "--loop", EXAMPLE]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit, match="0"):
@@ -122,7 +122,7 @@ def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monke
     assert printed.startswith("\n".join(figure_lines(scoreboard)))
     strong = scoreboard.trials[0]
     assert [one.verdict for one in strong.outcomes] == ["right"]
-    # The cause is most of the error, and vignetting is the one covariate that has its form.
+    # The cause makes most of the error, and only the covariate "vignetting" has its form.
     assert strong.errors.after_nm < 0.5 * strong.errors.before_nm
     assert strong.found == plain_loop(board / STORES / "00.zarr", tmp_path).found
 

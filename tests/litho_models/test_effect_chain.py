@@ -1,4 +1,4 @@
-"""Effects around a base model: the order of stages, and what design may see."""
+"""Effects around a base model act in the order of their stages, and design sees no measurement effect."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Effects on a plane, where each formula of the catalogue is arithmetic: written again from its docstring.
+"""Check effects on a plane, where each formula of the catalogue is simple arithmetic.
 
-The slope is known, a smooth surrounding is the pixel itself, and what lies elsewhere is read off the plane.
+The formulas are written again from the docstrings. On a plane the slope is known, a smoothed height equals
+the height, and heights at other places follow from the plane.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ SLOPE_Y, SLOPE_X, MIDDLE_UM = 0.03, -0.05, 0.6
 LOCAL_Y, LOCAL_X = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * PITCH_UM for n in SHAPE), indexing="ij")
 Y, X = LOCAL_Y + CENTRE_UM[0], LOCAL_X + CENTRE_UM[1]
 R2 = X**2 + Y**2
-# From -1 to 1 along the lines of the scan, and half their length.
+# The position from -1 to 1 along the lines of the scan, and half the length of a line.
 U, HALF_X_UM = np.linspace(-1, 1, SHAPE[1]), SHAPE[1] * PITCH_UM / 2
 M = MIDDLE_UM + SLOPE_Y * LOCAL_Y + SLOPE_X * LOCAL_X
 NEARBY = M / FULL_UM
@@ -79,13 +80,13 @@ FORMULAS: dict[str, tuple[dict[str, float], Callable[..., Field]]] = {
         {"radius_um": 0.4, "along": 1.0, "across": 1.0},
         lambda radius_um, **shape: M + radius_um * (SLOPE_X**2 + SLOPE_Y**2) / 2,
     ),
-    # What only blurs, fills what is narrow or lags by its own mean leaves a plane as it is.
+    # Effects that blur, fill narrow structures or lag around their mean delay leave a plane unchanged.
     "diffusion-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "resampling-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "long-range-proximity": ({"weight": 0.3, "length_um": 0.3}, lambda **values: M),
     "feature-collapse": ({"fraction": 0.3, "width_um": 0.5}, lambda **values: M),
     "trench-residue": ({"fraction": 0.3, "width_um": 0.5}, lambda **values: M),
-    # Its falling edge lags by l, and its mean delay is that of both kinds of edges.
+    # A falling edge lags by l. The mean delay, which is removed, is that of falling and rising edges.
     "feedback-lag": (
         {"length_um": 0.2, "rising": 0.5, "direction": 1.0},
         lambda length_um, rising, direction: M - SLOPE_X * length_um * (1 - (1 + rising) / 2),
@@ -103,7 +104,7 @@ def test_an_effect_on_a_plane_is_what_its_formula_says(name: str) -> None:
     plane = torch.from_numpy(M)[None, None]
     context = FieldContext(plane, PITCH_UM, FULL_UM, 0.1, CENTRE_UM, RADIUS_UM, "y", ORDER)
     changed = get_effect(name)(plane, values, context)[0, 0].numpy()
-    # Farther than six lengths of any kernel from the edge, where the plane ends.
+    # Compare only pixels more than six kernel lengths from the edge, where the plane ends.
     off = RAMP_OFF_UM if name in WARPS else 1e-7
     inner = np.s_[22:-22, 22:-22]
     np.testing.assert_allclose(changed[inner], formula(**values)[inner], rtol=0, atol=off)

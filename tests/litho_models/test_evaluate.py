@@ -1,4 +1,4 @@
-"""Evaluation of a frozen model: what it was trained on counts only among the same prints."""
+"""Evaluation of a frozen model: equal scan ids count as training scans only in the same prints."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def trained(tmp_path_factory):
     return store, train(store, "identity", folder / "run"), folder / "run"
 
 
-# Built anew the heights differ, and with them the hash: the prints are the same by their name.
+# In a store built anew the heights and so the hash differ. The name shows that the prints are the same.
 @pytest.mark.parametrize(("name", "same"), [("made", True), ("other", False)])
 def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_path, name, same):
     _, run, folder = trained

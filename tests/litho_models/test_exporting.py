@@ -1,4 +1,4 @@
-"""A model that leaves prints what it printed here, or says why it cannot leave."""
+"""An exported model predicts the same print as before, or the export says why it is impossible."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep
 SETTINGS = {
     "affine-mtf": {"sigmas_um": (0.1, 0.3)},
     "linear": {"sigmas_um": (0.1, 0.3)},
-    # All of its operations, on few features.
+    # Uses all operations of the model, on few features.
     "pbl": {"sigma_diffusion_init_um": 0.2, "surroundings": FEW, "scan_axis": FEW},
 }
 CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear")
@@ -33,7 +33,7 @@ def layout(seed: int, size_px: int = SIZE_PX) -> torch.Tensor:
 
 
 def frozen(name: str, folder: Path) -> FrozenSimulator:
-    """One of the zoo, or one whose weights are drawn."""
+    """Return a model of the zoo, or one with random weights."""
     if name.startswith("zoo:"):
         return load_frozen(name)
     torch.manual_seed(0)
@@ -57,12 +57,12 @@ def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> No
     assert export_model(model, tmp_path / "model.pt2", SIZE_PX) <= LARGEST_DIFFERENCE_UM
     facts = {"card.json": ""}
     program = torch.export.load(tmp_path / "model.pt2", extra_files=facts).module()
-    # A layout that the export has not seen.
+    # A layout that was not used for the export.
     torch.testing.assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
     assert json.loads(facts["card.json"])["pitch_um"] == model.pitch_um
 
 
-# The blurs of the others are those of Physics.
+# The blurs of the other models are those of Physics.
 @pytest.mark.parametrize("name", ["zoo:physics", "pbl", pytest.param("zoo:pbl", marks=pytest.mark.long)])
 def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")
@@ -76,7 +76,7 @@ def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
     assert json.loads(stored["calibrated_range_um"]) == model.card["calibrated_range_um"]
 
 
-def test_what_cannot_leave_says_why_and_leaves_no_file(tmp_path: Path) -> None:
+def test_a_model_that_cannot_be_exported_says_why_and_leaves_no_file(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     fno = save_frozen(build_model("fno", layers=1, width=4, modes=(4, 4)), tmp_path / "fno")
     with pytest.raises(InputError, match="complex numbers"):

@@ -1,4 +1,4 @@
-"""What surrounds a pixel and what a microscope adds along x: told apart, fitted to pixels, kept apart."""
+"""Feature networks separate what is printed from what the microscope adds along x."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def narrow(**fields: object) -> Pbl:
 
 
 def moved(model: Pbl) -> Pbl:
-    """No part idle."""
+    """Change every parameter at random, so that no part of the model is idle."""
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
@@ -45,12 +45,12 @@ def test_the_printer_does_not_know_x_from_y_and_the_scan_axis_does():
     model = moved(narrow())
     with torch.no_grad():
         turned = [part(layout().mT).mT - part(layout()) for part in (model.printer(), model)]
-    # Roundings of 1e-7 of heights of 1 µm, sums in another order.
+    # Sums in another order round heights of 1 µm by 1e-7 of their value.
     assert float(turned[0].abs().max()) < 1e-5
     assert float(turned[1].abs().max()) > 1e-3
 
 
-def test_what_does_not_change_along_x_is_measured_as_it_is_printed():
+def test_a_print_that_is_constant_along_x_is_measured_as_it_is_printed():
     model = moved(narrow())
     field = layout()
     steps_along_y = field[..., :1].expand_as(field).contiguous()
@@ -60,7 +60,7 @@ def test_what_does_not_change_along_x_is_measured_as_it_is_printed():
 
 
 def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypatch):
-    # Several blocks, the last not full.
+    # Several blocks of pixels; the last is not full.
     monkeypatch.setattr(pixelwise, "_PIXELS_AT_ONCE", 700)
     model, found = moved(narrow()).double(), []
     for learns in (True, False):
@@ -73,11 +73,11 @@ def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypa
         assert float((fixed - learnt).abs().max()) < 1e-11
 
 
-def test_pixels_tell_what_the_microscope_adds_along_x_from_what_is_printed(monkeypatch):
+def test_a_fit_to_pixels_separates_what_the_microscope_adds_along_x_from_the_print(monkeypatch):
     def lost_um(printed: np.ndarray) -> np.ndarray:
         return 0.15 * np.abs(np.gradient(printed, 0.1, axis=1))
 
-    # As many steps as a hundred scans would give.
+    # Small batches, so that the fit takes as many steps as with a hundred scans.
     monkeypatch.setattr(pixels, "BATCH_PX", 256)
     scans = []
     for scan in make_scans(5, bow_um=0.02):
@@ -86,7 +86,7 @@ def test_pixels_tell_what_the_microscope_adds_along_x_from_what_is_printed(monke
     model = narrow()
     record = pixels.fit_feature_networks(model, scans, [], TrainingConfig(nuisance="full", steps=7))
     assert record.step == 7 + pixels.EPOCHS * -(-5 * 96**2 // 256)
-    # White noise of 4 nm has a mean absolute value of 3.2 nm; the print is learned to some nm.
+    # White noise of 4 nm has a mean absolute value of 3.2 nm. The fit is off by some nm more.
     assert 3.2 < record.training_mae_nm < 2 * 3.2
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     printed = printed_height_um(unseen.layout_um)
@@ -95,7 +95,7 @@ def test_pixels_tell_what_the_microscope_adds_along_x_from_what_is_printed(monke
     def error_nm(part: Pbl, truth: np.ndarray) -> float:
         return 1000 * float(np.abs(predict_scan(part, unseen) - truth).mean())
 
-    # Each part within half of what tells them apart, 15.7 nm.
+    # The error of each part is below half of 15.7 nm, the difference between the two.
     apart = 1000 * float(lost.mean())
     assert error_nm(model, printed - lost) < 0.5 * apart < 0.6 * error_nm(model, printed)
     assert error_nm(model.printer(), printed) < 0.5 * apart < 0.6 * error_nm(model.printer(), printed - lost)
@@ -112,7 +112,7 @@ def test_a_finished_chain_is_found_in_the_cache_and_the_networks_are_fitted_to_t
         assert torch.equal(a, b), name
     assert first.history[0] == second.history[0]
     assert isinstance(first.model, Pbl)
-    # The chain was trained, and the networks on top of it.
+    # Both the chain and the networks after it were trained.
     assert not torch.equal(first.model.tau, build_model("pbl").state_dict()["tau"])
     assert all(
         float(network.linear.weight.detach().abs().max()) > 0 for network in first.model.feature_networks

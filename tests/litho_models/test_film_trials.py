@@ -1,4 +1,4 @@
-"""Blind trials on films: what is planted, and when an answer is right."""
+"""Blind trials on films: which causes are planted, and when an answer is right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FNO: its spectral layer is a Fourier sum, its tiles are periodic, its blending weights sum to one."""
+"""The FNO's spectral layer is a Fourier sum, its tiles are periodic, its blending weights sum to one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ QUICK = {"steps": 12, "rounds": 3, "batch": 2, "precision": "32-true", "nuisance
 
 
 def trained(**fields):
-    """A small FNO whose every weight differs from its start."""
+    """Return a small FNO whose weights all differ from their initial values."""
     torch.manual_seed(0)
     model = build_model("fno", **{**SMALL, **fields}).double()
     with torch.no_grad():
@@ -51,7 +51,7 @@ def test_the_spectral_layer_is_the_fourier_sum(shape):
             wave = np.exp(-2j * np.pi * (ky * y / ny + kx * x / nx))
             spectrum = (field[0].numpy() * wave[..., None]).sum(axis=(0, 1))
             mixed = spectrum @ weight[sign, :, :, row, kx]
-            # A positive k_x stands for its mirror image too; the first and the last possible have none.
+            # A positive k_x also stands for its mirror image. The first and the last possible k_x have none.
             share = (1 if kx in (0, nx / 2) else 2) / (ny * nx)
             wanted = wanted + share * (mixed[:, None, None] * wave.conj()).real
     with torch.no_grad():
@@ -125,7 +125,7 @@ def test_coordinates_break_the_periodicity():
 def test_a_field_moved_by_whole_strides_moves_its_print():
     model = trained()
     stride = SMALL["tile_px"] - SMALL["overlap_px"]
-    # A wide even border, so that nothing but the pattern moves.
+    # A wide uniform border, so that only the pattern moves.
     field = torch.zeros(1, 1, 160, 160, dtype=torch.float64)
     field[..., 48:80, 48:80] = torch.rand(32, 32, dtype=torch.float64)
     with torch.no_grad():
@@ -157,7 +157,7 @@ def test_a_patch_without_its_border_leaves_out_the_tiles_of_the_border():
     whole = sum(seen)
     seen.clear()
     blend_tiles(count, torch.rand(1, 1, 160, 160), tile, border_px=64)
-    # 32 px of the middle touch two tiles of stride 24, or three, along each axis, of the whole field's seven.
+    # The middle 32 px touch two or three of the field's seven tiles, of stride 24, along each axis.
     assert whole == 49
     assert sum(seen) <= 9
 
@@ -175,7 +175,7 @@ def test_the_variants_are_those_of_paper_and_code():
     assert paper.config.coordinates
     assert authors.config.coordinates
     assert not ours.config.coordinates
-    # 9 px of 256, and the same share of another size.
+    # 9 px of 256, and the same fraction for other sizes.
     assert [round(paper.config.padding_fraction * size) for size in (256, 540)] == [9, 19]
     assert (authors.config.padding_px, authors.config.padding_fraction) == (9, 0)
     # Lift, four layers of two spectral blocks and one 1 x 1 convolution, projection.
@@ -221,7 +221,7 @@ def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
         return interior(self, layout_um)
 
     monkeypatch.setattr(Fno, "interior", watched)
-    # Scans narrower than a tile, and a crop size that is not the tile's.
+    # Scans narrower than a tile, and a crop size that differs from the tile's.
     for size_px in (28, 64):
         fit("fno", make_scans(3, size_px=size_px), TrainingConfig(**QUICK, crop_px=40, model=SMALL))
     assert set(shapes) == {(32, 32)}
@@ -238,11 +238,11 @@ def test_fno_learns_a_blur_beyond_its_start():
     def error(model):
         return np.mean([np.abs(predict_scan(model, s) - s.height_um).mean() for s in scans])
 
-    # The start is the layout itself; blur and saturation are what there is to learn.
+    # The initial prediction is the layout itself, so blur and saturation have to be learned.
     assert error(fitted.model) < 0.5 * error(start)
 
 
-def test_what_is_not_measured_does_not_teach():
+def test_pixels_that_are_not_measured_do_not_change_the_training():
     scans = make_scans(3, size_px=64)
     broken = []
     for scan in scans:

@@ -1,4 +1,4 @@
-"""Frozen models: reproduce themselves, refuse what they were not made for, and run nothing on loading."""
+"""Frozen models reload unchanged, refuse other printers' layouts, and run no code on loading."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ DAMAGE = {
 
 
 def nested(depth):
-    """A list in a list in a list …"""
+    """Return a list in a list in a list …"""
     return json.loads("[" * depth + "]" * depth)
 
 
@@ -224,8 +224,8 @@ def another_fit(weights):
 
 @pytest.mark.parametrize("change", [one_weight_a_little_off, lowest_bit_turned, another_fit])
 def test_weights_other_than_those_of_the_card_are_refused(folder, tmp_path, change):
-    # Finite, of the right shapes and precision: only the hash in the card, left as it was, tells.
-    # Copies: what is loaded is a view of the file.
+    # The changed weights are finite, with the right shapes and precision. Only the card's hash differs.
+    # Copy the weights, because the loaded ones are views of the file.
     before = {key: value.clone() for key, value in load_file(folder / WEIGHTS_FILE).items()}
     change(folder / WEIGHTS_FILE)
     after = load_file(folder / WEIGHTS_FILE)
@@ -312,7 +312,7 @@ def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_
         assert card.attributed == {"slope-thinning": side}
         page = (tmp_path / side / README_FILE).read_text(encoding="utf-8")
         assert f"cannot tell: slope-thinning to the {side}." in page
-    # What the printer did is part of a design; what the microscope did is not.
+    # A design includes what the printer does, but not what the microscope does.
     layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
     heights = [load_frozen(tmp_path / name)(layout) for name in ("printer", "microscope", "kept")]
     assert torch.equal(heights[1], heights[2])

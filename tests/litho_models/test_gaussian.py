@@ -1,4 +1,4 @@
-"""Gaussian blur: closed forms, derivatives with respect to its width, edges."""
+"""Check closed forms, derivatives by the width, and edges of the Gaussian blur."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PITCH = 0.1
 
 
 def blur_interior(field, sigma_px, radius_px):
-    """Only the pixels whose whole support lies inside."""
+    """Blur a field and return only the pixels whose whole kernel lies inside."""
     return gaussian_blur(field, sigma_px, 1.0, edge=None, radius_px=radius_px)
 
 
@@ -50,7 +50,7 @@ def test_attenuates_a_grating_as_the_fourier_transform_of_a_gaussian():
     grating = torch.cos(2 * math.pi * x / period_um).expand(20, 400)
     blurred = gaussian_blur(grating, sigma_um, PITCH)[10, 100:300]
     gain = blurred.max() / 1.0
-    # Cutting at four sigma leaves out 6e-5 of the weight.
+    # The cut at four sigma leaves out 6e-5 of the weight.
     assert float(gain) == pytest.approx(math.exp(-2 * (math.pi * sigma_um / period_um) ** 2), abs=2e-4)
 
 
@@ -59,7 +59,7 @@ def test_widths_add_in_quadrature():
     field[..., 60, 60] = 1
     twice = gaussian_blur(gaussian_blur(field, 0.3, PITCH), 0.4, PITCH)
     once = gaussian_blur(field, 0.5, PITCH)
-    # Both are cut at four sigma, which removes exp(-8) = 3e-4 of the peak of 1/(2π 25) at the rim.
+    # Both are cut at four sigma, where the kernel is exp(-8) = 3e-4 of its peak of 1/(2π 25).
     assert float((twice - once).abs().max()) < 3e-4 * float(once.max()) * 2
 
 
@@ -82,15 +82,15 @@ def test_derivative_with_respect_to_the_width_matches_finite_differences():
     (gradient,) = torch.autograd.grad((weight * gaussian_blur(field, sigma, PITCH)).sum(), sigma)
     step = 1e-5
     high, low = (float((weight * gaussian_blur(field, 0.33 + s, PITCH)).sum()) for s in (step, -step))
-    # Central difference: error of order step² plus rounding 1e-13/1e-5.
+    # The error of a central difference is of order step², plus rounding of 1e-13/1e-5.
     assert float(gradient) == pytest.approx((high - low) / (2 * step), rel=1e-6)
 
 
 def test_the_width_may_move_through_a_change_of_support_without_a_jump():
     field = torch.rand(1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    # Four sigma of 0.25 µm are 10 px exactly: the support grows by a pixel just above.
+    # Four sigma of 0.25 µm are exactly 10 px, so just above this width the support grows by one pixel.
     below, above = gaussian_blur(field, 0.2499999, PITCH), gaussian_blur(field, 0.2500001, PITCH)
-    # The added ring weighs exp(-0.5 (11/2.5)²) = 6e-5 of the peak, 1e-5 of the sum.
+    # The added ring has exp(-0.5 (11/2.5)²) = 6e-5 of the peak, and 1e-5 of the sum.
     assert float((below - above).abs().max()) < 5e-5
 
 
@@ -117,7 +117,7 @@ def test_a_field_without_pixels_is_refused():
 
 @pytest.mark.parametrize("sigma_px", [(1.3, 9.0), (17.0, 4.0)])
 def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
-    # Blocks of the part and of the whole begin at different pixels.
+    # In the part and in the whole field, blocks begin at different pixels.
     radii = tuple(kernel_radius_px(sigma) for sigma in sigma_px)
     field = torch.rand(2, 1, 800, 830, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     strip = field[..., 100:500, 150:600]
@@ -138,7 +138,7 @@ def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
 @pytest.mark.parametrize("samples", [1, 2])
 def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice(samples):
     generator = torch.Generator().manual_seed(0)
-    # Two blocks along y, the second not full, and one along x.
+    # Two blocks along y, of which the second is not full, and one along x.
     field = torch.rand(samples, 1, 41, 11, dtype=torch.float64, generator=generator, requires_grad=True)
     widths = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.6, 1.1)]
 

@@ -1,4 +1,4 @@
-"""Which scans belong together, by card, ids and order."""
+"""Scans are grouped by the card, by their ids and by their order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.litho_models.prints import make_scans, write_store
 
 
 def scans_of(*ids: str, **facts: object) -> list[PrintedScan]:
-    """A scan of four pixels an id, in order; its first digit is the print."""
+    """Return a scan of four pixels for each id, in this order; the first digit of the id is the print."""
     scans = [blank_scan(number, 2, **facts) for number in range(len(ids))]
     return [
         replace(scan, id=one, print_id=one[1:2] or one, groups={})
@@ -29,7 +29,7 @@ def test_all_scans_are_one_group_and_it_comes_first() -> None:
 
 
 def test_every_label_is_that_of_the_scan_alone() -> None:
-    """A scan that is not among those learned from finds its group by the same rule."""
+    """The same rule also gives the group of a scan that was not learned from."""
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32")
     found = groupings(scans)
     assert len(found) > 3
@@ -39,14 +39,14 @@ def test_every_label_is_that_of_the_scan_alone() -> None:
 
 def test_characters_of_the_ids_stand_for_groups_unless_the_card_has_them() -> None:
     scans = scans_of("F11", "F12", "F21", "F22")
-    # The second character divides like the print, the first not at all.
+    # The second character groups the scans as the print does. The first is the same for all.
     assert list(groupings(scans, by_order=False)) == [ALL, "print", "character 3"]
     stated = [replace(scan, groups={"field": scan.id[2]}) for scan in scans]
     assert list(groupings(stated, by_order=False)) == [ALL, "field", "print"]
     assert groupings(stated)["field"] == ("1", "2", "1", "2")
 
 
-def test_ids_of_different_lengths_say_nothing() -> None:
+def test_ids_of_different_lengths_give_no_groups() -> None:
     assert list(groupings(scans_of("F1", "F1x", "F2", "F2x"), by_order=False)) == [ALL, "print"]
 
 
@@ -72,8 +72,8 @@ def test_a_change_may_come_where_a_print_begins() -> None:
     assert before == {"order 1-2": 2, "order 3-4": 4}
 
 
-def test_between_two_known_scans_nobody_knows_whether_a_change_had_come() -> None:
-    """A print that was left out lies there: it gets the mean of both sides."""
+def test_a_scan_of_a_left_out_print_at_the_place_of_a_change_has_no_label() -> None:
+    """A print that was left out lies between them, so it gets the mean of both sides."""
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32", "F41", "F42")
     by, _ = (by for by in groupings([*scans[:2], *scans[4:]]) if by.startswith("order"))
     assert by == "order 1-4"
@@ -88,7 +88,7 @@ def test_without_prints_a_change_may_come_anywhere_with_two_scans_on_each_side()
     assert [labels.count("before") for labels in orders] == [2, 3, 4]
 
 
-def test_scans_of_one_order_have_no_before() -> None:
+def test_scans_of_equal_order_are_not_grouped_by_order() -> None:
     scans = [replace(scan, order=0) for scan in scans_of("F11", "F12", "F21", "F22")]
     assert not [by for by in groupings(scans) if by.startswith("order")]
 
@@ -100,7 +100,7 @@ def test_a_group_of_the_card_may_have_any_name(name: str) -> None:
         replace(s, groups={name: own}) for s, own in zip(scans_of("a", "b", "c", "d"), labels, strict=True)
     ]
     assert groupings([replace(s, print_id="1") for s in scans])[name] == labels
-    # A scan without the group has no label, whatever else its name may mean.
+    # A scan without the group has no label, even if the group's name has another meaning too.
     assert label_of(replace(scans[0], groups={}), name) == ""
 
 
@@ -111,7 +111,7 @@ def test_a_group_of_the_card_may_have_any_name(name: str) -> None:
         ({"ids": {"print": r"P(?P<print>\d)F(?P<field>\d)(?P<day>[ab]|)"}}, {"field": "0", "day": ""}),
         ({"ids": {"print": r"P(?P<print>\d)F\d"}}, {}),
         ({"ids": {"print": r"X(?P<print>\d)(?P<field>\d)"}}, {}),
-        # One that repeats could take for ever; one that is none can stand in a store from elsewhere.
+        # A pattern with nested repeats could take for ever. A store from elsewhere may hold an invalid one.
         ({"ids": {"print": r"P(?P<print>\d+)F(?P<field>\d+)"}}, {}),
         ({"ids": {"print": r"P(?P<print>\dF"}}, {}),
         ({"ids": {"print": None}}, {}),

@@ -1,4 +1,4 @@
-"""Models on the hub: what was pushed comes back; what cannot be fetched is said in one line. No network."""
+"""A pushed model can be fetched back, and a failure is told in one line. No network is used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_models.frozen.files import push
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """huggingface_hub by its documented signatures, its repositories folders; returns where they lie."""
+    """Replace huggingface_hub by functions with its signatures; return the folder of its repositories."""
     root = tmp_path / "hub"
     library = ModuleType("huggingface_hub")
 

@@ -1,4 +1,4 @@
-"""What an earlier call kept: the same call goes on from it, another is refused, damage names its folder."""
+"""The same call continues earlier work, another call is refused, and damaged files name their folder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from litho_models.noise.residuals import read_residuals
 from litho_models.splits.folds import grouped_folds, plan_folds
 from tests.litho_models.prints import make_scans, write_store
 
-# The paper's PBL, whose fit is its steps. The default one then fits networks to pixels, each time anew.
+# The paper's PBL is fitted in steps only. The default PBL then fits networks to pixels, each time anew.
 QUICK = {
     "variant": "paper",
     "steps": 2,
@@ -40,14 +40,14 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(store, tmp_path_factory):
-    """A run of a network, with its checkpoint."""
+    """Return the folder of a network's training run, with its checkpoint."""
     folder = tmp_path_factory.mktemp("run") / "pbl"
     return train(store, "pbl", folder, settings=QUICK), folder
 
 
 @pytest.fixture(scope="module")
 def scored(store, tmp_path_factory):
-    """A benchmark of a fit by Gauss-Newton and of one in steps."""
+    """Return a benchmark of two models, one fitted by Gauss-Newton and one in steps."""
     out = tmp_path_factory.mktemp("benchmark")
     return benchmark(store, out, models=["affine", "pbl"], folds=2, settings=QUICK), out
 
@@ -66,7 +66,7 @@ def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
     save = CheckpointFolder.save
 
     def save_and_die(self, state):
-        # What the first round took, as if it had been long.
+        # Pretend that the first round took long.
         state.history[0] = state.history[0].model_copy(update={"seconds": 1000.0})
         save(self, state)
         raise Killed
@@ -139,7 +139,7 @@ def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, sto
 def test_a_damaged_fit_is_told_with_its_folder(scored, store, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(scored[1], out)
-    # What is asked for anew has fewer models than the result, which is not replaced then.
+    # The new call names fewer models than the result holds, so the result is not replaced.
     (out / "benchmark.json").unlink()
     folder = next(path for path in (out / "cache").glob("affine-*"))
     for name, damage in (

@@ -1,4 +1,4 @@
-"""What could still be learned: what is there is measured, and nothing is where nothing is."""
+"""The learner measures how much predictions still lack, and finds nothing where they lack nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Change = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[Study, list[np.ndarray], Learner]:
-    """Scans, what they show but for their noise, and the learner of them."""
+    """Return scans, their heights without noise, and the learner of these scans."""
     study = study_of(planted(size_px=96, noise_um=NOISE_UM), folds=5)
     twin = Twin.bare(base_model())
     predictions = [twin.height(scan) for scan in study.scans]
@@ -36,7 +36,7 @@ def scene() -> tuple[Study, list[np.ndarray], Learner]:
 
 @pytest.fixture(scope="module")
 def rest_without(scene) -> Callable[[Change | None], Rest]:
-    """What the learner finds where predictions lack a change, or nothing."""
+    """Return what the learner finds if the predictions lack this change, or no change."""
     study, predictions, learner = scene
 
     @functools.cache
@@ -47,17 +47,17 @@ def rest_without(scene) -> Callable[[Change | None], Rest]:
 
 
 def changed(study: Study, predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
-    """Predictions that lack a change."""
+    """Return predictions that lack a change."""
     return [p - change(f, p).astype(np.float32) for f, p in zip(study.scans, predictions, strict=True)]
 
 
 def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Some nanometres on slopes along x, the higher the print the more."""
+    """Return a bead of some nanometres on slopes along x, which grows with the height of the print."""
     return 0.02 * prediction * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=1))
 
 
 def later(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """The slopes along y lose height in the second half of the run."""
+    """Return a loss of height on slopes along y, in the second half of the run only."""
     return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=0))
 
 
@@ -68,7 +68,7 @@ def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
 
 
 def displaced(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """What lies at the upper right comes 0.1 µm too low, fading to the other sides."""
+    """Return a loss of 0.1 µm at the upper right that fades towards the other sides."""
     ny, nx = prediction.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     return 0.1 * np.exp(-2 * (y + 0.4) ** 2 - 2 * (x - 0.4) ** 2) * np.gradient(prediction, 0.1, axis=0)
@@ -81,18 +81,18 @@ def test_where_nothing_is_missing_nothing_can_be_learned(rest_without) -> None:
 
 
 @pytest.mark.parametrize("change", [bead, later, placed, displaced])
-def test_what_follows_layout_order_or_place_is_measured_in_its_size(rest_without, change) -> None:
+def test_the_learner_measures_the_size_of_changes_by_layout_order_or_place(rest_without, change) -> None:
     rest, true = rest_without(change), rest_without(None)
     there = float((rest.squares_nm2 - true.squares_nm2).mean())
     assert rest.matters
     assert rest.ci95_nm2[0] <= rest.mean_nm2 <= rest.ci95_nm2[1]
-    # A fifth is left for the spread of 200 coefficients over 64,000 pixels and for the ridge.
+    # A fifth allows for the scatter of 200 coefficients from 64,000 pixels and for the ridge.
     assert 0.8 * there < rest.mean_nm2 < 1.05 * there
 
 
 def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene, rest_without) -> None:
     study, predictions, learner = scene
-    # One scan alone has a pattern of its own: the others cannot know it.
+    # Only one scan has this pattern, so nothing can be learned about it from the others.
     alone = list(predictions)
     alone[0] = alone[0] - bead(study.scans[0], alone[0])
     found = learner.rest(alone)
@@ -100,15 +100,15 @@ def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene, rest_without) -
 
 
 def test_two_folds_are_enough(scene, rest_without) -> None:
-    """The weight of the ridge is then chosen on single scans of the other fold."""
+    """With two folds the weight of the ridge is chosen on single scans of the other fold."""
     study, predictions, _ = scene
     halves = Learner(replace(study, fold_of=np.arange(10) % 2), predictions)
     lacking = changed(study, predictions, bead)
     assert halves.rest(lacking).mean_nm2 == pytest.approx(rest_without(bead).mean_nm2, rel=0.1)
 
 
-def test_what_may_follow_the_order_are_height_slopes_and_surroundings(scene) -> None:
-    """The learner takes them by their place in a default model's features."""
+def test_only_height_slopes_and_surroundings_may_depend_on_the_order(scene) -> None:
+    """The learner identifies these features by their index among those of a default model."""
     scan = scene[0].scans[0]
     rows = feature_rows(build_model("features"), scan.stored, scan.sample)
     layout, pitch = scan.stored.layout_um / 1.2, scan.stored.pitch_um
@@ -126,7 +126,7 @@ def test_rows_are_thinned_where_they_would_not_fit(scene, rest_without, monkeypa
     monkeypatch.setattr(module, "_KEPT_BYTES", 4 * 320 * pixels // 2)
     thinned = Learner(study, predictions)
     assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 320 * pixels // 2
-    # Half of the pixels tell nearly the same.
+    # Half of the pixels give nearly the same result.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(rest_without(bead).mean_nm2, rel=0.15)
 
 
@@ -144,17 +144,17 @@ def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scen
     plain = rest_without(None)
     moved = Learner(replace(study, scans=tilted), predictions).rest(predictions)
     assert moved.squares_nm2 == pytest.approx(plain.squares_nm2, rel=1e-6)
-    # White noise is all that is there.
+    # The residual is white noise.
     assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(NOISE_UM * NM_PER_UM, rel=0.03)
 
 
-def test_the_form_may_be_wrong_by_the_upper_end_of_what_could_be_learned() -> None:
+def test_the_error_of_the_form_is_the_upper_end_of_what_could_be_learned() -> None:
     gains = np.array([8.0, 10.0, 9.0, 11.0, 10.0, 12.0])
     some = Rest(gains, np.full(6, 100.0))
     assert some.ci95_nm2 is not None
     assert math.sqrt(10.0) < some.most_nm == pytest.approx(math.sqrt(some.ci95_nm2[1]))
     assert Rest(-gains, np.full(6, 100.0)).most_nm == 0.0
-    # Too few scans for an interval: the mean.
+    # With too few scans for an interval the mean is used.
     assert Rest(gains[:2], np.full(2, 100.0)).most_nm == pytest.approx(3.0)
 
 

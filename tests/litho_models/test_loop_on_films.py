@@ -1,4 +1,4 @@
-"""The loop on micrographs of films: effects that move edges, and which of them a bare printer lacks."""
+"""On micrographs of films the loop finds which effect that moves edges a bare printer lacks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _context(layout_um: torch.Tensor) -> FieldContext:
 
 
 def _film(distance_px: np.ndarray) -> torch.Tensor:
-    """A film (1, 1, y, x), µm, its edge where a signed distance is zero."""
+    """Return a film (1, 1, y, x), µm, with its edge where a signed distance is zero."""
     return torch.from_numpy(FILM_UM / (1 + np.exp(-4 * distance_px)))[None, None]
 
 
@@ -44,14 +44,14 @@ def _radius_px(film: torch.Tensor) -> float:
 def test_a_bias_moves_every_edge_by_itself(bias_px: float) -> None:
     film = _film(_disc(25))
     moved = get_effect("etch-bias")(film, {"bias_px": bias_px}, _context(film))
-    # The film is looked up by cubics, its rim is one pixel wide: some hundredths of a pixel.
+    # Cubic interpolation of a rim one pixel wide is off by some hundredths of a pixel.
     assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_px, abs=0.03)
 
 
 def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
     values, disc = {"variance_px2": 3**2}, _film(_disc(20))
     spread = get_effect("resist-diffusion")
-    # A disc blurred by s is one half where its radius is less by s² / 2R, to second order in s / R.
+    # A disc blurred by s is one half at a radius smaller by s² / 2R, to second order in s / R.
     shrunk_px = _radius_px(disc) - _radius_px(spread(disc, values, _context(disc)))
     assert shrunk_px == pytest.approx(3**2 / (2 * 20), rel=0.05)
     straight = _film(np.tile(np.arange(97) - 48.3, (97, 1)))
@@ -61,13 +61,13 @@ def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -
 def test_electrons_come_back_where_something_is_written() -> None:
     layout = _film(_disc(20))
     dose = get_effect("electron-backscatter")(layout, {"weight": 0.5, "length_px": 8.0}, _context(layout))
-    # They are spread and not lost, but for what goes beyond the field, four of their lengths away.
+    # Electrons are spread and not lost, except those beyond the field, four of their lengths away.
     assert float(dose.sum()) == pytest.approx(float(layout.sum()), rel=1e-3)
     assert 0 < float(dose[0, 0, 48, 48 + 26]) < FILM_UM / 3
 
 
 def _prints(count: int, bias_px: float) -> list[PrintedScan]:
-    """Random films of a spot, a threshold and a shift of edges, with a noise of coverage."""
+    """Return random films made by a spot, a threshold and a shift of edges, with noise of the coverage."""
     numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_px}
     printer = build_model("e-beam", **(BARE | numbers), **GEOMETRY)
     scans = []
@@ -94,7 +94,7 @@ def test_the_loop_names_the_bias_that_a_bare_printer_lacks(tmp_path: Path) -> No
     result = close_loop(store, tmp_path / "loop", base="e-beam", base_settings=BARE, folds=2)
     assert [one.name for one in result.effects] == ["etch-bias"]
     (found,) = result.effects[0].strengths["bias_px"]
-    # A threshold and a spot that are fitted anew take some of it, but not its sign.
+    # The refitted threshold and spot take some of the bias, but do not change its sign.
     assert -4.5 < found.value < -1
     before, after = result.error("base"), result.error("all")
     assert before is not None

@@ -1,4 +1,4 @@
-"""The loop on a small store of the virtual fab, from scans to record, report and corrected model."""
+"""Run the loop on a small store of the virtual fab, from scans to record, report and corrected model."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ from litho_models.scoring.statistics import over_units
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
 
-# The page of the loop is drawn here.
+# These tests draw the figures of the loop's report.
 pytestmark = pytest.mark.pictures
 COUNT, SIZE_PX = 12, 48
 BASE = "affine-mtf"
 CAUSES = ("write-order-memory", "slope-thinning", "vertical-shrinkage")
-# What scans may share has its own tests.
+# Surfaces that scans share have their own tests.
 FEW_OFFERS = (("background", 2, False),)
 SOME_LAWS, TABLE = ("height-power-2", "height-times-slope-size-x"), "level-table"
 TABLES = ("errors", "candidates", "explained", "single_scans", "planted")
@@ -54,7 +54,7 @@ TABLES = ("errors", "candidates", "explained", "single_scans", "planted")
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Surfaces of the fab on the layout's grid: fields this small cannot be registered."""
+    """Write surfaces of the fab on the layout's grid, as fields this small cannot be registered."""
     folder = tmp_path_factory.mktemp("fab")
     knobs = ("write-order-memory=0.25",)
     litho_data.simulate(
@@ -73,7 +73,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
-    """Result, its folder, and what was said, with a handful of candidates; the locked scans are opened."""
+    """Return result, folder and messages of a loop with few candidates, which opens the locked scans."""
     said: list[str] = []
     out = store.parent / "loop"
     with pytest.MonkeyPatch.context() as patch:
@@ -81,9 +81,9 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
         patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
         patch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
-        # As if each second of the first fits stood for hours.
+        # Make each second of the first fits count as hours, so that the time left is told.
         patch.setattr(closing, "_OVER_FIRST_FITS", 1e5)
-        # Of one blur and two numbers.
+        # A base of one blur and two numbers.
         patch.setattr(bases, "build_model", lambda *name, **facts: base_model())
         result = close_loop(store, out, base=BASE, folds=2, open_lock_box=True, report=said.append)
     return result, out, said
@@ -130,7 +130,7 @@ def test_every_candidate_has_a_verdict_once(closed) -> None:
     names = [one.name for one in (*result.effects, *result.candidates)]
     assert len(names) == len(set(names))
     assert all(one.reason for one in result.candidates)
-    # Every scan has a gain of its own.
+    # Every scan has a separate gain.
     shrunk = next(one for one in result.candidates if one.name == "vertical-shrinkage")
     assert shrunk.verdict == "not-testable"
 
@@ -194,7 +194,7 @@ def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) 
 
     height = model(torch.from_numpy(scan.layout_um)[None, None], pitch_um=scan.pitch_um)[0, 0].numpy()
     left = 1e3 * (scan.height_um - height)[scan.usable]
-    # Levelling, background and each scan's datum are the microscope's: the print alone is less near.
+    # Levelling, background and datums belong to the microscope, so the print alone is less close.
     own = result.error("all", held_out="locked")
     assert own is not None
     assert np.abs(left - np.median(left)).mean() < 3 * own.by_scan_nm[scan.id]
@@ -241,7 +241,7 @@ def test_texts_follow_the_verdict(closed) -> None:
         assert one.name in said("effect", one)
 
 
-# Laws of the parts, without the fab.
+# Tests of the parts, without the fab.
 
 
 def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
@@ -257,7 +257,7 @@ def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
     assert verdict("description") == "described"
     assert verdict() == "nothing-missing"
     assert verdict(matters=True) == verdict(refused=True) == "unexplained"
-    # Nothing can be confirmed, so that a refusal says nothing.
+    # Too few scans to confirm anything, so a refusal means nothing.
     assert verdict(count=7, refused=True) == "too-few-scans"
 
 
@@ -277,19 +277,19 @@ def test_error_rows_count_the_terms_of_each_scan() -> None:
 
 
 def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
-    """The sandwich by scans against the spread over draws of the noise."""
+    """Compare the sandwich error by scans with the scatter of fits to different draws of the noise."""
     fitted, sds = [], []
     for seed in range(12):
         study = study_of(planted(seed=seed))
         state = bare_state(study)
         fitted.append(state.twin.vector[0])
         sds.append(np.sqrt(clustered_covariance(state.linear, [scan.id for scan in study.scans])[0, 0]))
-    # A spread of 12 draws is known to a fifth, twice that is allowed for.
+    # The scatter of 12 draws has a relative error of a fifth. Twice that is allowed.
     assert np.std(fitted, ddof=1) == pytest.approx(np.mean(sds), rel=0.45)
 
 
 def test_a_scan_is_freed_by_what_the_others_say() -> None:
-    """Its own heights move nothing of what is taken from it."""
+    """What is subtracted from a scan does not depend on its own heights."""
     scans = planted(count=8)
     bows = [0.03 * _bow(s.shape) * (s.groups["field"] == "2") for s in scans]
     bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
@@ -297,7 +297,7 @@ def test_a_scan_is_freed_by_what_the_others_say() -> None:
     state = bare_state(study)
     freed = freed_scans(state)
     taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
-    # Half of the difference between the fields is in each, shrunk.
+    # Each field has half of the difference between the fields, shrunk.
     for scan, own in zip(bowed, taken, strict=True):
         sign = 1 if scan.groups["field"] == "2" else -1
         assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
@@ -332,7 +332,7 @@ def test_a_base_is_asked_for_by_name_or_the_smallest_of_those_that_do_as_well_is
         return closed.base_name, [*closed.rivals]
 
     assert chosen("affine") == ("affine", [])
-    # A gain and a datum are what every scan may add by itself.
+    # Every scan may have a gain and a datum of its own.
     monkeypatch.setattr(bases, "_COMPETING", ("affine", "identity"))
     assert chosen(bases.AUTO) == ("identity", ["affine"])
     with pytest.raises(InputError):
@@ -348,7 +348,7 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cause, no law, no table, and little that scans may share."""
+    """Search no cause, law or table, and little that scans share, to save time."""
     for name in ("LAWS", "TABLES"):
         monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
@@ -368,7 +368,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
 ) -> None:
     scans = make_scans(6, 48)
     locked = locked_ids(scans)
-    # Hardly any pixel of the locked scan is measured, so it is dropped.
+    # Almost no pixel of the locked scan is measured, so the scan is dropped.
     corner = np.zeros(scans[0].shape, bool)
     corner[:4, :4] = True
     empty = [replace(s, valid=corner) if s.id in locked else s for s in scans]
@@ -379,7 +379,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
         assert train(path, "identity", tmp_path / f"run{number}").lock_box == locked
         assert len(found.run.dropped) == number
         assert found.run.n_scans == len(scans) - len(locked)
-        # Design flags layouts outside what the model was fitted on by the shares of the levels there.
+        # Design uses the level shares of the fitted layouts to flag a layout unlike them.
         used = np.concatenate([s.mask_level.ravel() for s in scans if s.id not in locked])
         shares = ModelCard.read(out / "model").training_level_share
         assert shares == pytest.approx(np.bincount(used, minlength=len(shares)) / used.size, abs=1e-12)
@@ -409,7 +409,7 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     scans = [replace(scan, print_id=str(number // 4)) for number, scan in enumerate(made)]
     rows, often = run._nested(study_of(scans), "prints", watched)
     assert seen == [{"1", "2"}, {"0", "2"}, {"0", "1"}]
-    # The law is chosen in every selection, and its gain lasts.
+    # Every selection chooses the law, and its gain remains on the held-out print.
     assert often == {law: 3}
     before, after = (
         next(row for row in rows if (row.model, row.policy) == (model, "offset")) for model in ("base", "all")
@@ -439,6 +439,6 @@ def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_explained_is_what_a_stage_leaves() -> None:
+def test_the_explained_share_follows_from_the_error_after_each_stage() -> None:
     row = Explained(stage="base", squared_error_nm2=20.0, explained_nm2=5.0, matters=True)
     assert Explained.model_validate(row.model_dump()) == row

@@ -1,4 +1,4 @@
-"""Screening promises what a fit then gains, with one strength or one by group."""
+"""Screening predicts the gain of a later fit, with one strength or one strength per group."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_linear_candidate_promises_what_its_fit_gains(in_half, by: str) -> Non
     one = found[LAW, by]
     fitted = fit_state(state.twin.with_effect(LAW, by, one.start()), study)
     gains = state.freed_nm2 - fitted.freed_nm2
-    # By group the base's share is taken out as all scans together have it: the promise is a rough one.
+    # By group the prediction is rough, as the base's part is removed for all scans together.
     np.testing.assert_allclose(one.gain_nm2, gains.mean(), rtol=0.05 if by == ALL else 0.3)
     assert np.corrcoef(one.gains_nm2, gains)[0, 1] > 0.95
 
@@ -59,7 +59,7 @@ def test_a_strength_in_half_of_the_scans_is_found_with_its_grouping(in_half) -> 
     strengths = {label: values["strength"] for label, values in one.start().items()}
     assert strengths["2"] == pytest.approx(0.04, rel=0.05)
     assert abs(strengths["1"]) < 0.1 * 0.04
-    # Of 252 ways to choose five scans of ten, two divide them as the fields do: these are not counted.
+    # Of 252 ways to choose five of ten scans, the two that equal the fields are not counted.
     (standing,) = [one for one in screening.standing() if one.name == LAW]
     assert standing.by == "field"
     assert standing.group_p is not None
@@ -70,7 +70,7 @@ def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
     _, _, found, screening = in_all
     one = found[LAW, ALL]
     assert one.start()[""]["strength"] == pytest.approx(0.04, rel=0.05)
-    # All signs alike: the observed one, of 2^10.
+    # Of 2^10 sets of signs only the observed set has all signs alike.
     assert one.family_p <= 4 / 2**10
     for (name, by), other in found.items():
         if name == LAW and by != ALL:
@@ -91,15 +91,15 @@ def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
     assert abs(screening.cosine(one, other)) < 0.5
 
 
-def test_what_the_base_does_is_no_candidate(in_all) -> None:
-    """A gain that all scans share is a number of the base, and what is left of it a gain of each scan."""
+def test_a_change_that_the_base_can_make_is_no_candidate(in_all) -> None:
+    """The base already has a common gain, and each scan may have a gain of its own."""
     _, state, _, _ = in_all
     found = Screening(state, [get_effect("vertical-shrinkage")]).common
     assert found["vertical-shrinkage"].retained < 1e-5
 
 
 def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
-    """What slopes of both axes lack a blunt tip would have added."""
+    """The slopes along both axes lack height, where a blunt tip would have added some."""
     name = "slope-thinning"
     thinned = get_effect(name).with_values({"along_x_um": 0.1, "along_y_um": 0.1})
     study = study_of(planted([(name, ALL, {"": thinned})]))
@@ -144,19 +144,19 @@ def test_multiples_count_from_the_null_and_stay_in_range() -> None:
     trial = Trial(_effect(), _effect().trials[:2])
     assert trial.steps(np.array([2.0, 3.0])) == pytest.approx([0.2, 0.6])
     assert trial.reach(np.array([2.0, 3.0])) == 1
-    # a would be 2, twice what it can be.
+    # a would be 2, twice its upper bound.
     assert trial.reach(np.array([20.0, 1.0])) == pytest.approx(0.5)
-    # b would be 3 where 2 is the most.
+    # b would be 3, and its upper bound is 2.
     assert trial.reach(np.array([1.0, 10.0])) == pytest.approx(0.5)
 
 
-def test_a_sign_that_cannot_be_is_not_allowed_unless_it_is_small_beside_the_rest() -> None:
+def test_an_impossible_sign_is_allowed_only_for_a_relatively_small_strength() -> None:
     trial = Trial(_effect(), _effect().trials[:2])
     assert trial.allowed(np.array([1.0, 1.0]))
     assert not trial.allowed(np.array([-1.0, 0.0]))
     assert not trial.allowed(np.array([-1.0, 1.0]))
-    # Beside a group in which it is ten times as large, it is noise.
+    # A wrong sign is noise if another group has ten times the strength.
     assert trial.allowed(np.array([[-1.0, 0.0], [10.0, 0.0]]))
     assert trial.allowed(np.array([-0.1, 1.0]))
-    # b may go either way.
+    # b may have either sign.
     assert trial.allowed(np.array([1.0, -1.0]))

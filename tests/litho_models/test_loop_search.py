@@ -1,4 +1,4 @@
-"""The joint search names what was planted, with the grouping that it was planted with, and nothing else."""
+"""The joint search finds all planted effects with their groupings, and nothing else."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     found = found_in((THINNING, "field", {"1": thinning(0.0), "2": thinning(0.2)}))
     assert added(found) == {THINNING: "field"}
     cause = found.causes[0]
-    # Half of the scans have nothing to gain: better in few of them is no refusal where labels say which.
+    # Half of the scans have nothing to gain. That does not refuse a cause whose labels say which gain.
     assert cause.group_p is not None
     assert cause.group_p < 0.05
     assert cause.judgement.improved[0] >= 5
@@ -66,7 +66,7 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
 
 
 def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
-    """Also of a cause that was not added last."""
+    """This also holds for a cause that was not added last."""
     values = {"1": thinning(0.1), "2": thinning(0.2)}
     study = study_of(planted([(THINNING, "field", values), (MEMORY, ALL, {"": memory(0.3)})]))
     twin = bare_state(study).twin.with_effect(THINNING, ALL, {"": thinning(0.15)})
@@ -90,7 +90,7 @@ def test_a_loss_along_a_diagonal_is_the_cause_with_its_direction() -> None:
     found = found_in((THINNING, ALL, {"": {**thinning(0.2), "turn_deg": 35.0}}))
     assert added(found) == {THINNING: ALL}
     values = found.state.twin.values({})[THINNING]
-    # A frame that is turned by 35 degrees is also one turned by -55, with its axes exchanged.
+    # A frame turned by 35 degrees equals one turned by -55 degrees with its axes exchanged.
     assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
     assert values["turn_deg"] == pytest.approx(35, abs=3)
 
@@ -103,7 +103,7 @@ def test_what_only_a_table_describes_enters_the_corrected_model() -> None:
     found = _in_model(state, describe(state, [table], 1))
     assert found.names == ["level-table"]
     assert state.mse_nm2 > 2 * found.state.mse_nm2
-    # All that is left is the noise.
+    # The residual is the noise.
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
     assert _in_model(state, []).state is state
 
@@ -136,24 +136,24 @@ def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
 @pytest.mark.parametrize(
     ("name", "values", "beside"),
     [
-        # Along one diagonal 0.3 µm wider in quadrature: more than half of it is plain blur.
+        # One diagonal is 0.3 µm wider in quadrature. More than half of this is plain blur.
         ("elliptical-psf", {"shear_um2": 0.09}, ["diffusion-blur", "galvo-lag"]),
-        # Lost at the foot, which every print is lower by: not shrunk.
+        # Height lost at the foot lowers every print by the same amount, unlike shrinkage.
         ("interface-offset", {"depth_um": 0.25}, ["vertical-shrinkage", "height-saturation"]),
-        # Offsets of rows, which every scan may have of its own, could hide them.
+        # Every scan may have its own offsets of rows, which could hide the cause.
         (
             "hatch-ripple",
             {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31},
             ["slope-thinning"],
         ),
-        # Bare places are not tilted with the print: that tells it from a tilt of the microscope.
+        # Bare places are not tilted with the print. This separates the cause from a tilt of the microscope.
         ("field-curvature", {"tilt_x_um": 0.06, "tilt_y_um": -0.04}, ["vignetting"]),
     ],
 )
 def test_a_cause_that_another_resembles_is_found(
     name: str, values: dict[str, float], beside: list[str]
 ) -> None:
-    """On a Physics model, whose own blur, gain and saturation are fitted beside it."""
+    """The base is a Physics model, whose blur, gain and saturation are fitted together with the cause."""
     base = build_model("physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4)
     effect = get_effect(name)
     scans = planted(
@@ -183,7 +183,7 @@ def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:
     assert same_change(bare, other, one) is same_change(bare, one, other) is False
 
 
-# The judge, in numbers.
+# The judgement of single causes, in numbers.
 
 STUDY = Study((), np.empty(0))
 
@@ -192,7 +192,7 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
     before = np.full(10, 100.0)
     assert judge(before, np.full(10, 90.0), STUDY).passed()
     half = judge(before, before - 20.0 * (np.arange(10) % 2), STUDY)
-    # The five that gain must have their sign: one arrangement in 2^5.
+    # All five gains must be positive: one of 2^5 arrangements of signs.
     assert half.p == pytest.approx(2**-5)
     assert not half.passed()
     assert half.passed(grouped=True)
@@ -200,7 +200,7 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
 
 
 def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -> None:
-    """Three of ten scans have 0.4 of the strength, so they lose by the mean one, but it is there in all."""
+    """Three of ten scans have 0.4 of the strength: the mean strength makes them worse, yet all have it."""
     strengths = np.where(np.arange(10) < 3, 0.4, 1.0)
     noise = np.random.default_rng(0).normal(size=(10, 50_000))
     change = np.random.default_rng(1).normal(size=50_000)
@@ -213,7 +213,7 @@ def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -
     assert judged.improved == (7, 10)
     assert one_sided_flip_p(judged.gains_nm2) > CONFIRM_P
     assert judged.p == pytest.approx(2**-10)
-    # <c, (s - m) c + n> of the mean strength m and a scan's strength s.
+    # <c, (s - m) c + n> for the mean strength m and a scan's strength s.
     gains = strengths**2 - (strengths - strengths.mean()) ** 2
     np.testing.assert_allclose(judged.gains_nm2, gains, atol=4 * 2 / 50_000**0.5)
     assert judged.passed()
@@ -226,7 +226,7 @@ def test_the_reason_says_what_is_missing() -> None:
     assert judge(before, before - 10 * signs, STUDY).reason().startswith("better in only 5 of 10")
     assert judge(before, before - 0.1, STUDY).reason() == "gain of 0.10 % is too small to matter"
     assert judge(before, before - 10, STUDY).reason() == ""
-    # Five scans gain 36 and five lose 10: the mean is known to 7, and 13 are gained.
+    # Five scans gain 36 and five lose 10: the mean gain is 13, with a standard error of 7.
     torn = judge(before, before - np.array([36.0, -10.0] * 5), STUDY)
     assert torn.low_nm2 < 0 < torn.gain_nm2
     assert replace(torn, p=0.0).reason() == "the interval of the held-out gain includes zero"

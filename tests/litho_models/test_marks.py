@@ -1,4 +1,4 @@
-"""What is seen in raw files and as marks in scans, without a model."""
+"""Marks that are found in raw files and scans without a model."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from litho_models.loop.record import ScanFinding
 from tests.litho_models.loop_scans import blank_scans, with_heights
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
-# A scan turned by 90 degrees has its lines along y.
+# The transform of a scan that is turned by 90 degrees: its lines lie along y.
 TURNED = np.array([[0.0, -1.0, 19.2], [1.0, 0.0, 0.0], [0, 0, 1]])
 
 
 def found_in(
     scans: Sequence[PrintedScan], rounding_um: dict[str, float] | None = None
 ) -> dict[str, ScanFinding]:
-    """Marks of scans whose maps are flat."""
+    """Return the marks found in scans of flat layouts."""
     prepared = prepare_scans(scans)
     return {
         one.name: one for one in marks(prepared, [np.zeros(s.shape) for s in scans], rounding_um=rounding_um)
@@ -33,7 +33,7 @@ def found_in(
 @pytest.mark.parametrize("step_um", [0.001, 0.0268])
 def test_the_step_of_rounded_heights_is_read_off(step_um: float) -> None:
     rounded = (np.floor(HEIGHTS / step_um) * step_um + 0.0123).astype(np.float32)
-    # Single precision at 1 µm: 6e-8 µm, so the step is known to 1e-4 of 1 nm and better.
+    # Single precision at 1 µm is 6e-8 µm, so the step of 1 nm is known to 1e-4 or better.
     assert rounding_step_um(rounded) == pytest.approx(step_um, rel=1e-3)
 
 
@@ -49,7 +49,7 @@ def test_rounding_counts_by_the_noise_it_adds_and_is_unknown_without_raw_files()
     def rounding(step_um: float) -> ScanFinding:
         return found_in(scans, {scan.id: step_um for scan in scans})["quantisation"]
 
-    # Uniform noise of a step q has the variance q² / 12.
+    # Rounding to steps of q adds a variance of q² / 12.
     coarse = rounding(0.012 * np.sqrt(12))
     assert coarse.seen
     assert "12 nm rms" in coarse.evidence
@@ -84,12 +84,12 @@ def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_line
 
     long = seen(lines)
     assert long.seen
-    # A mean of 15 pixels keeps 1 - lag/15 of its variance: 3 to 8 pixels apart 0.63 of 400 nm² remain, less
-    # what the means of whole lines take along (15 of 192 pixels, a tenth at most); across there is nothing.
+    # A mean of 15 pixels has a correlation of 1 - lag/15: 3 to 8 pixels apart 0.63 of 400 nm² remain. The
+    # means of whole lines take a tenth of this at most (15 of 192 pixels). Across the lines there is none.
     shared = float(long.evidence.split("share ")[1].split(" nm²")[0])
     assert 0.9 * 0.63 * 400 * 0.9 < shared < 0.63 * 400 * 1.1
     assert not seen([one.T for one in lines]).seen
-    # Offsets of whole lines alone, and over grain, in which they cannot be known exactly.
+    # Offsets of whole lines, alone and with added grain, which hides their exact values.
     offsets = [np.broadcast_to(one[:, :1], one.shape) for one in white]
     assert not seen(offsets).seen
     assert not seen([one.T + own for one, own in zip(white, offsets, strict=True)]).seen
@@ -110,7 +110,7 @@ def test_what_registration_straightened_is_told() -> None:
     assert not found_in(scans)["registration-residual"].seen
     one = found_in([replace(scans[0], bend_um=bend), *scans[1:]])["registration-residual"]
     assert one.seen
-    # Along x, 0.3 (u² - 1/3): largest at u = 1, two thirds of it.
+    # Along x, 0.3 (u² - 1/3) is largest at u = 1: two thirds of 0.3.
     assert "1 of 3 scans, bent by up to 0.20 µm" in one.evidence
 
 

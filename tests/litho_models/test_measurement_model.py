@@ -1,4 +1,4 @@
-"""What scans share beside their prints: planted, found, and nothing invented."""
+"""The model of what scans share besides their prints finds what was planted, and nothing else."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCANS = blank_scans(COUNT, SIZE_PX)
 def relief(
     number: int, shift_x_um: np.ndarray | float = 0.0, shift_y_um: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """A print (ny, nx), µm, as a sum of waves: known at every place, so also displaced."""
+    """Return a print (ny, nx), µm, as a sum of waves, which is known at displaced places too."""
     rng = np.random.default_rng([11, number])
     x = (np.arange(SIZE_PX) * PITCH_UM)[None, :] + shift_x_um
     y = (np.arange(SIZE_PX) * PITCH_UM)[:, None] + shift_y_um
@@ -41,7 +41,7 @@ PRINTS = [relief(number) for number in range(COUNT)]
 def measured(
     seen: Callable[[int], np.ndarray], *, noise_um: float = NOISE_UM, seed: int = 0
 ) -> list[PrintedScan]:
-    """Scans that show ``seen(number)`` (ny, nx), µm, with a datum of their own and white noise."""
+    """Return scans of ``seen(number)`` (ny, nx), µm, each with its own datum and white noise."""
     rng = np.random.default_rng(seed)
     noise = rng.normal(0, noise_um, (COUNT, SIZE_PX, SIZE_PX)) + rng.normal(0, 0.05, (COUNT, 1, 1))
     return with_heights(SCANS, [seen(number) + noise[number] for number in range(COUNT)])
@@ -58,14 +58,14 @@ def part_of(model: MeasurementModel, what: str, by: str) -> SharedPart:
 def left_nm(
     scans: Sequence[PrintedScan], model: MeasurementModel, prints: Sequence[np.ndarray] = PRINTS
 ) -> float:
-    """What the model leaves of scans, rms without each datum, nm."""
+    """Return the rms of the residual, without each scan's datum, nm."""
     left = [scan.height_um - model.expected_um(scan, own) for scan, own in zip(scans, prints, strict=True)]
-    # At the edge a displaced print would have to be looked up beyond it.
+    # Leave out the edge, where a displaced print would be needed beyond the field.
     return 1e3 * float(np.sqrt(np.mean([one[2:-2, 2:-2].var() for one in left])))
 
 
 def levelled(field_um: np.ndarray, levelling: str) -> np.ndarray:
-    """Without the plane (or twist, or bow) that fits best; the mean stays."""
+    """Subtract the plane (or twist, or bow) that fits best, but keep the mean."""
     powers = {1: X, 2: Y, 3: X**2, 4: X * Y, 5: Y**2}
     shapes = np.stack([np.ones_like(X), *(powers[k] for k in LEVELLED[levelling])]).reshape(  # type: ignore[index]
         1 + len(LEVELLED[levelling]),
@@ -80,7 +80,7 @@ def test_predictions_are_levelled_as_the_files_were(levelling: str) -> None:
     scans = measured(lambda number: levelled(PRINTS[number], levelling))
     learned = learn_measurement(scans, PRINTS)
     assert learned.levelling == levelling
-    # White noise is all that is left; a surface that was learned from it adds less than a percent.
+    # The residual is white noise. A surface learned from this noise adds less than a percent.
     assert left_nm(scans, learned) == pytest.approx(1e3 * NOISE_UM, rel=0.02)
 
 
@@ -91,7 +91,7 @@ def test_a_levelled_prediction_has_none_of_the_surface_and_keeps_its_mean() -> N
 
 
 def background(number: int) -> np.ndarray:
-    """A bow along x and a twist in field 2, nothing in field 1, µm."""
+    """Return a bow along x and a twist for field 2, and zero for field 1, µm."""
     return (0.03 * legendre.legval(X, [0, 0, 1]) + 0.02 * X * Y) * in_field(number, "2")
 
 
@@ -108,11 +108,11 @@ def learned(with_background: list[PrintedScan]) -> MeasurementModel:
 def test_a_background_by_field_is_found_to_within_its_noise(
     with_background: list[PrintedScan], learned: MeasurementModel
 ) -> None:
-    # Of what k scans of a field ask for no more than shrinking / (k + shrinking) is lost, however often it is
-    # fitted; half of it may come from what all scans have, the rest from the field.
+    # Shrinking loses at most shrinking / (k + shrinking) of the background of k scans of a field, however
+    # often the fit is repeated. Half of the background may go to all scans, the rest to the field.
     shrinking = part_of(learned, "background", "field").shrinking
     lost = shrinking / (COUNT / 2 + shrinking) * background(1).std()
-    # A part of p numbers has p pixels' worth of noise in each field.
+    # A part of p numbers takes up the noise of p pixels in each field.
     noise = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
     for number in range(COUNT):
         assert (learned.background_um(SCANS[number]) - background(number)).std() < lost + 2 * noise
@@ -130,7 +130,7 @@ def test_what_one_group_has_leaves_every_other_scan_untouched(learned: Measureme
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_displacement_in_one_field_is_found(axis: str) -> None:
-    """Under a pixel, S-shaped along x: the scan shows at x what lies at x + shift."""
+    """A shift below one pixel, S-shaped along x: at x the scan shows the print at x + shift."""
     size_um = 0.08
     shift = size_um * legendre.legval(X, [0, 0, 0, 1])
 
@@ -140,16 +140,16 @@ def test_a_displacement_in_one_field_is_found(axis: str) -> None:
 
     scans = measured(seen)
     learned = learn_measurement(scans, PRINTS)
-    # Half of it may be taken for what all scans have, the rest for the difference: the sum is what counts.
+    # Half of the shift may go to all scans, the rest to the difference. Only the sum is compared.
     parts = [part for part in learned.parts if part.what == f"shift-{axis}"]
     assert "field" in {part.by for part in parts}
     kept = min(COUNT / 2 / (COUNT / 2 + part.shrinking) for part in parts)
 
     def total(field: str) -> np.ndarray:
-        # 1, x, y, P2(x), x y, P2(y), P3(x): the last is what was planted.
+        # The shapes are 1, x, y, P2(x), x y, P2(y), P3(x). The last one was planted.
         return np.sum([part.coefficients.get(field, part.coefficients.get("")) for part in parts], axis=0)
 
-    # Slopes differ from place to place, so that the shapes are not quite apart: a twentieth.
+    # Slopes vary over the field, so the shapes are not quite independent: a twentieth is allowed.
     assert total("2")[6] == pytest.approx(size_um, rel=0.05 + 1 - kept)
     assert np.abs(total("1")).max() < (0.05 + 1 - kept) * size_um
     assert left_nm(scans, learned) < 1e3 * NOISE_UM * 1.15 < 0.6 * left_nm(scans, made())
@@ -160,7 +160,7 @@ def test_a_gain_by_print_is_found() -> None:
     scans = measured(lambda number: PRINTS[number] * (1 + gains[SCANS[number].print_id]))
     part = part_of(learn_measurement(scans, PRINTS), "gain", "print")
     kept = 2 / (2 + part.shrinking)
-    # Shrunk by the mean size of all reliefs, which are not of one size: within a fifth.
+    # Shrinking uses the mean size of all reliefs, whose sizes differ: a fifth is allowed.
     for label, gain in gains.items():
         assert part.coefficients[label][0] == pytest.approx(gain * kept, abs=0.2 * 0.05)
 
@@ -170,15 +170,15 @@ def test_next_to_nothing_is_learned_from_noise(seed: int) -> None:
     scans = measured(lambda number: PRINTS[number], seed=seed)
     learned = learn_measurement(scans, PRINTS, seed=seed)
     added = [learned.expected_um(scan, own) - own for scan, own in zip(scans, PRINTS, strict=True)]
-    # p numbers fit p pixels' worth of white noise; the largest part has 35 in each of 2 fields.
+    # p numbers fit the white noise of p pixels. The largest part has 35 numbers in each of 2 fields.
     limit_um = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
     assert np.sqrt(np.mean([one.var() for one in added])) < 2 * limit_um
-    # One of all that is offered may pass by chance.
+    # One of all parts that are tried may pass by chance.
     assert len(learned.parts) <= 1
 
 
 def test_scans_that_did_not_take_part_are_freed_too(with_background: list[PrintedScan]) -> None:
-    """What a field does is learned on three prints and predicts the fourth."""
+    """The background of a field is learned on three prints and predicts the fourth."""
     scans, prints = with_background[6:], PRINTS[6:]
     learned = learn_measurement(with_background[:6], PRINTS[:6])
     assert left_nm(scans, learned, prints) < 0.6 * left_nm(scans, made(), prints)

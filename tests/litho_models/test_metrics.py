@@ -1,4 +1,4 @@
-"""Error figures: closed forms, coverage of the intervals, exact sign-flip p."""
+"""Error figures follow closed forms; intervals have their coverage, sign-flip p values are exact."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scored(height, prediction, policy="offset"):
 def test_constant_error_is_bias_and_vanishes_when_the_datum_is_free():
     prediction = np.random.default_rng(0).uniform(0, 1, VALID.shape)
     score = scored(prediction - 0.052, prediction)
-    # Measured minus predicted: a print lower than the model says has a negative bias.
+    # The bias is measured minus predicted, so a print lower than predicted has a negative bias.
     assert score.bias_nm == pytest.approx(-52)
     assert score.mae_abs_nm == pytest.approx(52)
     assert score.mae_datum_free_nm < 1e-9
@@ -37,7 +37,7 @@ def test_gaussian_noise_has_a_mean_absolute_error_of_0_798_sigma():
     random = np.random.default_rng(1)
     noise = random.normal(0, 0.01596, VALID.shape)
     score = scored(noise, np.zeros(VALID.shape), "none")
-    # 65,536 pixels: |n| has a relative standard error of 0.756/256 = 0.3 %; three times that.
+    # The mean |n| of 65,536 pixels has a relative standard error of 0.756/256 = 0.3 %; three are allowed.
     assert score.mae_datum_free_nm == pytest.approx(15.96 * np.sqrt(2 / np.pi), rel=0.009)
     assert score.rmse_datum_free_nm == pytest.approx(15.96, rel=0.009)
     assert score.median_abs_datum_free_nm == pytest.approx(15.96 * 0.67449, rel=0.015)
@@ -59,14 +59,14 @@ def test_the_error_of_the_gain_is_that_of_repeated_prints():
     prediction = 0.6 + 0.2 * gaussian_filter(random.normal(size=VALID.shape), 4) * 14
     found = []
     for _ in range(300):
-        # Correlated over 7 px, as the residual of measured prints is, and rougher where it is high.
+        # The residual is correlated over 7 px, as on measured prints, and rougher where the print is high.
         noise = 0.1 * gaussian_filter(random.normal(size=VALID.shape), 3) * (0.5 + prediction)
         found.append(print_gain(0.9 * prediction + 0.03 + noise, prediction, VALID))
     slopes = np.array([line.slope for line in found])
-    # 300 repeats know a standard deviation to 4 %; 64 blocks know theirs to 9 % each time, and lose a few
-    # per cent of it to what neighbouring blocks share.
+    # The standard deviation of 300 repeats is known to 4 %, that of 64 blocks to 9 % each time. Correlation
+    # between neighbouring blocks lowers it by a few per cent.
     assert np.mean([line.slope_error for line in found]) == pytest.approx(slopes.std(), rel=0.15)
-    # Taken for independent, the same pixels would promise several times too much.
+    # If the pixels were taken as independent, the stated error would be several times too small.
     naive = noise.std() / (prediction.std() * np.sqrt(VALID.size))
     assert slopes.std() > 3 * naive
 
@@ -102,13 +102,13 @@ def test_prints_are_resampled_and_flipped_whole():
     groups = [print_ for print_ in "abcdef" for _ in range(scans_of_each)]
     better = over_units([1.0] * len(groups), groups)
     assert (better.count, better.positive) == (prints, prints)
-    # Twenty-four scans that agree, and yet no smaller p than six prints can have.
+    # Twenty-four scans agree, yet p is no smaller than six prints allow.
     assert better.p == smallest_flip_p(prints) == 1 / 32
-    # Groups of one scan are the scans themselves.
+    # With one scan per group the result is that of the scans.
     values = np.random.default_rng(5).normal(size=8).tolist()
     assert over_units(values) == over_units(values, list("abcdefgh"))
-    # What differs from print to print only is as uncertain as the mean of the prints: sd / sqrt(6) each way,
-    # against sd / sqrt(24) if its scans counted as independent. Percentiles of 6 values: within a third.
+    # If only prints differ, the half-width is that for the mean of prints, sd / sqrt(6). Independent scans
+    # would give sd / sqrt(24). Percentiles of 6 values are right within a third.
     shifts = np.random.default_rng(6).normal(size=prints)
     values = np.repeat(shifts, scans_of_each).tolist()
     low, high = bootstrap_interval(values, groups=groups)
@@ -118,7 +118,7 @@ def test_prints_are_resampled_and_flipped_whole():
 
 
 def test_prints_of_unequal_size_count_by_their_scans():
-    # Three scans at 0, one at 4: the mean over scans is 1, over prints it would be 2; no draw leaves 0 ... 4.
+    # Three scans at 0, one at 4: the mean over scans is 1, over prints 2. Every draw lies in 0 ... 4.
     low, high = bootstrap_interval([0.0, 0.0, 0.0, 4.0], groups=list("aaab"))
     assert (low, high) == (0.0, 4.0)
 
@@ -132,7 +132,7 @@ def test_sampled_and_exact_p_agree():
     difference = random.normal(0.6, 1.0, 14)
     exact = over_units(difference.tolist()).p
     sampled = over_units([*difference.tolist(), 0.0]).p
-    # A scan without difference changes nothing but the way p is computed; 9,999 draws: 3 standard errors.
+    # A scan without difference only makes p be sampled. 9,999 draws; three standard errors are allowed.
     assert sampled == pytest.approx(exact, abs=3 * np.sqrt(exact * (1 - exact) / 9999) + 1e-4)
 
 

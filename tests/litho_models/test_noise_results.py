@@ -1,4 +1,4 @@
-"""The page on noise quotes the committed results of virtual prints, and they find what was planted."""
+"""The page on noise quotes the committed results of virtual prints, which agree with what was planted."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def test_the_page_quotes_the_committed_results(mark):
     assert published(virtual_noise.PAGE, mark) == virtual_noise.texts(virtual_noise.FOLDER)[mark]
 
 
-def test_no_dose_and_no_roughness_is_off_what_was_planted():
+def test_doses_and_roughness_agree_with_what_was_planted():
     doses = NoiseAnalysis.read(virtual_noise.FOLDER / virtual_noise.DOSES)
     assert doses.dose.recommended_dose == 1.0
     gains = [row.height_gain for row in doses.dose.rows]
     assert gains == sorted(gains)
     found = NoiseAnalysis.read(virtual_noise.FOLDER / virtual_noise.REFERENCES)
-    # 30,000 pixels know σ to 1 %; what `features` lacks of the printer adds as little.
+    # 30,000 pixels give σ to 1 %. The model error of `features` adds as little.
     assert found.budget.floor.at("full").rmse_nm == pytest.approx(Noise().roughness_nm, rel=0.02)
 
 

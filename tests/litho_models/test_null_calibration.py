@@ -1,4 +1,4 @@
-"""The null calibration plants nothing, and the page says what came out."""
+"""The null calibration plants no cause, and the page quotes its result."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def test_the_page_quotes_the_committed_calibration() -> None:
     assert false <= null_calibration.most_at_the_rate(len(record["stores"]))
 
 
-def test_so_many_are_consistent_with_the_rate_and_one_more_is_not() -> None:
-    # Six or more of 40 have a probability of 0.014, five or more 0.048.
+def test_five_of_40_are_consistent_with_the_rate_and_six_are_not() -> None:
+    # At the stated rate six or more of 40 have a probability of 0.014, five or more of 0.048.
     assert null_calibration.most_at_the_rate(40) == 5
 
 
@@ -30,8 +30,8 @@ def test_scans_of_one_store_share_the_model_and_nothing_else() -> None:
     scans = null_calibration.null_scans(1)
     assert len(scans) == null_calibration.SCANS
     heights = np.stack([scan.height_um for scan in scans]).astype(np.float64)
-    # Roughness of 16 nm has correlations of under 1 µm; between scans nothing is shared but the layout's
-    # statistics, so the correlation of two maps stays within a few of 1 / sqrt(places of 2 µm in 19 µm).
+    # The roughness of 16 nm is correlated over less than 1 µm. Two scans share only the layout's statistics,
+    # so their maps correlate by no more than a few times 1 / sqrt(places of 2 µm in 19 µm).
     maps = heights - heights.mean(axis=(1, 2), keepdims=True)
     cosine = np.corrcoef(maps.reshape(len(maps), -1))
     assert np.abs(cosine - np.eye(len(maps))).max() < 5 / np.sqrt(9.6**2)

@@ -1,4 +1,4 @@
-"""A model of one's own goes by its name: trained, frozen, loaded."""
+"""A user's own model can be trained, frozen and loaded by its name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_example_trains_freezes_and_loads_its_model_by_name(tmp_path, monkey
     own_simulator.main()
     assert "two-spots is frozen" in capsys.readouterr().out
     model = load_frozen(tmp_path / "model").simulator
-    # The printer of these scans has one spot of 0.25 µm; what it saturates, two spots take for some width.
+    # The printer of these scans has one spot of 0.25 µm. Two spots describe its saturation as extra width.
     narrow = model.ranges["narrow"].value(model.narrow).item()
     assert narrow == pytest.approx(0.25, rel=0.3)
     with pytest.raises(InputError, match="not taken"):

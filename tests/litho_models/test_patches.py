@@ -1,4 +1,4 @@
-"""Patches are pieces of the scans of a store, where they say, and never of a locked one."""
+"""Patches are pieces of a store's scans, at the stated positions, and never of locked scans."""
 
 from __future__ import annotations
 
@@ -67,5 +67,5 @@ def test_what_cannot_be_drawn_is_one_line(store: Store, settings: dict, message:
         PatchDataset(store, **{"size_px": SIZE_PX, **settings})
 
 
-def test_a_path_will_do(store: Store) -> None:
+def test_a_path_is_accepted_in_place_of_a_store(store: Store) -> None:
     assert PatchDataset(Path(store.path), size_px=SIZE_PX).ids == PatchDataset(store, size_px=SIZE_PX).ids

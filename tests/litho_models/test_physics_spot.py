@@ -1,4 +1,4 @@
-"""The spot of Physics: given, fitted round, or fitted with a width along each axis."""
+"""The spot of Physics is given, fitted as a circle, or fitted with one width per axis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTHS = {"round": ("spot",), "elliptical": ("spot_y", "spot_x")}
 
 
 def model_of(kind: str, **widths_um: float) -> Simulator:
-    """Physics with a short diffusion and these widths (``spot``, ``spot_y``, ``spot_x``), float64."""
+    """Return Physics with a short diffusion and the widths ``spot`` or ``spot_y``, ``spot_x``, in float64."""
     model = build_model(
         "physics", pitch_um=PITCH_UM, level_height_um=0.1, levels=13, spot=kind, sigma_diffusion_init_um=0.3
     ).double()
@@ -25,7 +25,7 @@ def model_of(kind: str, **widths_um: float) -> Simulator:
 
 
 def layout(seed: int = 0) -> torch.Tensor:
-    """Blocks of random levels, (1, 1, 40, 48) µm."""
+    """Return blocks of random levels, (1, 1, 40, 48) µm."""
     coarse = (
         torch.randint(0, 13, (1, 1, 10, 12), generator=torch.Generator().manual_seed(seed)).double() * 0.1
     )
@@ -42,14 +42,14 @@ def test_a_spot_has_as_many_numbers_as_it_has_widths(spot: str, count: int) -> N
     model = model_of(spot)
     assert len(list(model.parameters())) == len(list(model_of("given").parameters())) + count
     widths = {name: float(value) for name, value in model.values.items() if "spot" in name}
-    # Before a fit they are what is given.
+    # Before a fit the widths are the given ones.
     assert list(widths.values()) == pytest.approx([0.2] * count)
 
 
 def test_spots_of_the_same_width_print_the_same() -> None:
     prints = [printed(model_of(spot), layout()) for spot in SPOTS]
     for other in prints[1:]:
-        # The given width is a number of float32.
+        # The given width is kept in float32.
         torch.testing.assert_close(other, prints[0], rtol=0, atol=1e-7)
 
 
@@ -70,14 +70,14 @@ def test_an_edge_is_blurred_by_the_width_across_it(axis: str) -> None:
         printed(model_of("elliptical", **{f"spot_{axis}": own, f"spot_{other}": its}), field)
         for own, its in ((0.15, 0.1), (0.15, 0.4), (0.3, 0.1))
     )
-    # Both kernels end with the wider one, after 4 sigma: 6e-5 of a step.
+    # Both kernels end where the wider one does, after 4 sigma. This cuts 6e-5 of a step.
     torch.testing.assert_close(wide, narrow, rtol=0, atol=6e-5)
     assert (across - narrow).abs().max() > 0.02
 
 
 @pytest.mark.parametrize("spot", ["round", "elliptical"])
 def test_derivatives_by_the_widths_are_difference_quotients(spot: str) -> None:
-    # The kernel ends at a whole pixel: here the widths change without it.
+    # The kernel ends at a whole pixel. Here the widths change without moving this end.
     model, field = model_of(spot, **dict.fromkeys(WIDTHS[spot], 0.21)), layout()
     weight = torch.linspace(-1, 1, field.numel(), dtype=torch.float64).reshape(field.shape)
     (model(field) * weight).sum().backward()
@@ -90,12 +90,12 @@ def test_derivatives_by_the_widths_are_difference_quotients(spot: str) -> None:
                 values.append(float((printed(model, field) * weight).sum()))
                 parameter.data -= sign * step
             assert parameter.grad is not None
-            # Central differences leave a step squared times the third derivative of a sum of hundreds.
+            # Central differences are off by step² times the third derivative of a sum of hundreds of terms.
             assert float(parameter.grad) == pytest.approx((values[0] - values[1]) / (2 * step), abs=1e-5)
 
 
 @pytest.mark.parametrize("spot", SPOTS)
-def test_what_is_inside_is_printed_alike_without_its_surroundings(spot: str) -> None:
+def test_the_inner_part_of_a_field_prints_the_same_without_its_surroundings(spot: str) -> None:
     model, field = model_of(spot), layout()
     reach = model.reach_px
     assert reach is not None

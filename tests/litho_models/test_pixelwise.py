@@ -1,4 +1,4 @@
-"""A function of each pixel in blocks: the values and gradients of all pixels at once."""
+"""A function of single pixels has the same values and gradients in blocks as for all pixels at once."""
 
 from __future__ import annotations
 

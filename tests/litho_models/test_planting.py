@@ -1,4 +1,4 @@
-"""How small an effect would be found: a large one planted in copies is, a tiny one is not, the data stay."""
+"""Effects planted in copies of the data show how small an effect would be found. The data do not change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAW = "height-times-slope-size-x"
 
 
 def closed_on(scans: Sequence[PrintedScan]) -> Closed:
-    """The search among two laws, and nothing else of the loop."""
+    """Run only the loop's search, among two laws."""
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
     found = search(base, [get_effect(LAW), get_effect("height-power-2")])
@@ -40,7 +40,7 @@ def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they
     assert large.found == pytest.approx(0.04, rel=0.05)
     assert (tiny.named, tiny.found) == ([], None)
     assert all((a.height_um == b).all() for a, b in zip(scans, before, strict=True))
-    # So much smaller that the change is linear in the amount.
+    # Both amounts are so small that the change is proportional to the amount.
     assert large.rms_nm / tiny.rms_nm == pytest.approx(0.04 / 0.0002, rel=1e-2)
     changes = []
     for scan in closed.given.scans:

@@ -1,4 +1,4 @@
-"""A frozen model prints in the precision it is asked for; one that loses on this processor is warned of."""
+"""A frozen model predicts in the chosen precision, with a warning if that is slower on this processor."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_precision_holds_inside_the_block_and_nowhere_else(effects, pbl, tmp_pat
     with pytest.raises(KeyError), frozen.at_precision("bfloat16"):
         raise KeyError
     assert max(off_by(a, b) for a, b in zip(printed(), before, strict=True)) < 1e-6
-    # Five layers of products that bfloat16 rounds by up to 2^-9, next to what does not pass the network.
+    # bfloat16 rounds the products of five layers by up to 2^-9. The part that bypasses them is exact.
     assert 1e-5 < off_by(reduced[1], before[1]) < 0.03
     assert 1e-5 < off_by(reduced[0], before[0]) < 0.01
 

@@ -1,4 +1,4 @@
-"""Predicting layouts as people hold them: every kind of array, and a file, give the model's heights."""
+"""Layouts as any kind of array, or as a file, give the heights that the model predicts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LEVELS = np.random.default_rng(4).integers(0, 13, (2, 3, 40, 52))
 def test_every_kind_and_shape_gives_what_forward_gives(model):
     layout = (LEVELS * 0.1).astype(np.float32)
     wanted = model(torch.from_numpy(layout).reshape(6, 1, 40, 52)).reshape(2, 3, 40, 52).numpy()
-    # Fields one by one or together: sums in another order, a few units of float32 in about 1 µm.
+    # A batch sums in another order than single fields: a few float32 roundings of about 1 µm.
     near = {"rtol": 0, "atol": 2e-6}
     np.testing.assert_allclose(model.predict(layout), wanted, **near)
     np.testing.assert_allclose(model.predict(layout.astype(np.float64))[1, 2], wanted[1, 2], **near)
@@ -68,7 +68,7 @@ def test_gradients_flow_through_a_tensor(model):
         (xr.DataArray(np.zeros((9, 9)), dims=("y", "x"), coords={"y_um": ("y", np.arange(9.0))}), "0.1 µm"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_one_line(model, layout, said):
+def test_an_invalid_layout_is_refused_in_one_line(model, layout, said):
     with pytest.raises(InputError, match=said):
         model.predict(layout)
     with pytest.raises(InputError, match="pitch_um"):
@@ -84,7 +84,7 @@ def test_a_file_of_levels_becomes_a_height_map_that_can_be_read_again(folder, mo
     assert "40 x 52 px" in said.output
     scan = read_scan(out)
     wanted = model.predict(levels * np.float32(0.1))
-    # Metres in float32: 1 µm is kept to 1e-7 of itself.
+    # The file has metres in float32, which keep 1 µm to 1e-7 of its value.
     np.testing.assert_allclose(scan.height_um, wanted, rtol=0, atol=1e-6)
     assert scan.pitch_um == pytest.approx((0.1, 0.1))
 

@@ -1,4 +1,4 @@
-"""Scan terms: what lies in their span vanishes, what does not stays, and no pixel judges itself."""
+"""Scan terms remove only errors within their span, and no pixel is scored by its own calibration."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_lines_are_estimated_beyond_a_gap_on_the_other_side(axes):
     for cell in cells:
         for axis, other in cell.other_side.items():
             scored, used = place[axis][cell.score], place[axis][other]
-            # Every pixel used is 32 px or more away along the line from every pixel scored.
+            # Along a line every calibration pixel is at least 32 px away from every scored pixel.
             assert min(abs(int(used.min()) - scored.max()), abs(int(used.max()) - scored.min())) > 32 - 1
             assert other.any()
 
@@ -73,7 +73,7 @@ def test_the_catalogue_is_complete_and_consistent():
     assert np.allclose(term_maps(TermPixels(pixels.prediction_um, at=some), SCAN_TERMS), everything[:, some])
     for term in chosen_terms(SCAN_TERMS):
         assert (term.maps is None) != (term.lines is None)
-        # What a scan adds leaves its datum alone, unless it is the datum; displacements follow the slopes.
+        # No term except the datum has a mean. Displacement terms are proportional to the slopes.
         if term.maps is not None and term.unit != "px" and term.name != "offset":
             assert np.abs(term.maps(pixels).mean(axis=1)).max() < 1e-12
 
@@ -121,7 +121,7 @@ def test_terms_of_the_policy_vanish_exactly(scan, policy):
     basis = term_maps(TermPixels(prediction), POLICIES[policy])
     added = (np.linspace(0.02, -0.03, len(basis)) @ basis).reshape(SHAPE)
     free = cross_fit(prediction + added, prediction, valid, POLICIES[policy])
-    # Double precision, a handful of terms of order one.
+    # A few terms of order one, in double precision.
     assert np.nanmax(np.abs(free.residual_um)) < 1e-12
 
 
@@ -138,7 +138,7 @@ def test_offset_of_one_half_is_estimated_on_the_other(scan):
     first, second = checkerboard(SHAPE, Blocks())
     height = prediction + np.where(first.score, 0.1, 0.0)
     free = cross_fit(height, prediction, valid, POLICIES["offset"])
-    # Each half is freed of the other's offset: the difference shows twice and never cancels.
+    # The offset of one half is subtracted from the other, so the difference shows twice and never cancels.
     assert np.allclose(free.residual_um[first.score], 0.1)
     assert np.allclose(free.residual_um[second.score], -0.1)
 
@@ -148,8 +148,8 @@ def test_noise_is_not_fitted_away():
     prediction = random.uniform(0.2, 0.8, (512, 512))
     noise = random.normal(0, 0.016, prediction.shape)
     free = cross_fit(prediction + noise, prediction, np.ones(noise.shape, bool), POLICIES["full+rows"])
-    # White noise, no line offsets: shrinkage leaves them at zero, and seven terms on about 80,000
-    # calibration pixels cost 16 nm * sqrt(7 / 80000) = 0.15 nm in quadrature, below 0.1 %.
+    # White noise has no line offsets, so shrinkage keeps them at zero. Seven terms from about 80,000
+    # calibration pixels add 16 nm * sqrt(7 / 80000) = 0.15 nm in quadrature, below 0.1 %.
     assert np.nanstd(free.residual_um) == pytest.approx(noise.std(), rel=1e-3)
     assert free.line_sd_um < 0.0005
 
@@ -161,9 +161,9 @@ def test_line_offsets_are_recovered_and_shrunk():
     prediction = random.uniform(0.2, 0.8, shape)
     height = prediction + offsets[:, None] + random.normal(0, noise, shape)
     free = cross_fit(height, prediction, np.ones(shape, bool), POLICIES["full+rows"])
-    # 512 offsets fix their standard deviation to 1/sqrt(2*512) = 3 %; three times that.
+    # The standard deviation of 512 offsets is known to 1/sqrt(2*512) = 3 %. Three times this is allowed.
     assert free.line_sd_um == pytest.approx(sd, rel=0.1)
-    # 224 pixels beyond the gap leave 16/15 = 1.1 nm: sqrt(16² + 1.1²) = 16.04 nm.
+    # An offset from 224 pixels beyond the gap has an error of 16/15 = 1.1 nm: sqrt(16² + 1.1²) = 16.04 nm.
     assert np.nanstd(free.residual_um) == pytest.approx(np.hypot(noise, noise / 15), rel=0.01)
     assert 300 < free.degrees_of_freedom - 7 < 512
 
@@ -197,15 +197,15 @@ def test_scan_lines_of_a_bent_scan_are_the_lines_it_was_scanned_in():
     shape, pitch_um = (120, 140), (0.1, 0.1)
     bend = Bend.of_scan(np.array([[0.1, -0.05, 0.1], [0.15, 0.1, -0.2]]), shape, pitch_um)
     line = scan_line_index(shape, np.eye(3), 0.1, bend)
-    # A scan whose height is its place across the lines, in pixels, registered. A spline reproduces a ramp
-    # but for its mirrored ends, which decay by 0.27 per pixel: 1e-5 after 9; float32 is good to 1e-5.
+    # A registered scan whose height is the position across the lines, in pixels. A spline reproduces a ramp
+    # except near its mirrored ends. Their effect decays by 0.27 per pixel to 1e-5 after 9, as float32 has.
     ramp = np.broadcast_to(np.arange(shape[0])[:, None] + 0.5, shape)
     height, valid = resample_to_layout(
         ramp, np.eye(3), shape, scan_pitch_um=pitch_um, layout_pitch_um=0.1, bend_um=bend
     )
     clear = valid & (np.abs(height - np.rint(height)) > 1e-4) & (height > 9) & (height < shape[0] - 9)
     assert np.ptp(np.floor(height[clear]) - line[clear]) == 0
-    # Without the bend the lines would be rows; it moves places by up to 0.4 µm.
+    # Without the bend the lines would be rows. The bend moves positions by up to 0.4 µm.
     assert np.ptp(line - np.arange(shape[0])[:, None]) > 2
 
 
@@ -214,20 +214,20 @@ def test_what_a_bent_scan_does_not_show_is_in_its_first_or_last_line():
     # The layout begins 10 px above the scan's first line and ends 10 px below its last.
     ten_px_down = np.array([[1, 0, 0], [0, 1, 1.0], [0, 0, 1]])
     line = scan_line_index((60, 40), ten_px_down, 0.1, bend)
-    # A place on the border of two lines may round into either, so it is the number of lines that is exact.
+    # A position between two lines may round to either, so only the number of lines is exact.
     assert line.max() == 39
     assert (line[:10] == 0).all()
     assert (line[50:] == 39).all()
 
 
 def test_roughness_beside_the_scored_pixels_is_not_taken_for_an_offset_of_the_line():
-    """What hangs together over 20 px along x reads as an offset beside it, and not across the gap."""
+    """Roughness correlated over 20 px along x looks like an offset next to it, but not across the gap."""
     random = np.random.default_rng(6)
     shape = (128, 256)
     rough = gaussian_filter(random.normal(size=shape), (0, 15.0))
     rough *= 0.01 / rough.std()
     prediction, valid = np.zeros(shape), np.ones(shape, bool)
-    # Gap of 1 px: what follows the split is scored by its neighbours.
+    # With a gap of 1 px the pixels next to the split are scored by their neighbours.
     near, far = (
         cross_fit(rough, prediction, valid, frozenset({"offset", "layout-rows"}), Blocks(line_gap_px=gap))
         for gap in (0, 32)

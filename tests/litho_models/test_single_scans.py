@@ -1,4 +1,4 @@
-"""What single scans add is recognised for what it is, and what all of them share is not put down to them."""
+"""Errors of single scans are recognised, and errors that all scans share are not attributed to them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from litho_models.scan_terms import SCAN_TERMS
 from litho_models.scan_terms.measurement_fit import learn_measurement
 from tests.litho_models.loop_scans import base_model, planted, study_of, with_heights
 
-# Offsets of lines need two blocks of 32 px and a gap as wide on either side of what they are judged on.
+# Offsets of lines need two blocks of 32 px, with gaps as wide on both sides of the scored pixels.
 SIZE_PX, SMALL_PX = 160, 64
 # A scan line crosses four rows of the layout.
 ANGLE = np.deg2rad(1.5)
 TURNED = np.array([[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]])
-# Neither by print nor by field; their standard deviation is 1.05.
+# Depend neither on the print nor on the field. Their standard deviation is 1.05.
 SIGNS = (1, -1, -1, 1, 1, 1, -1, 1, -1, -1)
 Change = Callable[[PreparedScan, np.random.Generator], np.ndarray]
 
@@ -35,9 +35,9 @@ def truths(scans: Sequence[PreparedScan]) -> list[np.ndarray]:
 def found_with(
     change: Change, size_px: int = SIZE_PX, *, turned: bool = False, shared_known: bool = False, seed: int = 0
 ) -> dict[str, ScanFinding]:
-    """What is found on ten scans with a change of their heights (y, x), µm, beside a datum each.
+    """Return what is found in ten scans with changed heights (y, x), µm, and a datum each.
 
-    ``shared_known``: beside maps that have what all scans share.
+    ``shared_known``: whether the predicted maps already contain what all scans share.
     """
     random = np.random.default_rng(seed)
     scans = planted(size_px=size_px, seed=seed)
@@ -62,7 +62,7 @@ def nothing(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
 
 
 def stripes(size_um: float, *, written: bool = False) -> Change:
-    """An offset of each scan line, or of each row of the layout."""
+    """Return a function that adds an offset to each scan line, or to each row of the layout."""
 
     def change(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
         line = np.indices(scan.usable.shape)[0] if written else scan.line
@@ -77,12 +77,12 @@ def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect}
     spread = found["datum-offset"].spread["offset_um"]
     assert spread.ci95 is not None
-    # As drawn: of the base's own offset all scans have the same.
+    # The datums as drawn. The base's offset is the same for all scans.
     scans = planted(size_px=SMALL_PX)
     drawn = [
         np.mean(scan.height_um - own) for scan, own in zip(scans, truths(prepare_scans(scans)), strict=True)
     ]
-    # White noise of 4 nm on 4,096 pixels: 0.06 nm.
+    # White noise of 4 nm gives the mean of 4,096 pixels an error of 0.06 nm.
     assert spread.value == pytest.approx(np.std(drawn, ddof=1), rel=0.02)
     assert spread.ci95[0] < spread.value < spread.ci95[1]
 
@@ -91,11 +91,11 @@ def test_stripes_are_told_from_columns_and_not_from_the_rows_that_they_lie_on() 
     found = found_with(stripes(0.004))
     one = found["scan-line-stripes"]
     assert one.seen
-    # No scan is turned: the lines could as well have been written so.
+    # No scan is turned, so the printer could also have written these lines.
     assert one.confusable_with == ["line-roughness"]
     assert "line-roughness" not in seen(found)
     assert "cannot be told from scan-line-stripes" in found["line-roughness"].evidence
-    # Of 1,600 lines with a noise of 4 / sqrt(64) nm each; a line is known from the other side of its scan.
+    # The error of 1,600 lines with noise of 4 / sqrt(64) nm each, measured on the other side of the scan.
     assert one.spread["sd_um"].value == pytest.approx(0.004, rel=0.08)
     lines = stripes(0.004)
     both = found_with(lambda scan, random: lines(scan, random) + lines(scan, random).T)
@@ -122,7 +122,7 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
     def bent(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
-        # 0.1 µm at the rim against the middle, freed of its mean; one sign for all, or one for each.
+        # A shift of 0.1 µm at the rim against the middle, with zero mean. Signs are equal, or they vary.
         size_um = 0.1 if shared else 0.1 * SIGNS[scan.stored.order]
         height = np.asarray(scan.stored.height_um, np.float64)
         rows, columns = np.indices(height.shape, dtype=float)
@@ -134,14 +134,14 @@ def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans
     assert found.seen is not shared
     spread = found.spread["x_by_xx_um"]
     assert spread.unit == "µm"
-    # A central difference sees sin(k) / k of a slope, 0.84 at a wavelength of 6 px: what it explains by a
-    # displacement it takes for a larger one.
+    # A central difference gives sin(k) / k of a slope, 0.84 at a wavelength of 6 px, so the fitted
+    # displacement is too large.
     assert (spread.value < 0.01) if shared else (0.105 < spread.value < 0.105 / 0.8)
 
 
 @pytest.mark.parametrize("of_prints", [True, False])
 def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints: bool) -> None:
-    """Five prints of two scans each; the same gains, by print or across prints."""
+    """Five prints of two scans each have the same set of gains, either by print or mixed."""
     gains = 0.02 * np.repeat([-2, -1, 0, 1, 2], 2)
     gains = gains if of_prints else np.roll(gains, 1)
 
@@ -155,7 +155,7 @@ def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints
     assert one.spread["gain"].value == pytest.approx(np.std(gains, ddof=1), rel=0.05)
 
 
-# Mains hum: lines that repeat every 1.3 µm, in each scan with another phase.
+# Mains hum: lines that repeat every 1.3 µm, with another phase in each scan.
 
 
 def humming(hum_um: float) -> Change:
@@ -172,9 +172,9 @@ def test_a_hum_is_found_with_its_period_and_its_share() -> None:
     said = found_with(humming(0.004), seed=1)["scan-line-stripes"].evidence
     period_um = float(said.split("repeat every ")[1].split(" µm")[0])
     share = float(said.split("with ")[-1].split(" %")[0]) / 100
-    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide; its centre of mass is known better.
+    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide. The centre of mass is more accurate.
     assert period_um == pytest.approx(1.3, abs=0.05)
-    # 4² / 2 = 8 nm² of hum beside 3² = 9 nm² of chance.
+    # The hum has 4² / 2 = 8 nm², and the random part 3² = 9 nm².
     assert share == pytest.approx(8 / 17, abs=0.15)
 
 
@@ -193,7 +193,7 @@ def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_t
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_lines_that_a_scan_is_held_against_are_of_other_folds(axis: int) -> None:
-    """Its own heights, and those of its fold, move nothing of what all are said to share."""
+    """Heights of a scan and of its fold do not change the shared lines with which the scan is compared."""
     scans = planted(count=6)
     study = study_of(scans)
     maps = truths(study.scans)
