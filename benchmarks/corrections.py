@@ -129,7 +129,10 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         for (relief, judge), rows in groups.items()
     ]
     heads = ("relief", "printed by", *COLUMNS.values())
-    note = f"rms error of the print, its offset free, nm; reliefs 0.6 µm high on {record['size_px']} px."
+    note = (
+        "Rms error of the print in nm, without its mean error; the reliefs are 0.6 µm high and "
+        f"{record['size_px']} px wide."
+    )
     return f"{summary(record['rows'])}\n\n{markdown_table(heads, lines, note)}"
 
 

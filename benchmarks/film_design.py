@@ -141,7 +141,7 @@ def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.
     for axes, (kind, height_um) in zip(others, prints.items(), strict=True):
         axes.imshow(wanted_um[cut], cmap="Greys_r", alpha=0.5)
         axes.contour(height_um[cut], [wanted_um.max() / 2], colors=["#c23b22"], linewidths=1.3)
-        axes.set_title(f"film wanted, edges of the {kind} print", fontsize=9)
+        axes.set_title(f"wanted film, edges of the {kind} print", fontsize=9)
     for axes in (first, *others):
         axes.set_axis_off()
     return figure

@@ -79,7 +79,7 @@ def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
     build_dataset(card, own / "films.zarr")
     result = close_loop(own / "films.zarr", own / "loop", base=process, base_settings=BASES[process])
     shutil.rmtree(own / "fab")
-    named = [{one.name, *one.confusable_with} for one in result.effects]
+    named = [{one.name, *one.confusable_with} for one in result.effects if one.knowledge == "cause"]
     wanted = [EFFECTS[trial.cause]] if trial.cause else []
     before, after = result.error("base"), result.error("all")
     assert before is not None
@@ -89,6 +89,7 @@ def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
         "planted": trial.cause or "nothing",
         "knobs": vars(trial.knobs),
         "named": [sorted(names) for names in named],
+        "laws": [one.name for one in result.effects if one.knowledge == "law"],
         "right": len(named) == len(wanted) and all(one in named[0] for one in wanted),
         "edges_nm": [before.leading_nm, after.leading_nm],
     }
@@ -97,6 +98,7 @@ def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
 def line_of(row: Mapping[str, Any]) -> str:
     """One trial in a line."""
     named = "; ".join(" or ".join(one) for one in row["named"]) or "nothing"
+    named += "".join(f", law {one}" for one in row["laws"])
     edges = "{:.2f} → {:.2f} nm".format(*row["edges_nm"])
     return f"{row['number']}: {row['planted']}, named {named}, {edges}"
 
@@ -108,9 +110,10 @@ def text_of(record: Mapping[str, Any]) -> str:
         for planted in dict.fromkeys(sorted(row["planted"] for row in rows)):
             own = [row for row in rows if row["planted"] == planted]
             edges = np.mean([row["edges_nm"] for row in own], axis=0)
-            right = f"{sum(row['right'] for row in own)} of {len(own)}"
-            table.append((process, planted, right, "{:.2f} → {:.2f} nm".format(*edges)))
-    return markdown_table(("process", "planted", "right", "edges, held out"), table)
+            right, lawful = (sum(map(bool, (row[key] for row in own))) for key in ("right", "laws"))
+            counts = (f"{count} of {len(own)}" for count in (right, lawful))
+            table.append((process, planted, *counts, "{:.2f} → {:.2f} nm".format(*edges)))
+    return markdown_table(("process", "planted", "right", "with a law", "edges, held out"), table)
 
 
 def main() -> None:

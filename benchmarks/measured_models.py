@@ -74,7 +74,8 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         "leaves in every map: five numbers from the training scans, added to predictions of measured maps "
         "and to no design. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
         "prints. "
-        f"At least the part of an error above it can be removed: at k = 1 and 7 {_above(benchmark, floor)}.",
+        f"A better model can remove at least what an error exceeds the noise by. At k = 1 and 7 "
+        f"that is, in nm: {_above(benchmark, floor)}.",
     )
 
 

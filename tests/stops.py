@@ -1,6 +1,6 @@
 """Stop a process after each of its writes, so that a second start can be compared with a whole run.
 
-A write is a call of Python that changes the file system: it opens a file to write, makes a folder, renames or
+A write is a Python call that changes the file system: it opens a file for writing, makes a folder, renames or
 removes. A stopped process ends at once, as if killed: no clean-up runs.
 """
 

@@ -143,7 +143,10 @@ def lead_text(
         open_ = "" if low * high > 0 else ", which includes 0"
         interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
         against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
-    return f"Printed by {judge}, {best} is best in {LABELS[figure]}. Its lead: " + "; ".join(against) + "."
+    return (
+        f"When {judge} prints the layouts, those designed with {best} have the best {LABELS[figure]}. "
+        f"Their lead: {'; '.join(against)}."
+    )
 
 
 def _model_table(models: Mapping[str, Mapping[str, float]]) -> str:

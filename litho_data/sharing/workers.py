@@ -93,7 +93,7 @@ def run_jobs(
     """Yield each job with its result, in the order in which the jobs are finished.
 
     At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
-    worker died is run again, alone, at most twice; Dask repeats it as often as its scheduler allows.
+    worker died is run again, one at a time, at most twice; Dask repeats it as often as its scheduler allows.
 
     Args:
         function: importable by name; jobs and results can be pickled.
@@ -156,7 +156,10 @@ def _tried(
                 yield number, answer
         if lost:
             under_way = [number for number in lost if tries[number]]
-            print(f"a worker died: running {', '.join(map(name, under_way))} again, alone", file=sys.stderr)
+            print(
+                f"a worker died: running {', '.join(map(name, under_way))} again, one at a time",
+                file=sys.stderr,
+            )
             pool.restart()
             waiting = [number for number in lost if not tries[number]]
             batches = [*([number] for number in under_way), waiting, *batches]

@@ -115,7 +115,7 @@ def require_reach(printer: Printer) -> None:
     if whole or printer.depends_on_position:
         why = "the whole image" if whole else "the place in the write field"
         raise InputError(
-            f"printer {printer.name} of a large element",
+            f"printer {printer.name} for a large element",
             got=f"a print that depends on {why}",
             wanted="a model with a finite reach, such as zoo:pbl, or none",
         )

@@ -28,7 +28,10 @@ class ReliefSettings(DesignSettings):
         gt=0,
     )
     off_blur_um: float = setting(
-        1.0, "Blur of the deviation of a first print, if one was measured", unit="µm", ge=0
+        1.0,
+        "Blur (sd) of the measured deviation of a first print from its prediction, if there is one",
+        unit="µm",
+        ge=0,
     )
 
 

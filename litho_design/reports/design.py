@@ -173,12 +173,13 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
         f"deviations: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
-    grown = f", an error grows to {100 / PASS_SHARE:.0f} % at most"
+    grown = f", and no error exceeds {100 / PASS_SHARE:.0f} %"
     page.paragraph(
-        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
-        f"is more than {PASS_DROP_DB:g} dB below the print as modelled, every other one keeps "
-        f"{100 * PASS_SHARE:g} % of it{grown * bool(set(errors) & set(passed.figures))}. "
-        f"Judged by {', '.join(map(named, passed.figures))}."
+        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval). In a "
+        f"print that passes, no figure in dB is more than {PASS_DROP_DB:g} dB below that of the print as "
+        f"modelled, all other figures reach at least {100 * PASS_SHARE:g} % of it"
+        f"{grown * bool(set(errors) & set(passed.figures))}. "
+        f"Figures: {', '.join(map(named, passed.figures))}."
     )
     chosen = [name for name in task.headline if name in passed.figures][:2] or passed.figures[:2]
     figures = {name: (design.predicted[name], named(name)) for name in chosen}

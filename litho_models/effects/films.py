@@ -1,4 +1,4 @@
-"""Effects on films: they move the edges of a written, developed or etched film, seen from above.
+"""Effects and laws of films: they move the edges of a written, developed or etched film, seen from above.
 
 Lengths are in pixels of the layout, which resolve the beam or lens of the machine.
 """
@@ -70,9 +70,49 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     separating="write one layout at five doses: a bias is the same at each",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards along their normals by the bias, by taking the film's value this far inwards."""
+    """Move edges outwards by the bias."""
+    return _moved(height, values["bias_px"], context)
+
+
+_shifts = partial(
+    entry,
+    role="undetermined",
+    of_films=True,
+    stage="development",
+    acts_on="height",
+    source="found in the residual; M̄ is the Gaussian mean of the film M (0 … 1) over a length",
+    separating="write straight edges beside bare ground and beside films of three widths, at five doses",
+    knowledge="law",
+)
+_SHIFT = {"shift_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))}
+
+
+@_shifts("edges shifted outwards by a constant", _SHIFT)
+def edge_shift(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """Move edges outwards by the shift, whatever causes it."""
+    return _moved(height, values["shift_px"], context)
+
+
+@_shifts(
+    "edges shifted outwards by 2 M̄ - 1, which is 0 at a straight edge",
+    {**_SHIFT, "length_px": Parameter("px", 10.0, 140.0, 25.0, "shape", tried=(15.0, 45.0))},
+)
+def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """Move edges by the shift times the film within the length: outwards in dense places, inwards in sparse
+    ones.
+    """
+    length = values["length_px"]
+    nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
+    return _moved(height, values["shift_px"] * (2 * nearby[0, 0] - 1), context)
+
+
+FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
+
+
+def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
+    """Move edges along their normals, by taking the film's value this far inwards."""
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)
-    share = values["bias_px"] / steepness
+    share = outwards_px / steepness
     return add_warp(height, share * along_y, share * along_x, 1.0)

@@ -127,6 +127,8 @@ _FORWARD_ORDER = (
 TIP = measurement.tip_dilation.name
 
 CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
+# Laws and tables, which are not registered and have no cause.
+_NAMELESS = {**LAWS, **films.FILM_LAWS, **TABLES}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
@@ -140,7 +142,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
     """
-    if effect.name in {**CATALOGUE, **LAWS, **TABLES}:
+    if effect.name in {**CATALOGUE, **_NAMELESS}:
         raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
     alike = [name for name, other in CATALOGUE.items() if other.stage == effect.stage]
     behind = get_effect(after).name if after else alike[-1]
@@ -157,8 +159,8 @@ def get_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
-    if (nameless := LAWS.get(name) or TABLES.get(name)) is not None:
-        return nameless
+    if name in _NAMELESS:
+        return _NAMELESS[name]
     require_known("effect", name, CATALOGUE)
     return CATALOGUE[name]
 
@@ -170,7 +172,7 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
         InputError: an unknown name.
     """
     given = {get_effect(name).name for name in names}
-    known = {**CATALOGUE, **LAWS, **TABLES}
+    known = {**CATALOGUE, **_NAMELESS}
     # Laws and tables act on the finished print, before the microscope.
     ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
     return [name for name in ordered if name in given]

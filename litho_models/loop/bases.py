@@ -49,7 +49,9 @@ def bases_for(
     scans = [scan.stored for scan in study.scans]
     named = _built(base, scans[0], fields) if base in MODELS else None
     if fields and not (named and is_small(named)):
-        raise InputError(f"settings of {base}", got=", ".join(fields), wanted="a small model's name as base")
+        raise InputError(
+            f"settings of {base}", got=", ".join(fields), wanted="a small model as base, given by its name"
+        )
     if base == AUTO:
         return {name: _built(name, scans[0]) for name in _COMPETING}
     if named is None:

@@ -18,6 +18,7 @@ from torch import nn
 
 from litho_data.commands.progress import estimate
 from litho_models.effects import screened_effects
+from litho_models.effects.films import FILM_LAWS
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
 from litho_models.loop.fits import State, Study, fit_state
@@ -187,8 +188,9 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         start: the base; ``named``: its causes; refused causes are removed from it.
     """
     study = start.study
-    # Laws and tables describe heights, not films.
-    laws, tables = ([], []) if study.of_films else (list(LAWS.values()), list(TABLES.values()))
+    # Tables describe heights, not films.
+    laws = [*(FILM_LAWS if study.of_films else LAWS).values()]
+    tables = [] if study.of_films else [*TABLES.values()]
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")

@@ -120,7 +120,7 @@ class HeldOut:
     def left_out_nm(self) -> dict[str, float]:
         """Return how much the error (k = 1) grows without each cause or law, after the model is refitted.
 
-        Printer parameters then stay fixed, and the measurement is learned again.
+        The measurement model is then fitted again, at these parameters of the printer.
         """
 
         def error_nm(state: State) -> float:

@@ -81,8 +81,8 @@ def _verdict(plan: NextPrint) -> str:
     asked = [q for q in plan.questions if q.kind != "fact"]
     decided = "; ".join(q.text for q in asked if q.status == "decides")
     if not asked:
-        return f"No print is needed: a fact in the card answers {facts}."
-    wanting = f" A fact in the card, not a print, answers {facts}." if facts else ""
+        return f"No print is needed: add the missing fact to the card to settle {facts}."
+    wanting = f" To settle {facts}, add the missing fact to the card; no print can." if facts else ""
     return (
         f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
         f"Questions asked: {len(asked)}.{wanting}"

@@ -1,4 +1,4 @@
-"""Write the first scans of a new lab: six prints alone on the substrate.
+"""Write the first scans of a new lab: six prints, each surrounded by bare substrate.
 
 They are rotated, tilted and bowed, and stored in five formats.
 """

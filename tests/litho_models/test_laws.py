@@ -106,7 +106,7 @@ def rim(length_um: float) -> np.ndarray:
 
 
 def jump(axis: str, at: float) -> np.ndarray:
-    """Return 1 beyond a position from -1 to 1, 0 before it, and a fraction at the pixel it cuts."""
+    """Return a step at the position ``at`` (-1 … 1): 0 before it, 1 after it, a fraction in its pixel."""
     size = SHAPE["yx".index(axis)]
     return np.clip((PLACES[axis] - at) * (size - 1) / 2 + 0.5, 0, 1)
 

@@ -14,6 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models import close_loop
 from litho_models.effects import FieldContext, get_effect
+from litho_models.effects.films import FILM_LAWS
 from litho_models.models import build_model
 from tests.litho_models.prints import write_store
 
@@ -56,6 +57,29 @@ def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -
     assert shrunk_px == pytest.approx(3**2 / (2 * 20), rel=0.05)
     straight = _film(np.tile(np.arange(97) - 48.3, (97, 1)))
     assert torch.allclose(spread(straight, values, _context(straight)), straight, atol=0.02 * FILM_UM)
+
+
+def test_a_shift_by_density_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
+    values, law = {"shift_px": 5.0, "length_px": 10.0}, get_effect("edge-shift-by-density")
+    disc = _film(_disc(40, 129))
+    # The Gaussian mean (sd L) at the edge of a disc is 1/2 - L / (2R sqrt(2 pi)), to first order in L / R, and
+    # falls by 1 / (L sqrt(2 pi)) per pixel outwards. The moved edge is where shift and distance agree.
+    falling = 2 / (10 * np.sqrt(2 * np.pi))
+    wanted_px = 5 * falling * 10**2 / (2 * 40) / (1 + 5 * falling)
+    shrunk_px = _radius_px(disc) - _radius_px(law(disc, values, _context(disc)))
+    # Cubic interpolation of a rim one pixel wide is off by some hundredths of a pixel.
+    assert shrunk_px == pytest.approx(wanted_px, abs=0.03)
+    straight = _film(np.tile(np.arange(129) - 64.0, (129, 1)))
+    assert torch.allclose(law(straight, values, _context(straight)), straight, atol=0.08 * FILM_UM)
+
+
+def test_a_constant_shift_is_the_bias_without_its_cause() -> None:
+    film = _film(_disc(25))
+    shifted = get_effect("edge-shift")(film, {"shift_px": 1.5}, _context(film))
+    assert torch.equal(shifted, get_effect("etch-bias")(film, {"bias_px": 1.5}, _context(film)))
+    assert {(one.knowledge, one.role, one.of_films) for one in FILM_LAWS.values()} == {
+        ("law", "undetermined", True)
+    }
 
 
 def test_electrons_come_back_where_something_is_written() -> None:
