@@ -70,7 +70,9 @@ def refine_around_defects(
         masked = without_defects(scan, found, warp)
         fine = refine_pyramid(masked, layout_level, start, model, tolerance_px=_TOLERANCE_PX)
         defects = found
-        if not fine.refinement.converged:
+        # What remains without true defects fits better. Where every edge is shifted, all edges are suspected,
+        # and little remains but flat ground.
+        if not fine.refinement.converged or fine.refinement.correlation < plain.refinement.correlation:
             return plain, None
         ends = corners(layout_level.shape)
         moved = apply_transform(fine.refinement.layout_to_scan, ends) - apply_transform(warp, ends)

@@ -118,10 +118,11 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
     if told := estimate("the loop", _OVER_FIRST_FITS * (time.monotonic() - began_s)):
         study.report(told)
-    searches = {}
+    searches: dict[str, Found] = {}
     for name, state in starts.items():
         study.report(f"looking for what {name} lacks")
-        searches[name] = search(state, candidates)
+        # What one base lacks the others probably lack too, so they start there.
+        searches[name] = search(state, candidates, seed=next(iter(searches.values()), None))
     chosen = _simplest(searches)
     start, named = starts[chosen], searches.pop(chosen)
     learner = Learner(freed, start.maps_um(freed.scans))

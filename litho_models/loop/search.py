@@ -77,6 +77,7 @@ def search(
     candidates: Sequence[Effect],
     most: int = 8,
     secants: Secants | None = None,
+    seed: Found | None = None,
 ) -> Found:
     """Add at most ``most`` effects to a fitted model.
 
@@ -84,10 +85,20 @@ def search(
         start: the current model; ``candidates``: effects that may be added.
         secants: secants of the candidates at a similar model; by default at the model itself.
     """
-    found = Found(start)
+    found = Found(start) if seed is None else _seeded(start, seed)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
     _defend(found)
+    return found
+
+
+def _seeded(start: State, seed: Found) -> Found:
+    """Add all causes that were found with another base, and remove those that this base does not need."""
+    if not seed.causes:
+        return Found(start)
+    twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
+    found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
+    _test_again(found)
     return found
 
 
@@ -243,9 +254,14 @@ def _defend(found: Found) -> None:
     """
     if len(found.causes) < 2:
         return
-    study = found.state.study
     for name in found.names:
         _regroup(found, name)
+    _test_again(found)
+
+
+def _test_again(found: Found) -> None:
+    """Judge each cause in addition to all others, and remove it if it is not confirmed."""
+    study = found.state.study
     for cause in list(found.causes):
         study.report(f"testing again: {cause.name}")
         without = found.state.without(cause.name)

@@ -91,6 +91,17 @@ def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
         assert scan.usable.mean() > 0.8
 
 
+def test_shifted_edges_are_not_taken_for_defects(tmp_path: Path) -> None:
+    """All edges are shifted by 2.5 px, which is many times the usual misfit, in connected areas."""
+    knobs = FilmKnobs(etch_bias_um=0.01)
+    card = simulate_films(tmp_path / "fab", "e-beam", count=1, size_px=208, seed=303, knobs=knobs)
+    build_dataset(card, tmp_path / "films.zarr")
+    (scan,) = open_store(tmp_path / "films.zarr").scans()
+    # The microscope adds no shift, turn or scale; the affine takes up a part of the shift of the edges.
+    assert scan.scan_to_layout == pytest.approx(np.eye(3), abs=0.02)
+    assert scan.usable.mean() > 0.8
+
+
 def test_a_field_lies_alone_on_bare_ground(tmp_path: Path) -> None:
     knobs = FilmKnobs(backscatter=0.6, backscatter_um=0.08)
     simulate_films(tmp_path / "fab", "e-beam", count=1, size_px=96, knobs=knobs)
