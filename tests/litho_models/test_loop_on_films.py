@@ -62,8 +62,8 @@ def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -
 def test_a_shift_by_density_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
     values, law = {"shift_px": 5.0, "length_px": 10.0}, get_effect("edge-shift-by-density")
     disc = _film(_disc(40, 129))
-    # The Gaussian mean (sd L) at the edge of a disc is 1/2 - L / (2R sqrt(2 pi)), to first order in L / R, and
-    # falls by 1 / (L sqrt(2 pi)) per pixel outwards. The moved edge is where shift and distance agree.
+    # The Gaussian mean (sd L) at the edge of a disc is 1/2 - L / (2R sqrt(2 pi)), to first order in L / R,
+    # and falls by 1 / (L sqrt(2 pi)) per pixel outwards. The moved edge is where shift and distance agree.
     falling = 2 / (10 * np.sqrt(2 * np.pi))
     wanted_px = 5 * falling * 10**2 / (2 * 40) / (1 + 5 * falling)
     shrunk_px = _radius_px(disc) - _radius_px(law(disc, values, _context(disc)))
