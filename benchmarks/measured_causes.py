@@ -68,9 +68,9 @@ def errors_table(result: CloseLoop) -> str:
     return markdown_table(
         ["model", "what is added to the print", "held out", "numbers", "k = 1", "k = 7"],
         rows,
-        f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans; nothing but "
-        "k terms is fitted to a scored scan, on other pixels. Numbers: of the printer + of the measurement. "
-        "Intervals: 95 %, bootstrap over scans.",
+        f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans; only "
+        "k terms are fitted to a scored scan, on its other pixels. Numbers: of the printer + measurement "
+        "model. Intervals: 95 %, bootstrap over scans.",
     )
 
 

@@ -70,12 +70,11 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
         f"by scan, seed {split['seed']}; {len(split['lock_box'])} locked scans are in no fold and in no "
         f"figure of this table; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. "
-        "Per-scan terms are fitted on pixels that are not scored. The shared background is what levelling "
-        "leaves in every map: five numbers from the training scans, added to predictions of measured maps "
-        "and to no design. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
-        "prints. "
-        f"A better model can remove at least what an error exceeds the noise by. At k = 1 and 7 "
-        f"that is, in nm: {_above(benchmark, floor)}.",
+        "Per-scan terms are fitted on pixels that are not scored. Levelling leaves a shared background in "
+        "every map. Its five numbers come from the training scans; it is added to predictions of measured "
+        "maps, but not to designs. The noise is an upper estimate ([how](../../noise.md)); its intervals "
+        "are over prints. A better model can reduce an error at least by its excess over the noise. "
+        f"This excess at k = 1 and 7: {_above(benchmark, floor)}.",
     )
 
 
@@ -97,10 +96,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         ("model", "parameters", "zero height free (k = 1)", "offset, gain, tilt and bow free (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds, each predicted by models that were not trained on it, plus the smooth background of their "
-        "training scans. k: terms fitted to each scan, on pixels that are not scored. Intervals: 95 %, over "
-        "scans; in the last row but one over the 6 prints. That row is an upper estimate: it counts as noise "
-        "what place, field and print share.",
+        "folds. Each is predicted by models not trained on it, plus the smooth background of their "
+        "training scans. k terms are fitted to each scan, on pixels that are not scored. Intervals: "
+        "95 %, over scans, or over the 6 prints in the last row but one. That row is an upper estimate: "
+        "it includes errors common to a place, field or print.",
     )
 
 

@@ -227,16 +227,17 @@ def summary(trials: list[dict[str, Any]]) -> str:
             "layouts",
             "predicted power",
             "questions",
-            "mean of it",
+            "mean power",
             "decided rightly",
             "wrongly",
-            "not to be separated",
+            "not separable",
         ),
         rows,
-        f"{len(trials)} trials, knobs in turn; in {with_question} the first round left a question about what "
-        f"was planted. Powers are the plan's, for {PRINTS} prints; shares with 95 % intervals (Wilson). "
+        f"{len(trials)} trials with each knob in turn. In {with_question} the first round left a question "
+        f"about the planted cause. Powers are those of the plan for {PRINTS} prints; shares with 95 % "
+        "intervals (Wilson). "
         "The last column was declared before printing.",
-        f"Decided rightly with computed layouts, of questions about what was planted: {_by_knob(trials)}.",
+        f"Correct decisions with computed layouts, about planted causes: {_by_knob(trials)}.",
     )
 
 

@@ -48,8 +48,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"{designs} designs took {minutes / 60:.1f} hours of search, one thread each, while the machine did "
-        "other work. Intervals are Student's, 95 %, over seeds."
+        f"{designs} designs took {minutes / 60:.1f} hours of search, each in one thread on a machine "
+        "with other work. Intervals are Student's, 95 %, over seeds."
     )
     return "\n\n".join(parts)
 

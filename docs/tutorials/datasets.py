@@ -12,8 +12,9 @@ card = litho_data.simulate("campaign", count=6, size_px=160, seed=3)
 print(card)
 
 # %% [markdown]
-# `card.toml` says which files are scans, which layout belongs to each, and what the files do not state: pitch, height
-# of a level, units. The scans are raw: tilted, bowed, slightly rotated, with an unknown zero. Read one:
+# `card.toml` says which files are scans, which layout belongs to each, and what the files do not state:
+# pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, with an unknown zero. Read
+# one:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -21,8 +22,8 @@ low, high = scan.height_um.min(), scan.height_um.max()
 print(f"{scan.name}: {scan.height_um.shape} pixels, heights {low:.2f} … {high:.2f} µm")
 
 # %% [markdown]
-# One call reads all scans, registers each on its layout and stores the result with its history. If the card names a
-# levelling recipe, it is applied on the way.
+# One call reads all scans, registers each to its layout and stores the result with its history. If the card
+# names a levelling recipe, the recipe is applied too.
 
 # %%
 result = litho_data.build_dataset(card, "prints.zarr")
@@ -64,8 +65,8 @@ for axes, (title, (image, scale)) in zip(figure.subplots(1, 3), panels.items(), 
 figure
 
 # %% [markdown]
-# The print is flatter and rounder than its layout. A model of the printer has to learn this difference. Before you
-# pass the dataset on, check that nothing has changed since it was built:
+# The print is flatter and rounder than its layout. A model of the printer has to learn this difference.
+# Before you share the dataset, check that nothing has changed since it was built:
 
 # %%
 checked = litho_data.verify("prints.zarr")

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Twelve pictures, ten lines each
 #
-# The lines above each picture draw it. Run the page once from top to bottom. The first lines define a function that
-# shows maps (all about 16 µm wide) and simulate four prints. For real prints, see [your own scans](../own_data.md).
+# The code above each picture draws it. Run it all once from top to bottom. The first lines define a function
+# that shows maps (all about 16 µm wide) and simulate four prints. For real prints, see [your own
+# scans](../own_data.md).
 
 # %%
 import litho_data

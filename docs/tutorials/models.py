@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Which model predicts best?
 #
-# You want to know which model of the printer predicts best, and by how much. On this page you compare three models on
-# scans that none of them was trained on. You get intervals, and see how much of the error is noise.
+# You want to know which model of the printer predicts best, and by how much. On this page you compare three
+# models on scans that none of them was trained on. You get error intervals, and see how much of each error is
+# noise.
 
 # %%
 import litho_data
@@ -12,9 +13,9 @@ card = litho_data.simulate("campaign", count=8, size_px=128, seed=0)
 built = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
-# `benchmark` divides the scans into folds. Each fold is predicted by models trained on the others. No fold
-# contains locked scans. The error is the mean absolute difference of measured and predicted height after the unknown
-# zero of each scan is removed ([why](../evaluation.md#two-errors)).
+# `benchmark` divides the scans, except the locked ones, into folds. Each fold is predicted by models trained
+# on the other folds. The error is the mean absolute difference of measured and predicted height after the
+# unknown zero of each scan is removed ([why](../evaluation.md#two-errors)).
 
 # %%
 result = litho_models.benchmark("prints.zarr", "benchmark", models=("affine", "linear", "physics"), folds=2)
@@ -23,7 +24,7 @@ for scores in result.scores:
     print(f"{scores.model:8} {scores.mae_datum_free_nm:6.2f} nm   95 % over scans {low:.2f} … {high:.2f}")
 
 # %% [markdown]
-# Models may differ even if their intervals overlap, because they are compared scan by scan.
+# Models may differ even if their intervals overlap, because the test compares them scan by scan.
 
 # %%
 for pair in result.paired:
@@ -33,8 +34,8 @@ for pair in result.paired:
     )
 
 # %% [markdown]
-# Scans of one print are not independent. If there are several prints, `pair.over_prints` contains the same test over
-# prints. A part of every error is noise that no model can predict:
+# Scans of one print are not independent. If there are several prints, `pair.over_prints` compares print by
+# print. A part of every error is noise that no model can predict:
 
 # %%
 floor = result.noise_floor
@@ -50,8 +51,8 @@ from litho_models.evaluation.plots import error_bars
 error_bars(result.scores, floor.mae_at("offset"), paper_line=False)
 
 # %% [markdown]
-# Train the model that you chose on all scans except the locked ones, and freeze it. The result is a folder with
-# weights and a card, which designs and other people can load.
+# Train the model that you chose on all scans except the locked ones, and freeze it. The result is a folder
+# with weights and a card, to use in designs or to share.
 
 # %%
 litho_models.train("prints.zarr", "physics", "run")

@@ -16,9 +16,9 @@ designs = {
 }
 
 # %% [markdown]
-# `without` was designed for a perfect printer, `with` through a model trained on measured prints. The prediction of a
-# design by its own model proves nothing. Let a model that was used for neither design print both elements, and look
-# at the images:
+# `without` was designed for a perfect printer, `with` through a model trained on measured prints. How good a
+# design looks to its own model proves nothing. Let a model that was used for neither design print both
+# elements, and look at the images:
 
 # %%
 judged = {

@@ -135,7 +135,8 @@ class LayoutFiles(Record):
     def _counted(self) -> Self:
         if self.average_px is not None and self.levels != self.average_px**2 + 1:
             raise ValueError(
-                f"wanted levels = {self.average_px**2 + 1}, for 0 to all white pixels in a square"
+                f"wanted levels = {self.average_px**2 + 1}, for no white pixel to all pixels white "
+                "in a square"
             )
         return self
 
@@ -165,10 +166,10 @@ class ScanFiles(Record):
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if self.full_scale_file is not None and self.unit is not None:
-            raise ValueError("wanted either unit or full_scale_file, which is in metres")
+            raise ValueError("wanted either unit or full_scale_file (in metres), not both")
         given = (self.unit, self.full_scale_file, self.channel, self.missing)
         if self.instrument == "sem" and (self.size_um is None or any(one is not None for one in given)):
-            raise ValueError("wanted size_um and nothing about heights: a micrograph has none")
+            raise ValueError("wanted size_um and nothing about heights, because a micrograph has none")
         return self
 
 

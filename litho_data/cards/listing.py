@@ -107,7 +107,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every[scan_id], folder)
         if not reason and (several := [found for found in files if len(found) > 1]):
             names = ", ".join(one.name for one in several[0])
-            reason = f"several files: {names}; the pattern has to tell them apart"
+            reason = f"several files: {names}; the pattern must match only one"
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
@@ -130,7 +130,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         raise InputError(
             f"card {file}: period of the grating of {unknown[0]}",
             got="no [grating]",
-            wanted="period_um in that table, from its certificate",
+            wanted="period_um in that table, from the certificate of the grating",
         )
     if not any(one.use == "dataset" for one in fields):
         shown = "; ".join(f"{key}: {why}" for key, why in [*{**unpaired, **refused}.items()][:3]) or "no ids"
@@ -183,7 +183,7 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
     if print_id is None and use == "dataset":
         return f"id does not match [ids] print = {card.ids.print!r}"
     if scan_id not in table and any("order" in row for row in table.values()):
-        return f"not in {card.ids.table}, which gives the order"
+        return f"not in {card.ids.table}, which sets the order"
     return ""
 
 

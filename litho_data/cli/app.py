@@ -39,7 +39,9 @@ class Format(StrEnum):
 
 @app.command()
 def fetch(
-    name: Annotated[str, argument("a dataset of this project, e.g. neural-lithography, or a card's path")],
+    name: Annotated[
+        str, argument("a dataset of this project, e.g. neural-lithography, or the path of a card")
+    ],
     into: Annotated[Path | None, option("folder to fill; by default the user cache")] = None,
 ) -> None:
     """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; every SHA-256 is checked.
@@ -67,7 +69,8 @@ def build(
         str | None,
         typer.Option(
             metavar="UM|blind",
-            help="radius of the tip, or blind to find it; pixels that it may not have touched become invalid",
+            help="radius of the tip, or blind to estimate it; pixels that the tip may not have "
+            "touched become invalid",
         ),
     ] = None,
 ) -> None:
@@ -179,7 +182,9 @@ def replay(
 @app.command()
 def export(
     store: StorePath,
-    format: Annotated[Format, option("one file, the authors' 8-bit pairs, or a self-describing release")],
+    format: Annotated[
+        Format, option("single file, 8-bit pairs in the authors' format, or self-describing release")
+    ],
     out: Annotated[Path | None, option("file (zip) or folder to write; by default beside the store")] = None,
 ) -> None:
     """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder.

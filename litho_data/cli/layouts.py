@@ -40,7 +40,7 @@ def masks(
         str, option("round (the paper's equation) or floor (as the published layouts)")
     ] = "round",
     field_px: Annotated[
-        int | None, option("side of a larger field that random layouts are cut from, pixels")
+        int | None, option("side of a larger field from which random layouts are cut, pixels")
     ] = None,
     pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,
@@ -90,7 +90,9 @@ def simulate(
     ] = None,
     fab: Annotated[
         Path | None,
-        option("earlier run (raw/ and truth/) whose machine prints the plan; give a new --seed"),
+        option(
+            "folder (raw/ and truth/) of an earlier run whose machine prints the plan; needs a new --seed"
+        ),
     ] = None,
     count: Annotated[int | None, option("number of scans; by default the preset's", min=1)] = None,
     size_px: Annotated[int | None, option("side of a layout; by default the preset's", min=32)] = None,
@@ -100,12 +102,12 @@ def simulate(
         option("an effect, name=strength or name=strength@seed; repeatable; --list-knobs"),
     ] = None,
     noise: Annotated[str, option("default or off")] = "default",
-    microscope: Annotated[str, option("default (small warps) or aligned (none)")] = "default",
+    microscope: Annotated[str, option("default (scans slightly warped) or aligned (no warp)")] = "default",
     write_field_um: Annotated[
         float | None, option("side of a write field shared by a print's fields, µm")
     ] = None,
     stitch_field_um: Annotated[
-        float | None, option("side of the fields that the knob stitching displaces, µm")
+        float | None, option("side of the fields that the effect stitching displaces, µm")
     ] = None,
     references: Annotated[
         bool, option("add scans of a bare substrate, a flat and a 5-step print", "--references")

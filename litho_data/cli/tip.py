@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @reads_scans
 def tip(
-    scans: Annotated[list[Path], argument("one scan, or all scans of one tip, of the same pitch")],
+    scans: Annotated[list[Path], argument("one scan, or all scans made with one tip at the same pitch")],
     how: Facts,
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
@@ -80,6 +80,7 @@ def _text(found: TipEstimate) -> str:
     for scan in found.scans:
         limit = f"{scan.resolution_um:.3g} µm" if scan.resolution_um else "no length"
         lines.append(
-            f"{scan.name}: {scan.certain_fraction:.1%} touched for certain; may show the tip below {limit}"
+            f"{scan.name}: {scan.certain_fraction:.1%} certainly touched; details below {limit} "
+            "may be the tip"
         )
     return "\n".join(lines)

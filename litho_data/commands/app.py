@@ -47,12 +47,12 @@ DaskOption = Annotated[
 ]
 
 _LONGEST = 200
-_AGAIN = "what was finished is kept: give the command again"
+_AGAIN = "finished parts are kept: run the command again"
 _WAYS_OUT = {
     errno.ENOSPC: f"make room; {_AGAIN}",
     errno.EDQUOT: f"make room; {_AGAIN}",
     errno.EROFS: "choose another --out",
-    errno.EACCES: "choose another place, or ask for the right",
+    errno.EACCES: "choose another place, or get the permission to write there",
     errno.EMFILE: f"allow more open files (ulimit -n), or fewer workers; {_AGAIN}",
     errno.ENFILE: f"close other programs; {_AGAIN}",
 }
@@ -119,7 +119,11 @@ def new_app(help_text: str) -> typer.Typer:
         # This option is declared only for the help: run_app removes it from the command line before parsing.
         plugin: Annotated[
             list[str] | None,
-            option("Load a Python file that registers something; works with every command.", OPTION),
+            option(
+                "Load a Python file that registers additions, such as models or readers; works "
+                "with every command.",
+                OPTION,
+            ),
         ] = None,
     ) -> None:
         if version:

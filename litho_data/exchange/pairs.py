@@ -201,11 +201,12 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
             height_um = scan.height_um + lift_um
             if lift_um:
                 notes.append(
-                    f"{scan_id}: raised by {lift_um * 1e3:.1f} nm, the format has no negative heights"
+                    f"{scan_id}: raised by {lift_um * 1e3:.1f} nm: the format has no negative heights"
                 )
             if unmeasured := int(np.isnan(height_um).sum()):
                 notes.append(
-                    f"{scan_id}: {unmeasured} pixels without measurement became 0, the format has no gaps"
+                    f"{scan_id}: {unmeasured} pixels without measurement became 0, because the "
+                    "format cannot mark them"
                 )
             full_scale_um = max(float(np.nanmax(height_um, initial=0)), 1e-6)
             grey = np.rint(np.nan_to_num(height_um) / full_scale_um * GREY_MAX).astype(np.uint8)

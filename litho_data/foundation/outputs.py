@@ -38,7 +38,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         raise InputError(
             "output",
             got=f"{folder}, which holds {strangers[0]}",
-            wanted="a new folder, or one with nothing but an older result, which is replaced",
+            wanted="a new folder, or one that contains only an older result, which is replaced",
         )
 
 

@@ -203,9 +203,9 @@ PATTERNS: dict[str, tuple[Callable[[SetSettings], Iterator[NamedLayout]], str]] 
     "flat": (_flat, "one level everywhere"),
     "step-ladder": (_steps, "stairs over all levels"),
     "checkerboard": (_checkerboard, "squares of 1/16 of the side"),
-    "line-space": (_lines, "lines and spaces that widen by a pixel each, along x and along y"),
+    "line-space": (_lines, "lines and spaces, each one pixel wider than the last, along x and along y"),
     "siemens-star": (_star, "18 wedges around the centre"),
     "pillars": (_pillars, "isolated squares from one pixel up, full height on bare ground"),
-    "pits": (_pits, "isolated square holes from one pixel up in full height"),
+    "pits": (_pits, "isolated square holes from one pixel up, in a film of full height"),
     "dose-matrix": (_dose_matrix, "one framed step ladder per dose, 0.7 to 1.3 of the recipe's"),
 }

@@ -128,7 +128,7 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
     values, directions = np.linalg.eigh(normal * np.outer(scale, scale))
     if values[0] < _SINGULAR * values[-1]:
         raise InputError(
-            "the layout varies like the background itself",
+            "the layout cannot be told from the background",
             got=f"condition {values[-1] / max(values[0], np.finfo(float).tiny):.1g}",
             wanted="a lower degree or a layout with independent structure",
         )

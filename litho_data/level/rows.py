@@ -109,7 +109,7 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
         return ""
     size = float(np.nanmax(np.abs(shifts[stayed >= _STAYED])))
     shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
-    return f"{shifted} did not move: part of the print may be removed"
+    return f"{shifted} did not move, so part of the print may be removed"
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:

@@ -255,7 +255,7 @@ def _require_enough(
     shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
     if strict and left_out:
         raise InputError(
-            f"{out} not built: {len(left_out)} ids cannot be used",
+            f"{out} was not built: {len(left_out)} ids cannot be used",
             got=shown,
             wanted="all ids usable, because of --strict",
         )

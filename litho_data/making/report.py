@@ -77,7 +77,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     if result.findings:
         page.heading("To do")
         table = [{"scan": one.scan, "what": one.text} for one in result.findings]
-        page.table(table, "Findings against the dataset, worst first", "findings.csv")
+        page.table(table, "Problems of the dataset, worst first", "findings.csv")
     apart = {"skipped": result.skipped, "unpaired": result.unpaired}
     rows = [
         {"id": key, "status": how, "reason": reason}
@@ -86,7 +86,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     ]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and why; with --strict the build is refused instead"
+        caption = "Ids that are not in the store, and why. With --strict nothing is built if there are any"
         page.table(rows, caption, "left_out.csv")
 
 
@@ -118,7 +118,7 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
 
 def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
     if scans:
-        page.heading("What the grating says about the microscope")
+        page.heading("Properties of the microscope from the grating")
         page.table(
             [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
             "Scales, bow of a line and tip, from the known period of the grating; no other scan is "

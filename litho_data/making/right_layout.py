@@ -155,7 +155,7 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
         if one.dihedral != usual and 2 * count > len(prints):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
             what = "a mirror image of its layout" if mirrored else f"turned ({one.dihedral})"
-            yield one.id, f"{what}, unlike the other scans: is the file of its layout the right one?"
+            yield one.id, f"{what}, unlike the other scans: is its layout file the right one?"
         elif one.dihedral in MIRRORED:
             yield one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"
 
@@ -180,7 +180,7 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
         nearest = min(middle, key=lambda group: abs(logs[k] - middle[group]))
         if off > _CLEAR_SIGMA * scatter and nearest != one.group:
             percent = 100 * np.expm1(logs[k] - middle[one.group])
-            text = f"height per level {percent:+.0f} % off the others of {one.group}, as in {nearest}"
+            text = f"height per level {percent:+.0f} % off that of the others of {one.group}, as in {nearest}"
             yield one.id, f"{text}: is its id or dose the right one?"
     growth = np.array([one.response[1] for one in prints])
     rising = {

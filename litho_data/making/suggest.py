@@ -197,14 +197,15 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
     from litho_data.reports.page import Page
 
     page = Page(
-        "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
+        "Which levelling",
+        "Recipes compared on scans of the card, by the part of the heights that the layout does not explain.",
     )
     page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
     rows = [
         {"recipe": name, **of} | ({"warning": found.warned.get(name, "")} if found.warned else {})
         for name, of in found.left_nm.items()
     ]
-    caption = "Part of the levelled heights that the layout does not explain, root mean square, nm"
+    caption = "Part of the levelled heights that the layout does not explain (rms), nm"
     page.table(rows, caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)

@@ -118,7 +118,7 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
     if quality.get("polarity") == -1:
         yield "its heights fall where the levels rise: is the layout or the scan inverted?", Weight.LAYOUT
     if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
-        text = f"details lie {off:.1f} px off their place: is it the right layout and pitch?"
+        text = f"details lie {off:.1f} px from their places in the layout: are layout and pitch right?"
         yield text, Weight.PLACE
     if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
         yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
@@ -188,7 +188,7 @@ def _shown(times: float) -> str:
 def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
     """Return the first words of the report: good, or a list of things to fix, worst first."""
     if not found:
-        return f"Good: all {n_scans} scans are in the store, and nothing speaks against them."
+        return f"Good: all {n_scans} scans are in the store, and no problem was found."
     shown = " · ".join(str(one) for one in found[:_SHOWN])
     more = f" · and {len(found) - _SHOWN} more in the table" if len(found) > _SHOWN else ""
     return f"{n_scans} scans are in the store. To do, worst first — {shown}{more}"

@@ -80,7 +80,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
     files = [row for row in manifest["files"] if row["sha256"]]
     if folder is None:
         files = []
-        notes.append("the raw files were not found and not checked; data_dir says where they are")
+        notes.append("the raw files were not found, so they were not checked; give their folder as data_dir")
     else:
         findings += [
             finding for row in progress(files, "hashing raw files") for finding in _raw_file(folder, row)
@@ -145,10 +145,10 @@ def _tables(store: Store) -> Iterator[Finding]:
     manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
     files = read_table(group_of(store.root, "manifest"), "path")
     if record_sha256([manifest, table_sha256(files)]) != store.root.attrs.get("manifest_sha256"):
-        yield Finding("manifest", "is not the one whose hash the store carries")
+        yield Finding("manifest", "does not match its hash in the store")
     for name in ("quality", "provenance"):
         if table_sha256(read_table(group_of(store.root, name), "scan")) != manifest.get(f"{name}_sha256"):
-            yield Finding(f"table {name}", "is not the one whose hash the manifest carries")
+            yield Finding(f"table {name}", "does not match its hash in the manifest")
 
 
 def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
@@ -188,7 +188,7 @@ def _array(store: Store, scan_id: str, name: str, wanted: str) -> Finding | None
     if array is None:
         return None
     same = VARIABLES[name].sample_sha256(array) == wanted
-    return None if same else Finding(where, "values are not those that were built")
+    return None if same else Finding(where, "values differ from those that were built")
 
 
 def _padding(store: Store) -> Iterator[Finding]:

@@ -103,7 +103,7 @@ def _component(data: bytes, kind: str, at: int, limit: int) -> tuple[Any, int]:
             parts.append(part)
         return parts, at
     if kind.lower() not in _NUMBERS:
-        raise EOFError(f"{kind!r} at {at} is no type of component")
+        raise EOFError(f"{kind!r} at {at} is not a type of component")
     form = np.dtype(_NUMBERS[kind.lower()])
     if at + count * form.itemsize > limit:
         raise EOFError(f"a component at {at} reaches beyond its end")

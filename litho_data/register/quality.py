@@ -87,12 +87,12 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     bent_um = 0.0 if bend_um is None else bend_um.largest
     how = "registered with a quadratic distortion"
     if bend_um is not None and bend_um.kind == "creep":
-        how = "its lines creep along the slow axis, which is corrected"
+        how = "its lines creep along the slow axis; the creep is corrected"
     # Each test is written as "not >=", so that a figure that could not be computed fails.
     failures = {
         f"correlation {ecc:.2f}, at least {MIN_ECC} wanted": not fits,
         f"ambiguous: the layout repeats itself, correlation {repeats:.2f} with its own shift": repeating,
-        f"ambiguous: another shift correlates {second:.2f} times as well": fits
+        f"ambiguous: at another shift the correlation is {second:.2f} times as high": fits
         and not repeating
         and second > MAX_SECOND_ALIGNMENT,
         f"ambiguous: another orientation or polarity correlates within {margin:.2f}": tied and not upright,
@@ -100,13 +100,13 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
         f"{scale}, {low} to {high} wanted; is the pitch right?": not low <= smallest <= largest <= high,
         f"target registration error {tre_px:.2f} px": tre_px > softness * MAX_TRE_MEDIAN_PX,
         "corners not determined": spread_px != spread_px,
-        f"corners known to {spread_px:.2f} px only": spread_px > softness * MAX_CORNER_SD_PX,
+        f"corners are known only to {spread_px:.2f} px": spread_px > softness * MAX_CORNER_SD_PX,
         f"bent by up to {bent_um:.2f} µm, which may fold the scan": bend_um is not None
         and not bend_um.slope < MAX_BEND_SLOPE,
     }
     warnings = {
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
-        f"{defects:.1%} of the field shows something other than the print and is left out": defects > 0,
+        f"{defects:.1%} of the field does not show the print and is left out": defects > 0,
         f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
         "layout looks the same in another orientation; upright assumed": tied and upright,
         f"target registration error {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,

@@ -158,7 +158,7 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
     if not largest > _EDGE_SIGMA * usual:
         raise InputError(
             f"step along {axis}",
-            got="no edge that stands out of the profile",
+            got="no edge that stands out from the profile",
             wanted="a scan of a step or groove whose edges lie across this axis",
         )
     steep = np.flatnonzero(np.abs(change) > largest / 2)

@@ -285,7 +285,7 @@ def _dask(address: str) -> Iterator[Pool]:
                 executor.submit,
                 count,
                 (KilledWorker, CancelledError),
-                "died, as did its replacements, or Dask's scheduler died",
+                "died, and so did its replacements, or Dask's scheduler died",
             )
         finally:
             executor.shutdown(wait=False)

@@ -83,7 +83,7 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
         if half >= _HALF_OF_REACH * tops.reach_px(depth_um, pitch_um):
             break
     if chosen is None:
-        return PeakRadius(None, 0.0, "no top stands out of the noise", depth_um, None, None)
+        return PeakRadius(None, 0.0, "no top rises clearly above the noise", depth_um, None, None)
     parts = [edge for edge in chosen.edges(2) if edge > 0]
     spread = float(np.std(parts, ddof=1) / np.mean(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.0
     radius_um, doubt = 1 / chosen.edge, chosen.doubt(depth_um, pitch_um)

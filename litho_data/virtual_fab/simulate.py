@@ -73,7 +73,7 @@ def simulate(
         raise InputError(
             "references",
             got="own layouts",
-            wanted="reference scans marked by their use in the table of the layouts",
+            wanted="reference scans whose use is stated in the table of the layouts",
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -228,7 +228,9 @@ def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: i
     truth = Truth.read(Path(fab) / "truth")
     if seed == truth.seed:
         raise InputError(
-            "seed", got=seed, wanted="a seed that differs from the earlier run's, because the prints are new"
+            "seed",
+            got=seed,
+            wanted="a seed that differs from that of the earlier run, because the prints are new",
         )
     about = load_card(card)
     return simulate(

@@ -66,7 +66,7 @@ def strength_for_rms(
     # Residuals of the size of float32 rounding do not count as an effect.
     if at_limit < 1e-3:
         raise InputError(
-            f"knob {name}", got="no trace in addition to offset, gain, plane and bow", wanted="another knob"
+            f"knob {name}", got="no change beyond offset, gain, plane and bow", wanted="another knob"
         )
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)

@@ -38,19 +38,20 @@ def score(
     judge: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable. Without it, "
-            "scan and photograph: the models of the zoo for the same printer"
+            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable. "
+            "Without judge, scan and photograph, models of the zoo for the same printer are the judges"
         ),
     ] = None,
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="optics of the judges: thin, or thick (wave propagation method). By default as designed"
+            help="optics of the judges: thin, or thick (wave propagation method). By default that "
+            "of the design"
         ),
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option("--stream", help="large hologram: printed and scored band by band"),
+        typer.Option("--stream", help="for a large hologram: print and score it band by band"),
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",
@@ -92,10 +93,14 @@ def export(
     level_height_um: Annotated[float, typer.Option(help="level of NAME.npy, µm")] = 0.1,
     dose_curve: Annotated[
         Path | None,
-        typer.Option(help="CSV of grey,height_um as printed; without it, grey is linear in height"),
+        typer.Option(help="CSV with the printed height_um of each grey; by default grey is linear in height"),
     ] = None,
     marks: Annotated[
-        bool, typer.Option("--marks", help="also print an F (orientation) and a flat witness beside it")
+        bool,
+        typer.Option(
+            "--marks",
+            help="also print an F, which shows the orientation, and a flat witness area beside the element",
+        ),
     ] = False,
 ) -> None:
     """Write a file of the layout for the printer, with a sidecar that states heights and size.

@@ -54,12 +54,13 @@ Judges = Annotated[
     list[str] | None,
     typer.Option(
         "--judge",
-        help="NAME=MODEL or MODEL that prints the finished layout; repeatable. By default the zoo's models "
-        "of the same printer",
+        help="NAME=MODEL or MODEL that predicts the print of the finished layout; repeatable. By default the "
+        "zoo's models of the same printer",
     ),
 ]
 Robust = Annotated[
-    bool, typer.Option(help="search for the best layout by the worst of the model and its judges")
+    bool,
+    typer.Option(help="search for the layout whose worst loss, over the model and its judges, is smallest"),
 ]
 Objects = Annotated[
     list[Path] | None,
@@ -70,7 +71,7 @@ Objects = Annotated[
 HeldOutObjects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: picture or folder of pictures that is only scored; repeatable. By default "
+        help="computational lens: picture or folder of pictures used only for scores; repeatable. By default "
         "the last quarter of --objects by name, at least two",
         hidden=True,
     ),
@@ -143,7 +144,10 @@ def correct(
     scan: MeasuredSource | None,
     after: Annotated[
         Path | None,
-        typer.Option(help="a first correction, printed and measured: the error of its print is subtracted"),
+        typer.Option(
+            help="folder of a first correction that was printed and measured; the measured error "
+            "of its print is subtracted"
+        ),
     ] = None,
     spread_of: SpreadOf = None,
     judge: Judges = None,
@@ -177,7 +181,7 @@ def lens(
     judge: Judges = None,
     robust: Robust = False,
     large: Annotated[
-        bool, typer.Option("--large", help="ring by ring, for a lens of any size that focuses light")
+        bool, typer.Option("--large", help="design ring by ring, for a focusing lens of any size")
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",

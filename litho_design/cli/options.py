@@ -31,7 +31,7 @@ Extrapolate = Annotated[
 BandPx = Annotated[
     int,
     typer.Option(
-        help="rows of a band at most, px: with --large or --stream memory grows with its square",
+        help="largest number of rows in a band, px; with --large or --stream, memory grows with its square",
         min=8,
         hidden=True,
     ),

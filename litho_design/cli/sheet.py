@@ -11,7 +11,7 @@ from litho_design.cli.design import Target
 from litho_design.cli.options import Device, Out
 from litho_design.exports.job import Format
 
-sheet = typer.Typer(help="One sheet of prints: make it for a lab, and read its scans.", no_args_is_help=True)
+sheet = typer.Typer(help="Make one sheet of prints for a lab, and evaluate its scans.", no_args_is_help=True)
 
 
 @sheet.command("new")
@@ -25,7 +25,7 @@ def new(
     ] = "stl",
     target: Target = "text",
     layouts: Annotated[
-        int, typer.Option(min=6, help="number of random layouts, to learn the printer from")
+        int, typer.Option(min=6, help="number of random layouts to which the printer model is fitted")
     ] = 12,
     seed: Annotated[int, typer.Option(min=0, help="seed of the random layouts")] = 0,
     device: Device = "cpu",

@@ -35,6 +35,8 @@ class PrintJob(Record):
     slicing_um: float = setting(0.1, "Slicing distance", unit="µm", option="--slicing-um", gt=0, le=_MOST)
     hatching_um: float = setting(0.1, "Hatching distance", unit="µm", option="--hatching-um", gt=0, le=_MOST)
     gds_layers: GdsLayers = setting(
-        "cumulative", "Whether layer k is level >= k, or level == k", option="--gds-layers"
+        "cumulative",
+        "Whether layer k contains the pixels with level >= k or those with level == k",
+        option="--gds-layers",
     )
     gwl: Gwl = setting(Gwl(), "GWL")

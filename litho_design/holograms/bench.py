@@ -55,7 +55,7 @@ class HologramScore(Record):
     rmse_paper: float = Field(description="RMSE at the paper's scale")
     ssim: float = Field(description="SSIM")
     si_psnr_resolved_db: float = Field(
-        description="scale-invariant PSNR against the target at the element's resolution, dB"
+        description="scale-invariant PSNR relative to the target at the element's resolution, dB"
     )
     ssim_resolved: float = Field(description="SSIM against the target at the element's resolution")
     clipped_share: float = Field(description="pixels clipped for SSIM, share")

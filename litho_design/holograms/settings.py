@@ -35,7 +35,7 @@ class HologramLoss(Record):
         0.1, "Weight of the light that misses the target", option="--efficiency-weight", ge=0
     )
     signal_window_um: float = setting(
-        0.0, "Light further from the wanted light than this is free; 0 for none", unit="µm",
+        0.0, "Distance from the target's light beyond which the loss ignores light; 0: none", unit="µm",
         option="--signal-window-um", ge=0,
     )  # fmt: skip
 

@@ -28,7 +28,7 @@ class MeasuredSource:
     )
     levelling: Levelling = setting(
         "bow",
-        "What is removed from the scan: nothing, a plane, or a bow of second order",
+        "What is removed from the scan: nothing, a plane, or a second-order bow",
         option="--scan-levelling",
     )
     scale_sd: float = setting(
@@ -38,12 +38,13 @@ class MeasuredSource:
     )
     aligned: bool = setting(
         False,
-        "The scan lies upright on the pixels of the element, and is not registered",
+        "Take the scan as already aligned with the pixels of the element; it is not registered",
         option="--scan-aligned",
     )
     tip_um: float | None = setting(
         None,
-        "Radius of the tip, whose widening is removed; 0 for none. By default estimated from the scan",
+        "Radius of the tip, whose widening of the surface is removed; 0 removes nothing. By "
+        "default estimated from the scan",
         unit="µm",
         option="--scan-tip-um",
     )
@@ -75,8 +76,8 @@ class PhotoSource:
     )
     power_counts: float | None = setting(
         None,
-        "Summed counts, without dark level, of all light on the element at the same exposure: gives "
-        "efficiencies",
+        "Summed counts, without dark level, of all light on the element at the same exposure; needed "
+        "for efficiencies",
         option="--camera-power",
     )
     pitch_sd: float = setting(

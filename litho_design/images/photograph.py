@@ -77,20 +77,26 @@ class CameraRecord(Record):
         """Return remarks about the photograph, one phrase each."""
         found = list(self.notes)
         if self.orientation != "identity":
-            found.append(f"the photograph was brought onto the image by {self.orientation}, as asked")
+            found.append(f"the photograph was turned onto the image by {self.orientation}, as requested")
         if self.ambiguous:
             others = ", ".join(self.ambiguous)
-            found.append(f"ambiguous: it fits as well after {others}, so a mirrored print would go unnoticed")
+            found.append(
+                f"ambiguous: the photograph fits equally well after {others}, so a mirrored print "
+                "would go unnoticed"
+            )
         if self.coverage < 1:
             found.append(
-                f"{100 * (1 - self.coverage):.1f} % of the image lies beyond it, and is taken as expected"
+                f"{100 * (1 - self.coverage):.1f} % of the image lies outside the photograph; "
+                "there the expected image is used"
             )
         if self.vignetting_sd:
             found.append(
-                "without --camera-flat the score may contain vignetting; its uncertainty includes that"
+                "without --camera-flat the score may include vignetting; its uncertainty allows for that"
             )
         if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
-            found.append(f"counts look like the light to the power {self.gamma:.2f}: is the file raw?")
+            found.append(
+                f"counts seem proportional to the light to the power {self.gamma:.2f}: is the file raw?"
+            )
         return found
 
 
@@ -202,7 +208,7 @@ def photographed_image(
     if max(saturated, cut_off if raw.min() == 0 else 0.0) > _LARGEST_SATURATED:
         raise InputError(
             f"photograph {photo_file}",
-            got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at an end of their range",
+            got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at the lowest or highest value",
             wanted=f"at most {100 * _LARGEST_SATURATED:g} %",
             hint="a shorter exposure" if saturated > cut_off else "a black level above the noise",
         )
@@ -225,7 +231,7 @@ def photographed_image(
     if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
         raise InputError(
             f"photograph {photo_file}",
-            got=f"counts that grow as the light to the power {fit.gamma:.2f} ± {fit.gamma_sd:.2f}",
+            got=f"counts proportional to the light to the power {fit.gamma:.2f} ± {fit.gamma_sd:.2f}",
             wanted="counts proportional to the light",
             hint="take the camera's raw file, or undo its gamma",
         )

@@ -60,9 +60,9 @@ class MeasuredRecord(Record):
     def remarks(self) -> list[str]:
         """Return remarks on what was removed and on the orientation of the scan, one phrase each."""
         found = [] if not self.warning else [self.warning]
-        found += ["the scan was taken as it is, without registration"] if self.aligned else []
+        found += ["the scan was used without registration"] if self.aligned else []
         if self.orientation != "identity":
-            found.append(f"the scan was brought onto the layout by {self.orientation}")
+            found.append(f"the scan was turned onto the layout by {self.orientation}")
         if self.levelling == "none":
             found.append("nothing was levelled")
         else:

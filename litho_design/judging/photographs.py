@@ -118,7 +118,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
             f"photograph {source.path}",
             got=f"a SI-PSNR uncertain by noise and dark level to {uncertainty['si_psnr_db']:.2f} dB",
             wanted=f"at most {_LARGEST_SD_DB} dB",
-            hint="a longer exposure or the mean of several, and --camera-dark-level",
+            hint="a longer exposure or the mean of several exposures, and --camera-dark-level",
         )
     pictures = {f"photograph {photo.record.name}": image.clip(0)}
     return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)

@@ -30,8 +30,8 @@ from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARG
 from litho_design.tasks.task import Figures, Task
 
 _LEFT_OUT = (
-    "a large element: without polish, process window, baselines, thick element and report; the figures that "
-    "need the whole image at once are left out"
+    "a large element: no polish, process window, baselines, thick element or report, and no scores that "
+    "need the whole image at once"
 )
 _PREVIEW_PX = 1024
 # Settings of light and of search, with the only values that a large element supports.

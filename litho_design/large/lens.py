@@ -70,7 +70,7 @@ class RingLens(DirectLensTask):
         only(settings, LIGHT | rings)
         self.tile_px = tile_px
         Task.__init__(self, settings, printer)
-        self.notes = ["a lens of rings: levels and heights along one radius; no layout of the plane"]
+        self.notes = ["lens of rings: levels and heights along one radius, but no layout of the plane"]
 
     def check_printer(self, printer: Printer) -> None:
         """Refuse a printer whose reach is not finite."""

@@ -31,7 +31,7 @@ class LensScore(Record):
     fwhm_um: float = Field(description="full width at half maximum, µm")
     fwhm_ideal_um: float = Field(description="the same of a perfect lens, µm")
     cbr: float = Field(description="centre-to-background ratio")
-    cbr_ceiling: float = Field(description="the same of a perfect lens: the ceiling")
+    cbr_ceiling: float = Field(description="the same of a perfect lens: the upper limit")
     eff_window: float = Field(description="power in the PSF window, share of the aperture's")
 
 

@@ -40,7 +40,9 @@ class LensView(Record):
 
     aperture: Literal["square", "circle"] = setting("circle", "Aperture of the lens")
     window_px: int = setting(254, "Lens: side of the PSF window", unit="px", option="--window-px", ge=16)
-    path: Literal["plane", "radial"] = setting("plane", "Search on the plane, or along a radius of rings")
+    path: Literal["plane", "radial"] = setting(
+        "plane", "Search over the whole plane, or over rings along a radius"
+    )
 
 
 class ImagingSettings(Record):
@@ -67,7 +69,7 @@ class ImagingSettings(Record):
         0.0, "Photon noise: variance over signal, both relative to a white object", ge=0
     )
     loss: Literal["l1", "smooth-l1"] = setting(
-        "l1", f"Error of a picture in the search: l1, or smooth-l1, a square below {SMOOTH_BELOW}"
+        "l1", f"Image error in the search: l1, or smooth-l1, which is quadratic below {SMOOTH_BELOW}"
     )
     iterations: int = setting(50, "Iterations of the Richardson-Lucy deconvolution", ge=1)
 

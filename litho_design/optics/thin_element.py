@@ -47,7 +47,7 @@ class Optics(Record):
     incidence_y: float = setting(0.0, "Sine of the angle of incidence along y", gt=-1, lt=1)
     source_sine: float = setting(
         0.0,
-        "Sine of half the angle under which the element sees an incoherent source; 0 for a point",
+        "Sine of half the angle that an incoherent source subtends at the element; 0 for a point",
         ge=0,
         lt=1,
     )
@@ -65,14 +65,14 @@ class Optics(Record):
     )
     source_distance_um: float = setting(
         0.0,
-        "Distance from the element back to a point source; 0 for a far source",
+        "Distance from the element to a point source; 0 for a distant source",
         unit="µm",
         ge=0,
     )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum", "far-field"] = setting(
         "auto",
-        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid; or the far "
-        "field, in the focal plane of a lens",
+        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, the valid one of these two, or the "
+        "far field in the focal plane of a lens",
         option="--propagation",
     )
     element: ElementKind = setting(

@@ -53,12 +53,12 @@ class ProcessWindow(Record):
     )
     samples: int = setting(
         0,
-        "Draws of the process window in the loss; 0 designs for the print as modelled",
+        "Draws of the process window in the loss; 0 designs for the nominal print only",
         option="--robust-samples",
         ge=0,
     )
     tail: float = setting(
-        0.25, "Worst share of the draws, whose mean loss is minimised", option="--risk-tail", gt=0, le=1
+        0.25, "Share of the worst draws whose mean loss is minimised", option="--risk-tail", gt=0, le=1
     )
     seed: int = setting(0, "Seed of the draws")
     yield_draws: int = setting(100, "Random prints of the yield", option="--yield-draws", ge=2)

@@ -59,7 +59,7 @@ class SearchSettings(Record):
     checkpoint_every: int = setting(50, "Iterations between two checkpoints", ge=1)
     precision: Literal["float32", "bfloat16"] = setting(
         "float32",
-        "Networks of the model in the search: float32 or bfloat16; scores are always in float32",
+        "Precision of the model's networks in the search: float32 or bfloat16; scores are always in float32",
         option="--precision",
     )
     seed: int = setting(0, "Seed of start and sampling", option="--seed")
@@ -89,7 +89,10 @@ class EnsemblePenalty(Record):
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
 
     weight: float = setting(
-        1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
+        1.0,
+        "Weight of the models' disagreement, per wave of height difference",
+        option="--ensemble-weight",
+        ge=0,
     )
 
 
@@ -99,7 +102,7 @@ class Fabrication(Record):
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
 
     inside_weight: float = setting(
-        0.0, "Weight of levels and steps that the model's training layouts hardly have",
+        0.0, "Weight of levels and steps that are rare in the model's training layouts",
         option="--inside-weight", ge=0,
     )  # fmt: skip
 

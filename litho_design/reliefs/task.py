@@ -36,8 +36,8 @@ class ReliefScore(Record):
     base.
     """
 
-    rms_nm: float = Field(description="rms error of the print, offset free, nm")
-    mae_nm: float = Field(description="mean absolute error, offset free, nm")
+    rms_nm: float = Field(description="rms error of the print without its mean error, nm")
+    mae_nm: float = Field(description="mean absolute error without the mean error, nm")
     p95_nm: float = Field(description="95th percentile of the absolute error, nm")
     offset_nm: float = Field(description="mean of print minus target, nm")
 

@@ -91,11 +91,12 @@ def width_sentence(design: Design) -> str:
     text += f" The search used {width.searched_with} of them."
     (low, high), (_, unit) = width.between, _parted(width.figure)
     if high > max(by_model.values()):
-        text += f" With the error that they had on their own prints, expect {low:.3g} to {high:.3g}{unit}."
+        text += f" With their errors on their own training prints, expect {low:.3g} to {high:.3g}{unit}."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
-            f" They differ most about level {level} ({low_um:.3f} to {high_um:.3f} µm): a print with wide "
+            f" They differ most in the height of level {level} ({low_um:.3f} to {high_um:.3f} µm): "
+            "a print with wide "
             "fields of it would decide (litho-models next-print)."
         )
     return text
@@ -113,7 +114,7 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     stated, *_ = by_model
     worst = (max if less else min)(by_model, key=by_model.__getitem__)
     text = (
-        f"{len(by_model)} models of this printer print it ({', '.join(by_model)}): {name} "
+        f"{len(by_model)} models of this printer predict its print ({', '.join(by_model)}): {name} "
         f"{by_model[stated]:.3g}{unit} as stated by {stated}, {median(by_model.values()):.3g} in the median, "
         f"{by_model[worst]:.3g} at worst, by {worst}."
     )
@@ -140,7 +141,7 @@ def thickness_warning(design: Design) -> str:
     return (
         f"as a thick element (wave propagation method, one reflection included) the same print sends "
         f"{100 * thick:.1f} % where the thin element of these scores sends {100 * thin:.1f} %: its detail is "
-        "too fine for its height, and the figures are too good"
+        "too fine for its height, so the scores are too good"
     )
 
 

@@ -62,8 +62,9 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         words=WORDS,
     )
     page.verdict(
-        f"As {design.printer.name} prints it: {headline(design.predicted)}. This is what the model that the "
-        "layout was designed with expects, not a measurement: before printing, score it with another model "
+        f"As {design.printer.name} prints it: {headline(design.predicted)}. This is a prediction "
+        "of the model "
+        "used for the design, not a measurement: before printing, score the layout with another model "
         "(litho-design score, litho-design compare). " + width_sentence(design)
     )
     if design.baselines:
@@ -80,7 +81,12 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
             for name, by_model in design.width.figures.items()
             for model, figures in by_model.items()
         ]
-        page.table(rows, "The layout and the uncorrected ones, by every model at hand", "width.csv", digits=4)
+        page.table(
+            rows,
+            "The layout and the uncorrected layouts, printed by every available model",
+            "width.csv",
+            digits=4,
+        )
     page.heading("All scores", folded=True)
     if lens:
         page.figure(
@@ -100,7 +106,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.paragraph(stroke_advice(design))
     if tiling := design.tiling:
         page.paragraph(
-            f"Predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with their halo, the "
+            f"Predicted as a whole or in {tiling.tiles} tiles of {tiling.tile_px} px with their halo, the "
             f"print differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
         )
     if design.out_of_distribution is not None:
@@ -127,7 +133,7 @@ def _panels(
         limit = 2 * float(np.std(error)) + 1e-9
         maps = {
             "error, offset free": error - error.mean(),
-            "the part that no layout can print": 1000 * np.load(folder / UNPRINTABLE_FILE),
+            "the part of the relief that no layout can print": 1000 * np.load(folder / UNPRINTABLE_FILE),
         }
         return [first, [Panel(*one, side, "nm", "RdBu_r", -limit, limit) for one in maps.items()]]
     behind = "behind the predicted print", task.display(seen), window

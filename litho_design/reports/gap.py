@@ -51,8 +51,8 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
     page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
         "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
-        "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
-        "independent result."
+        "(columns). On the diagonal a model judges its own design, so the score is its own "
+        "prediction, not an independent result."
     )
     for figure in shown:
         page.table(_matrix(result, figure), _caption(result.task, figure), f"matrix_{figure}.csv", digits=3)
@@ -74,7 +74,10 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
     )
     if result.paired:
         page.heading("Arm against arm", folded=True)
-        page.paragraph("Differences under the same judge, paired by seed. If 0 is inside, the order is open.")
+        page.paragraph(
+            "Differences under the same judge, paired by seed. If an interval includes 0, the "
+            "order is undecided."
+        )
         pairs = [
             one.model_dump(exclude={"ci95"})
             | dict(zip(("95 % from", "to"), one.ci95 or (np.nan, np.nan), strict=True))

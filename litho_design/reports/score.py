@@ -34,7 +34,7 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
         page.figure(
             panels_figure([[Panel(*shown, judgement.frame_um) for shown in judgement.photos.items()]]),
             "Photograph through the printed lens, each image at the scale with the smallest error. The "
-            "scores are of this one object.",
+            "scores refer to this one object only.",
         )
     for score in result.scores:
         for remark in score.remarks():
@@ -62,7 +62,7 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
         for score in result.scores
         if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
     ]
-    page.table(heights, "Heights against the print that the design expected", "heights.csv", digits=1)
+    page.table(heights, "Measured heights and the print that the design expected", "heights.csv", digits=1)
     return page.write(folder)
 
 

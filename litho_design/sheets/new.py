@@ -80,7 +80,7 @@ def new_sheet(
         fields: list[Field] = []
         for name, level in levels.items():
             write_layout(folder, name, level)
-            what = _WITNESSES.get(name, "a random layout, to learn the printer from")
+            what = _WITNESSES.get(name, "a random layout, to fit the printer model")
             file = "" if name == "substrate" else _exported(level, format, folder, name, geometry)
             fields.append(Field(order=len(fields), id=name, file=file, what=what))
         for arm in ARMS:

@@ -106,7 +106,7 @@ def _by_kind(result: ReadSheet) -> dict[str, dict[Arm, float]]:
 def _write_report(folder: Path, result: ReadSheet) -> None:
     page = Page(
         "What the sheet shows",
-        "A printer learned from one sheet of prints, and one hologram printed twice.",
+        "A printer model fitted to one sheet of prints, and one hologram printed twice.",
         run=result,
         facts={"dataset": result.dataset.sha256},
     )
@@ -127,7 +127,7 @@ def _write_report(folder: Path, result: ReadSheet) -> None:
         errors, "Mean absolute error, one offset per scan free; scans held out of the fits", "errors.csv"
     )
     found = ", ".join(result.found) or "nothing"
-    page.paragraph(f"The loop adds {found}; its verdict: {result.verdict.replace('-', ' ')}.")
+    page.paragraph(f"The loop adds {found}. Its verdict: {result.verdict.replace('-', ' ')}.")
     page.links(
         [
             ("prints-report/report.html", "Report of the dataset"),

@@ -188,5 +188,5 @@ def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Se
             "judges",
             got=f"{both[0]!r} twice",
             wanted="judges with names that no arm has",
-            hint="the models of the arms judge anyway",
+            hint="the models of the arms are judges in any case",
         )

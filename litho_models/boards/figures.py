@@ -114,10 +114,10 @@ def _of_singles(trials: Sequence[Trial]) -> list[Figure]:
     in_form, other = (_of_kind(trials, kind) for kind in ("in-form", "other-form"))
     rest = [trial for trial in trials if trial.draw.kind != "other-form"]
     return [
-        _causes("in form: named, alone or in a set", counted(in_form), _NAMED, "all but one"),
+        _causes("known form: named, single or in a set", counted(in_form), _NAMED, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in in_form), "none"),
-        _causes("of another form: named rightly, or a law", counted(other), _LAWFUL),
-        _causes("… noticed, a law or a name included", counted(other), _SEEN, "all but one"),
+        _causes("other form: correct name, or a law", counted(other), _LAWFUL),
+        _causes("… noticed, with or without name or law", counted(other), _SEEN, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in other), "at most 1"),
         Figure(
             f"all others: error after at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
@@ -141,13 +141,13 @@ def _of_mixtures(trials: Sequence[Trial]) -> list[Figure]:
     simulated = [trial for trial in trials if trial.draw.kind != "measured"]
     return [
         _causes(
-            "the catalogue's causes: named, alone or in a set",
+            "causes of a known form: named, single or in a set",
             [one for one in causes if one.name not in FORMS],
             _NAMED,
             "at least 80 %",
         ),
         _causes(
-            "causes of another form: named rightly, or a law",
+            "causes of another form: correct name, or a law",
             [one for one in causes if one.name in FORMS],
             _LAWFUL,
         ),

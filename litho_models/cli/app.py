@@ -37,17 +37,17 @@ StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")
 Out = Annotated[Path, option("folder of the result; one that holds anything else is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
-    option("terms fitted to each scan for its datum-free error; offset by default, for films none"),
+    option("terms fitted to each scan for its datum-free error; by default offset, or none for films"),
 ]
 _BACKGROUND_HELP = "training: add to predictions the smooth background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: all that the measurement model learns"),
+    option(f"{_BACKGROUND_HELP}; shared: the whole fitted measurement model"),
 ]
 NoiseOption = Annotated[
     Path | None,
-    option("noise.json of `litho-models noise` on this dataset, to show its floor beside the errors"),
+    option("noise.json of `litho-models noise` on this dataset; its noise floor is shown beside the errors"),
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
@@ -239,7 +239,7 @@ def predict(
 def export(
     model: ModelName,
     out: Annotated[Path, option("file to write: .pt2 (torch.export) or .onnx (extra onnx)")],
-    size_px: Annotated[int, option("side of the layouts that the program takes", min=1)] = 512,
+    size_px: Annotated[int, option("side of the layouts that the exported program accepts", min=1)] = 512,
 ) -> None:
     """Write a frozen model as a program for layouts of one size, which runs without this package.
 
@@ -303,7 +303,8 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "side that causes effects of undetermined role: for all of them, or for EFFECT; repeatable",
+            "side (printer or microscope) that is taken as the cause of effects of undetermined "
+            "role: of all, or of EFFECT; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,

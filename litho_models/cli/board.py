@@ -46,7 +46,7 @@ def judge(
     loop: Annotated[
         str | None,
         option(
-            "command of the loop: its last arguments are STORE and FOLDER; writes FOLDER/answer.json; "
+            "command of the loop, called with STORE and FOLDER at its end; it writes FOLDER/answer.json; "
             "by default close-loop of this package"
         ),
     ] = None,

@@ -24,8 +24,8 @@ def close_loop(
     stores: Annotated[
         list[Path],
         argument(
-            "dataset store made by litho-data build; further stores hold later prints of the same printer "
-            "and decide what the first leaves open"
+            "dataset store made by litho-data build; further stores, with later prints of the same "
+            "printer, decide the questions that the first leaves open"
         ),
     ],
     out: Annotated[Path, option("folder for result, report, tables and the corrected model")],
@@ -42,7 +42,10 @@ def close_loop(
     folds: Annotated[int, option("number of folds, by scan", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
-        option("also repeat every choice without each fold or print, and judge it on the omitted part; slow"),
+        option(
+            "also repeat all choices with each fold or print left out, and judge them on that "
+            "fold or print; slow"
+        ),
     ] = None,
     inject: Annotated[
         list[str] | None,
@@ -56,7 +59,7 @@ def close_loop(
     steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
     cache: Annotated[
         Path | None,
-        option("folder of a network's trainings per fold; by default beside --out"),
+        option("folder for the trained networks of each fold; by default beside --out"),
     ] = None,
     seed: Annotated[int, option("seed of folds and bootstrap, not of the lock box", min=0)] = 0,
     workers: WorkersOption = 1,
@@ -107,16 +110,18 @@ def check(
     out: Annotated[Path, option("folder for check.json, report and tables")],
     reference: Annotated[
         Path | None,
-        option("store of unchanged prints; by default the prints in the model's card"),
+        option("store of prints from before any change; by default the prints in the model's card"),
     ] = None,
     new: Annotated[
         list[str] | None,
         option("a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
-    false_alarms: Annotated[float, option("share of unchanged data sets that raise an alarm")] = 0.005,
+    false_alarms: Annotated[
+        float, option("share of data sets of an unchanged printer that raise an alarm")
+    ] = 0.005,
     tolerance: Annotated[
         float | None,
-        option("largest drift of a figure, 0.05 is 5 %; by default three times its spread"),
+        option("largest accepted drift of a figure (0.05 is 5 %); by default three times its spread"),
     ] = None,
     strict: Annotated[bool, option(f"end with exit code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
@@ -171,7 +176,7 @@ def next_print(
         report=say,
     )
     if plan is None:
-        typer.echo(f"nothing is open in {loop}: no print is needed")
+        typer.echo(f"{loop} has no open questions: no print is needed")
         return
     typer.echo(f"{plan.prints} print{'s' * (plan.prints > 1)}, {len(plan.scans)} scans with the references")
     for question in plan.questions:

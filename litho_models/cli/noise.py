@@ -19,10 +19,10 @@ def noise(
     substrate: Annotated[Path | None, option("scan of the bare substrate, without a store")] = None,
     flat: Annotated[Path | None, option("scan of a flat print, without a store")] = None,
     steps: Annotated[Path | None, option("scan of a step print, without a store")] = None,
-    unit: Annotated[str | None, option("unit of these scans where the files state none")] = None,
+    unit: Annotated[str | None, option("height unit of these scans, for files that state none")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
-        option("size of these scans in µm where the files state none", metavar="Y X"),
+        option("size of these scans in µm, for files that state none", metavar="Y X"),
     ] = None,
     level_height_um: Annotated[
         float | None, option("nominal step of the step print, µm; 0.1 by default")

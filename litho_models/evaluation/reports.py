@@ -25,7 +25,7 @@ _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
     "leave-one-print-out": "all scans of one print are held out at a time; the lock box is in no fold",
     "paper": "a random quarter of the quadrants is held out: quadrants of one scan lie on both sides, so "
-    "this split leaks and serves comparison with the paper only",
+    "errors are too small; use this split only for comparison with the paper",
 }
 
 
@@ -69,7 +69,7 @@ def write_benchmark_report(
     _errors(page, result, scores, caption, "benchmark.csv")
     if result.dataset.name == _PAPER_DATASET:
         page.note(*said("paper", split=split.kind, paper_nm=plots.PAPER_MAE_NM))
-    page.heading("Which differences are more than chance?", folded=True)
+    page.heading("Which differences exceed chance?", folded=True)
     page.table(
         result.paired,
         "Error of one model minus that of another, over the same scans and with the same terms fitted.",
@@ -89,8 +89,8 @@ def write_benchmark_report(
     page.heading("Training", folded=True)
     page.table(
         result.fits,
-        "Every fit: error on its training, inner-validation and held-out scans, all without a background and "
-        "with the zero height of each scan fitted, so that over-fitting shows; how long training took here.",
+        "Errors of every fit on its training, inner-validation and held-out scans, to show over-fitting, and "
+        "the time of training. No background is used, and the zero height of each scan is fitted.",
         "fits.csv",
         digits=3,
         columns=_OF_FIT,

@@ -66,7 +66,7 @@ class Check:
         unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
         larger = "" if unneeded else self._larger(cause, without)
         if unneeded:
-            reason = f"not needed beside the others: {unneeded}"
+            reason = f"not needed if the others are in the model: {unneeded}"
         elif larger:
             reason = f"may only correct the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
@@ -74,7 +74,7 @@ class Check:
         elif outgrown := self.state.twin.outgrows(cause.name):
             reason = f"its best length is outside the range of this effect: {', '.join(outgrown)}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
-            reason = f"its best strength is beyond the largest possible one: {', '.join(exhausted)}"
+            reason = f"its best strength exceeds the largest possible one: {', '.join(exhausted)}"
         # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
         # that is small relative to the unexplained error therefore proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
@@ -127,7 +127,7 @@ class Check:
                 both = with_table(self.state, table)
                 judged = judge_states(both.without(cause.name), both)
                 if reason := judged.reason(grouped=cause.by != ALL):
-                    return replace(cause, reason=f"{table.name} explains the same and more: {reason}")
+                    return replace(cause, reason=f"{table.name} explains this effect and more: {reason}")
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:

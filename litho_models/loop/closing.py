@@ -106,7 +106,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
         plain[name] = fit_state(Twin.bare(base), study)
-    study.report("learning what groups of scans share")
+    study.report("fitting what groups of scans share")
     nearest = min(plain.values(), key=lambda state: state.mse_nm2)
     freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
     excluded = untestable(freed)

@@ -54,16 +54,17 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     _residuals(page, maps)
     page.table(
         result.explained,
-        "What a ridge on features of layout and position still explains on held-out scans.",
+        "Squared error on held-out scans that a ridge regression on features of layout and "
+        "position still explains.",
         "explained.csv",
     )
     page.heading("All errors")
     page.table(
         [row.model_dump(exclude={"by_scan_nm", "edge_by_scan_nm"}) for row in result.errors],
-        "Each row names its model, measurement and terms. All rows are computed in the same way.",
+        "Each row names its model, measurement model and scan terms. All rows are computed in the same way.",
         "errors.csv",
     )
-    page.heading("What scans share beside their prints", folded=True)
+    page.heading("Errors that scans share apart from their prints", folded=True)
     page.paragraph(said("measurement", result.measurement))
     page.heading("What single scans add", folded=True)
     page.table(
@@ -75,7 +76,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.heading("What was planted in copies of the scans")
         page.table(result.planted, "Whether the loop names each planted effect.", "planted.csv", digits=3)
     if result.confounded:
-        page.paragraph(f"Known only jointly: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}.")
+        page.paragraph(
+            f"Only known in combination: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
+        )
     page.heading("Every other candidate", folded=True)
     page.table(result.candidates, "Why it was not added.", "candidates.csv")
     return page.write(folder)

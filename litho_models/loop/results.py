@@ -238,9 +238,9 @@ def _refused(
     if count < FEWEST_SCANS:
         return "too-few-scans", f"{count} scans to choose and confirm on, at least {FEWEST_SCANS} needed"
     if last.beside_base < SMALLEST_RETAINED:
-        return "not-testable", "on these layouts its change is the same as that of per-scan terms"
+        return "not-testable", "on these layouts it cannot be told from per-scan terms"
     if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-        return "absorbed", "the base has absorbed it: its parameters make the same change"
+        return "absorbed", "changed parameters of the base have the same effect"
     if not last.allowed and named.first[name].family_p <= FAMILY_P:
         return "contradicted", "its best strength has the wrong sign"
     gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"

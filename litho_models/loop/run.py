@@ -117,7 +117,7 @@ def close_loop(
         alone: list[ScanFinding] = []
         residuals = models.residuals()
         if not study.of_films:
-            report("looking for terms of single scans")
+            report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, study.scans, maps).findings()
             alone = with_marks(terms, marks(study.scans, maps, _rounding_um(opened, development)))

@@ -128,7 +128,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
     screening = Screening(found.state, effects, secants)
     found.first, found.last = screening.common | found.first, found.last | screening.common
     left = screening.standing()
-    study.report(f"{len(left)} of {len(effects)} candidates stand out")
+    study.report(f"{len(left)} of {len(effects)} candidates are significant")
     while left:
         entering = [left[0], *_rivals(left[0], left[1:], screening)]
         left = [one for one in left if one not in entering]

@@ -131,7 +131,11 @@ class SingleScans:
             behind = judged[other].gains_nm2 - gains
             beaten, better = (one_sided_flip_p(sign * behind) <= CONFIRM_P for sign in (1, -1))
             excess_p = one_sided_flip_p(gains - columns)
-            excess = "" if excess_p <= CONFIRM_P else f"rows gain no more than columns (p = {excess_p:.3f})"
+            excess = (
+                ""
+                if excess_p <= CONFIRM_P
+                else f"row terms gain no more than column terms (p = {excess_p:.3f})"
+            )
             follows = ""
             if beaten:
                 follows = f"the lines follow {_frame(other)} more closely: {other}"

@@ -61,7 +61,7 @@ class PblConfig(SimulatorConfig):
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
     # The next three fields are not in the paper.
-    transposable: bool = Field(False, description="areawise network that treats x and y alike")
+    transposable: bool = Field(False, description="network on areas (areawise) that treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
     scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
 

@@ -32,8 +32,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.heading("In numbers", folded=True)
     page.table(
         result.figures,
-        "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed, whichever print "
-        f"is the first; alarm if at most “alarm at”, the figure's share of {result.false_alarm_rate:g}.",
+        "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed at any print; "
+        f"alarm if at most “alarm at”, the figure's share of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
         columns=_COLUMNS,

@@ -47,7 +47,7 @@ def analyse_noise(
     """
     if model is not None and residuals is None:
         raise InputError(
-            "model", got=f"{model} without residuals", wanted="a benchmark from which it can be chosen"
+            "model", got=f"{model} without residuals", wanted="a benchmark from which the model can be chosen"
         )
     dataset = open_store(store)
     with growing_folder(out, NoiseAnalysis.FILE_NAME, {"dataset": {"name": dataset.name}}):
@@ -126,9 +126,7 @@ def analyse_noise_of_files(
             references=found,
             dose=None,
             spread=None,
-            notes=[
-                "Single scans as read: levelling is an offset or a polynomial of second degree, as stated."
-            ],
+            notes=["Single scans as read, levelled by an offset or a second-degree polynomial, as stated."],
         )
         write_noise_report(result, references, out)
         result.write(out)

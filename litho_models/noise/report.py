@@ -62,7 +62,9 @@ def noise_verdict(floor: NoiseFloor) -> str:
 def _references(page: Page, result: NoiseAnalysis, references: Sequence[Reference]) -> None:
     found = result.references
     page.heading("Reference prints")
-    page.figure(plots.surfaces(references), "Heights about their mean; substrate and flat share a scale.")
+    page.figure(
+        plots.surfaces(references), "Heights relative to their mean; substrate and flat have the same scale."
+    )
     page.heading("Reference prints in numbers", folded=True)
     rows = [
         {"use": use, **surface.model_dump()}
@@ -78,7 +80,7 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     if found.print_noise:
         page.table(
             found.print_noise,
-            "Roughness that the print adds, in quadrature, to that of substrate and microscope.",
+            "Roughness that the print adds in quadrature to the roughness of substrate and microscope.",
             "print_noise.csv",
         )
     for one in found.textures:
@@ -147,7 +149,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         "Scans left out. First: how many pixels lie inside the 90 % interval that was predicted for them. "
         "Second: where among the predicted heights the measured ones fall; flat if σ is right.",
     )
-    page.heading(f"What the uncertainty of {found.model} depends on", folded=True)
+    page.heading(f"Dependence of the uncertainty of {found.model} on its covariates", folded=True)
     page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     page.table(
         [row for one in found.calibrations for row in _covered(one, [one], {"levels", "pit", "scans"})],

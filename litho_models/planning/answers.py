@@ -127,7 +127,9 @@ def of_rivals(
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
     names = [rival.name for rival in question.rivals]
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
-    why = [f"difference of the nearest two rivals on one random print, in standard deviations: {ways}"]
+    why = [
+        f"difference between the two most similar rivals on one random print, in standard deviations: {ways}"
+    ]
     if question.spread:
         why.append(f"the evidence of a print varies by {100 * question.spread:.0f} %, beyond noise")
     if question.form_nm is not None:

@@ -20,7 +20,7 @@ WORDS = {
     TURNED: "turned by 90°",
     Way(direction=-1): "in the other direction",
     Way(tip=2): "with a new, sharp tip",
-    Way(pixel_size=0.5): "with pixels of half the size, as much time for each",
+    Way(pixel_size=0.5): "with half the pixel size and the same time per pixel",
 }
 _MOST_EXTRAS = 2
 # A further scan is planned if it increases the separation of the rivals at least by this factor.

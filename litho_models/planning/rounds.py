@@ -67,7 +67,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             f"prints of {store.path}",
             got=f"a plan for dataset {planned[:12]}…",
             wanted=f"a plan for {first.path}, {first.sha256[:12]}…",
-            hint="these prints answer another printer's questions",
+            hint="these prints were planned for the questions on another printer",
         )
     scans = store.scans()
     for scan in scans:

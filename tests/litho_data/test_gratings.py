@@ -99,7 +99,7 @@ def test_a_grating_is_a_row_of_a_plan_and_a_table_of_the_report(tmp_path):
     (found,) = grating_scans(store)
     assert found.bow_um == pytest.approx(0.05 * found.line_um / 4, abs=4 * found.bow_sd_um)
     report = next(tmp_path.glob("p*/report.html"))
-    assert "What the grating says about the microscope" in report.read_text("utf-8")
+    assert "Properties of the microscope from the grating" in report.read_text("utf-8")
 
     printed.write_text(printed.read_text("utf-8").replace("[grating]\nperiod_um = 1.0", ""), encoding="utf-8")
     with pytest.raises(InputError, match=r"grating of N0F1.*no \[grating\]"):

@@ -158,7 +158,7 @@ def test_layout_aware_levelling_with_gaps_and_mask() -> None:
 def test_a_layout_that_is_a_ramp_cannot_be_told_from_tilt() -> None:
     z, _ = tilted_substrate(11)
     ramp = np.broadcast_to(np.arange(SHAPE[1]) / 20.0, SHAPE)
-    with pytest.raises(InputError, match="the layout varies like the background"):
+    with pytest.raises(InputError, match="the layout cannot be told from the background"):
         level_layout_aware(z, layout_level=ramp, blur_px=0.0)
     for wrong, message in ((np.zeros((3, 3)), "shape"), (np.full(SHAPE, np.nan), "covers no measured pixel")):
         with pytest.raises(InputError, match=message):

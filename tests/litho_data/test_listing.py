@@ -72,7 +72,7 @@ def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_pat
     (tmp_path / "scans.csv").write_text("id,order\nP12,4\n", encoding="utf-8")
     listing = list_fields(card)
     assert [(one.id, one.order) for one in listing.fields] == [("P12", 4)]
-    assert listing.refused == {"P11": "not in scans.csv, which gives the order"}
+    assert listing.refused == {"P11": "not in scans.csv, which sets the order"}
     # If the table has no orders, no scan has an order, and all are kept, sorted by id.
     (tmp_path / "scans.csv").write_text("id,dose\nP12,1.5\n", encoding="utf-8")
     assert [(one.id, one.order) for one in list_fields(card).fields] == [("P11", 0), ("P12", 1)]

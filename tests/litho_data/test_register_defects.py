@@ -40,7 +40,7 @@ def test_a_defect_does_not_pull_the_warp_and_is_mapped(name: str) -> None:
     # This is the required accuracy. A plain fit is off by 0.5 to 1.2 px.
     assert rms_error_px(found, warp) < 0.1
     assert found.defects is not None
-    assert "something other than the print" in found.quality.warning
+    assert "does not show the print" in found.quality.warning
     # The map holds the added defect, except where it differs from the print by less than the misfit.
     truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
     frame = index_to_um((PITCH_UM, PITCH_UM))

@@ -147,7 +147,7 @@ def test_values_that_decode_but_differ_are_named(own_campaign: Path) -> None:
     root = zarr.open_group(own_campaign / "prints.zarr", mode="a", use_consolidated=False)
     array_of(root, "height_um")[2, 10, 10] += 1e-3
     found = named(own_campaign)
-    assert "height_um of scan P21: values are not those that were built" in found
+    assert "height_um of scan P21: values differ from those that were built" in found
     assert "attribute dataset_sha256" in found
     assert "P11" not in found
 

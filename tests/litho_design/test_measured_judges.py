@@ -259,7 +259,7 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     for camera, why in (
         ({"noise": 0.25}, "above the noise"),
         ({"gamma": 1 / 2.2}, "proportional"),
-        ({"exposure": 4.0}, "end of their range"),
+        ({"exposure": 4.0}, "at the lowest or highest value"),
     ):
         with pytest.raises(InputError, match=why):
             scored(**camera)

@@ -88,7 +88,7 @@ def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, m
     # The steps lie between levels, so a third of a step is lost by rounding. The judges err by no more than
     # this and a tenth.
     assert width.values("searched").max() > 3 * np.delete(width.values(), 0).max()
-    assert "models at hand print the layout “uncorrected” better" in judged.notes[-1]
+    assert "available models print the layout “uncorrected” better" in judged.notes[-1]
     said = width_sentence(judged)
     assert "3 models of this printer" in said
     assert "level 12 (0.480 to 1.320 µm)" in said

@@ -297,7 +297,7 @@ def test_taller_prints_end_the_strict_command_with_3(lab, tmp_path, monkeypatch,
 def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
     found = check(lab / "model", lab / "made.zarr", tmp_path / "out", new=["3", "7"])
     assert (found.figures[0].reference_prints, found.figures[0].new_prints) == (10, 2)
-    assert any("made of some of the new prints" in note for note in found.notes)
+    assert any("new prints were used to fit the model" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

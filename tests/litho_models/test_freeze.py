@@ -329,7 +329,7 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     with torch.no_grad():
         model.scan_axis.linear.weight.fill_(0.02)
     source = save_frozen(model, tmp_path / "source")
-    assert "Inside, beside them: `scan-axis`" in (source / README_FILE).read_text(encoding="utf-8")
+    assert "The model also contains `scan-axis`" in (source / README_FILE).read_text(encoding="utf-8")
     cards = {side: freeze(source, tmp_path / side, side) for side in ("printer", "microscope")}
     cards["left"] = freeze(source, tmp_path / "left")
     cards["again"] = freeze(tmp_path / "printer", tmp_path / "again")

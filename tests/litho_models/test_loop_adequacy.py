@@ -83,7 +83,7 @@ def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -
         (1.4, 0.0, {}, ""),  # 14 % of its gain in other shapes
         (1.6, 5.0, {}, "gain another 16 %"),
         (1.6, 5.4, {}, ""),  # more than twice as much again is left for causes that are missing
-        (1.6, 5.4, {"exhausts": ["fraction"]}, "beyond the largest possible one: fraction"),
+        (1.6, 5.4, {"exhausts": ["fraction"]}, "exceeds the largest possible one: fraction"),
         (1.4, 0.0, {"exhausts": ["fraction"]}, ""),
         # A range at its limit is another effect, however well the form fits.
         (0.0, 0.0, {"outgrows": ["length_px"]}, "outside the range of this effect: length_px"),

@@ -229,9 +229,9 @@ def test_a_folder_of_the_loop_is_frozen_as_its_model(closed, tmp_path: Path) -> 
 def test_texts_follow_the_verdict(closed) -> None:
     result, _, _ = closed
     words = {
-        "described": "no cause and no short law holds",
-        "nothing-missing": "Nothing is missing",
-        "unexplained": "Something is missing",
+        "described": "no cause and no short law is confirmed",
+        "nothing-missing": "These scans show nothing",
+        "unexplained": "The model lacks something",
         "too-few-scans": f"at least {result.fewest_scans} scans",
     }
     for verdict, text in words.items():
