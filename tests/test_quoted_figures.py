@@ -205,7 +205,7 @@ def test_the_results_page_quotes_the_draws_of_the_papers_split_and_the_seeds():
     )
     assert f"Physics {low['physics']:.2f} to {high['physics']:.2f} nm" in text
     ahead = [draw["pbl"] - draw["fno"] for draw in draws]
-    assert f"ahead of PBL by {min(ahead):.2f} to {max(ahead):.2f} nm in all four draws" in text
+    assert f"better than PBL by {min(ahead):.2f} to {max(ahead):.2f} nm in all four draws" in text
     prints = errors_nm("benchmark_prints.json") | errors_nm("benchmark_prints_pbl.json")
     shown = {"PBL": "pbl", "`features`": "features", "`linear`": "linear", "Physics": "physics"}
     for name, model in shown.items():
