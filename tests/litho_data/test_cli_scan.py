@@ -67,7 +67,7 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
     assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
 
 
-def test_warnings_of_a_levelling_step_go_to_stderr(app, tmp_path: Path) -> None:
+def test_a_levelling_step_warns_on_stderr_only(app, tmp_path: Path) -> None:
     """A block covers half of some lines, so that row alignment shifts them."""
     height = 0.003 * np.random.default_rng(0).standard_normal((128, 128))
     height[30:90, 20:90] += 0.8

@@ -174,7 +174,7 @@ class TestStrengthForRms:
 
     def test_knobs_within_the_nuisance_span_are_refused(self, jobs):
         for name in ("tilt-bow", "z-gain", "vertical-shrinkage", "datum-offset"):
-            with pytest.raises(InputError, match="no trace"):
+            with pytest.raises(InputError, match="no change beyond offset"):
                 strength_for_rms(name, 5.0, jobs=jobs)
 
     def test_bad_targets_of_a_strength_are_errors(self, jobs):

@@ -155,7 +155,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     # The scores are 6 and 4 dB below the ceiling, so the error is 10^(6/20) and 10^(4/20) times as large.
     assert "| 100 % |" in text
     assert "| 58 % |" in text
-    assert "pbl is best" in text
+    assert "those designed with pbl have the best" in text
     assert "over none +2.000 [-0.500, +4.500], which includes 0" in text
 
 

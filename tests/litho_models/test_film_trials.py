@@ -36,7 +36,9 @@ def test_an_answer_is_right_if_it_names_the_cause_and_nothing_else(
     tmp_path, monkeypatch: pytest.MonkeyPatch, named: list[str], right: bool
 ) -> None:
     row = SimpleNamespace(leading_nm=1.0)
-    effects = [SimpleNamespace(name=one, confusable_with=[]) for one in named]
+    causes = [SimpleNamespace(name=one, confusable_with=[], knowledge="cause") for one in named]
+    # A law is no name.
+    effects = [*causes, SimpleNamespace(name="edge-shift", knowledge="law")]
     result = SimpleNamespace(effects=effects, error=lambda stage: row)
     monkeypatch.setattr(film_trials, "simulate_films", lambda out, *more, **knobs: out.mkdir(parents=True))
     monkeypatch.setattr(film_trials, "build_dataset", lambda *more: None)
@@ -46,5 +48,5 @@ def test_an_answer_is_right_if_it_names_the_cause_and_nothing_else(
     assert found["right"] == right
     record = {"processes": {"e-beam": [found, {**found, "planted": "nothing", "right": True}]}}
     table = text_of(record)
-    assert f"| e-beam | etch_bias_um | {int(right)} of 1 | 1.00 → 1.00 nm |" in table
+    assert f"| e-beam | etch_bias_um | {int(right)} of 1 | 1 of 1 | 1.00 → 1.00 nm |" in table
     assert "| e-beam | nothing | 1 of 1 |" in table

@@ -311,7 +311,7 @@ def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_
         assert card.undetermined_effects == {}
         assert card.attributed == {"slope-thinning": side}
         page = (tmp_path / side / README_FILE).read_text(encoding="utf-8")
-        assert f"cannot tell: slope-thinning to the {side}." in page
+        assert f"do not show the cause: slope-thinning to the {side}." in page
     # A design includes what the printer does, but not what the microscope does.
     layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
     heights = [load_frozen(tmp_path / name)(layout) for name in ("printer", "microscope", "kept")]
