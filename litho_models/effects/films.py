@@ -5,7 +5,9 @@ Lengths are in pixels of the layout, which resolve the beam or lens of the machi
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -74,28 +76,22 @@ def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     return _moved(height, values["bias_px"], context)
 
 
-_shifts = partial(
-    entry,
-    role="undetermined",
-    of_films=True,
+_AS_LAW: dict[str, Any] = {
+    "role": "undetermined",
+    "source": "found in the residual; M̄ is the Gaussian mean of the film M (0 … 1) over a length",
+    "separating": "write straight edges beside bare ground and beside films of three widths, at five doses",
+    "knowledge": "law",
+}
+edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards by a constant", **_AS_LAW)
+
+
+@entry(
+    "edges shifted outwards by 2 M̄ - 1, which is 0 at a straight edge",
+    {**etch_bias.parameters, "length_px": Parameter("px", 10.0, 140.0, 25.0, "shape", tried=(15.0, 45.0))},
     stage="development",
     acts_on="height",
-    source="found in the residual; M̄ is the Gaussian mean of the film M (0 … 1) over a length",
-    separating="write straight edges beside bare ground and beside films of three widths, at five doses",
-    knowledge="law",
-)
-_SHIFT = {"shift_px": Parameter("px", -8.0, 8.0, 1.4, tried=(1.0, -1.0))}
-
-
-@_shifts("edges shifted outwards by a constant", _SHIFT)
-def edge_shift(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by the shift, whatever causes it."""
-    return _moved(height, values["shift_px"], context)
-
-
-@_shifts(
-    "edges shifted outwards by 2 M̄ - 1, which is 0 at a straight edge",
-    {**_SHIFT, "length_px": Parameter("px", 10.0, 140.0, 25.0, "shape", tried=(15.0, 45.0))},
+    of_films=True,
+    **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Move edges by the shift times the film within the length: outwards in dense places, inwards in sparse
@@ -103,7 +99,7 @@ def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext)
     """
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
-    return _moved(height, values["shift_px"] * (2 * nearby[0, 0] - 1), context)
+    return _moved(height, values["bias_px"] * (2 * nearby[0, 0] - 1), context)
 
 
 FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}

@@ -17,7 +17,7 @@ from functools import cache
 from torch import nn
 
 from litho_data.commands.progress import estimate
-from litho_models.effects import screened_effects
+from litho_models.effects import get_effect, screened_effects
 from litho_models.effects.films import FILM_LAWS
 from litho_models.effects.laws import LAWS, TABLES
 from litho_models.loop.checking import Check
@@ -195,7 +195,9 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
-        lawful = search(named.state, laws, 4, secants)
+        # A law with the formula of a named cause would only replace its name.
+        formulas = {get_effect(name).apply for name in named.names}
+        lawful = search(named.state, [law for law in laws if law.apply not in formulas], 4, secants)
         study.report("describing the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:

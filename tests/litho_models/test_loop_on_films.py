@@ -60,7 +60,7 @@ def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -
 
 
 def test_a_shift_by_density_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
-    values, law = {"shift_px": 5.0, "length_px": 10.0}, get_effect("edge-shift-by-density")
+    values, law = {"bias_px": 5.0, "length_px": 10.0}, get_effect("edge-shift-by-density")
     disc = _film(_disc(40, 129))
     # The Gaussian mean (sd L) at the edge of a disc is 1/2 - L / (2R sqrt(2 pi)), to first order in L / R,
     # and falls by 1 / (L sqrt(2 pi)) per pixel outwards. The moved edge is where shift and distance agree.
@@ -75,7 +75,7 @@ def test_a_shift_by_density_leaves_straight_edges_and_shrinks_a_disc_by_its_curv
 
 def test_a_constant_shift_is_the_bias_without_its_cause() -> None:
     film = _film(_disc(25))
-    shifted = get_effect("edge-shift")(film, {"shift_px": 1.5}, _context(film))
+    shifted = get_effect("edge-shift")(film, {"bias_px": 1.5}, _context(film))
     assert torch.equal(shifted, get_effect("etch-bias")(film, {"bias_px": 1.5}, _context(film)))
     assert {(one.knowledge, one.role, one.of_films) for one in FILM_LAWS.values()} == {
         ("law", "undetermined", True)
