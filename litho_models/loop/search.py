@@ -84,6 +84,7 @@ def search(
     Args:
         start: the current model; ``candidates``: effects that may be added.
         secants: secants of the candidates at a similar model; by default at the model itself.
+        seed: result of the same search with another base, whose causes are tried first.
     """
     found = Found(start) if seed is None else _seeded(start, seed)
     while len(found.causes) < most and _add_one(found, candidates, secants):
