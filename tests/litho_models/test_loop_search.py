@@ -65,6 +65,18 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
 
 
+@pytest.mark.parametrize("needed", [True, False])
+def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
+    """Another base lacked a loss on slopes; this one lacks a memory and perhaps the loss."""
+    seed = found_in((THINNING, ALL, {"": thinning(0.2)}))
+    assert added(seed) == {THINNING: ALL}
+    lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
+    found = search(bare_state(study_of(planted(lacking, seed=1))), CANDIDATES, seed=seed)
+    assert added(found) == {name: ALL for name, *_ in lacking}
+    if not needed:
+        assert found.refused[THINNING]
+
+
 def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
     """This also holds for a cause that was not added last."""
     values = {"1": thinning(0.1), "2": thinning(0.2)}
