@@ -110,8 +110,7 @@ def text_of(record: Mapping[str, Any]) -> str:
         for planted in dict.fromkeys(sorted(row["planted"] for row in rows)):
             own = [row for row in rows if row["planted"] == planted]
             edges = np.mean([row["edges_nm"] for row in own], axis=0)
-            right, lawful = (sum(map(bool, (row[key] for row in own))) for key in ("right", "laws"))
-            counts = (f"{count} of {len(own)}" for count in (right, lawful))
+            counts = (f"{sum(bool(row[key]) for row in own)} of {len(own)}" for key in ("right", "laws"))
             table.append((process, planted, *counts, "{:.2f} → {:.2f} nm".format(*edges)))
     return markdown_table(("process", "planted", "right", "with a law", "edges, held out"), table)
 

@@ -1,4 +1,4 @@
-"""Make typical mistakes with the three commands and the packages, in a folder of small inputs."""
+"""Run the three commands and the packages with typical mistakes of users, on small inputs."""
 
 from __future__ import annotations
 

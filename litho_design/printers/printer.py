@@ -121,8 +121,8 @@ class Printer(nn.Module):
         """Print levels that include the printer's halo on all sides, tile by tile; return the height, µm (b,
         1, y, x).
 
-        The backward pass prints each tile again, so memory grows with ``tile_px`` instead of the element. For
-        models of finite reach the result equals that of ``forward`` up to rounding; for others
+        The backward pass prints each tile again, so memory depends on ``tile_px`` and not on the element. If
+        the model has a finite reach, the result equals that of ``forward`` up to rounding. Otherwise
         ``tiling_check`` measures the difference.
         """
 

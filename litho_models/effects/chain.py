@@ -60,7 +60,7 @@ class EffectChain(nn.Module):
         self, layout_um: Tensor, context: FieldContext, known: Fields | None = None
     ) -> tuple[Tensor, Key]:
         """Apply the effects that act before the base model to the layout; see ``after_base``."""
-        return self._run_stage("layout", layout_um, context, {} if known is None else known, ())
+        return self._run_stage("layout", layout_um, context, known, ())
 
     def after_base(
         self, height_um: Tensor, context: FieldContext, known: Fields | None = None, key: Key = ()
@@ -72,11 +72,12 @@ class EffectChain(nn.Module):
                 ones are added.
             key: what ``height_um`` depends on.
         """
-        return self._run_stage("height", height_um, context, {} if known is None else known, key)[0]
+        return self._run_stage("height", height_um, context, known, key)[0]
 
     def _run_stage(
-        self, acts_on: ActsOn, field: Tensor, context: FieldContext, known: Fields, key: Key
+        self, acts_on: ActsOn, field: Tensor, context: FieldContext, known: Fields | None, key: Key
     ) -> tuple[Tensor, Key]:
+        known = {} if known is None else known
         for name, values in self.values.items():
             effect = get_effect(name)
             if effect.acts_on == acts_on:

@@ -86,7 +86,7 @@ def search(
         secants: secants of the candidates at a similar model; by default at the model itself.
         seed: result of the same search with another base, whose causes are tried first.
     """
-    found = Found(start) if seed is None else _seeded(start, seed)
+    found = _seeded(start, seed) if seed and seed.causes else Found(start)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
     _defend(found)
@@ -95,8 +95,6 @@ def search(
 
 def _seeded(start: State, seed: Found) -> Found:
     """Add all causes that were found with another base, and remove those that this base does not need."""
-    if not seed.causes:
-        return Found(start)
     twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
     found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
     _test_again(found)

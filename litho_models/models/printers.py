@@ -139,7 +139,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A relief with many levels that a laser writes into a resist with a contrast curve."""
+    """A relief of many levels, written by a laser in a resist with a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -151,7 +151,7 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A relief with many levels that micromirrors expose in a resist that spreads its dose."""
+    """A relief of many levels, exposed by micromirrors in a resist in which the dose diffuses."""
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig

@@ -96,7 +96,7 @@ def blend_tiles(
     size, overlap = tile
     stride = size - overlap
     window = blending_window(tile, layout_um)
-    # All positions are counted from the start of the first tile that the whole field would have.
+    # Positions are counted from the start of the first tile, ``overlap`` pixels before the field.
     (top, bottom), (left, right) = (
         (overlap + border_px, overlap + length - border_px) for length in layout_um.shape[-2:]
     )

@@ -1,4 +1,4 @@
-"""Files from others that were once read wrongly give the described map, or a message that says why not."""
+"""Files that an earlier version misread give the right map, or a message with the reason."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_a_packed_store_that_has_lost_a_file_is_refused(own_campaign: Path, tmp_
 
 
 def put(store: Path, name: str, value: Any, place: Any = 1) -> None:
-    """Write a value into an array, and change the type of the array where needed."""
+    """Write a value into an array of a store; a float turns an array of integers into floats."""
     root = zarr.open_group(store, mode="a", use_consolidated=False)
     old = array_of(root, name)
     values: Any = old[...]

@@ -1,4 +1,4 @@
-"""The joint search finds all planted effects with their groupings, and nothing else."""
+"""The search finds every planted effect with its grouping, and no other effect."""
 
 from __future__ import annotations
 
