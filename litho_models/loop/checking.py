@@ -91,7 +91,7 @@ class Check:
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
-            if gain_nm2 < 0.1 * other.judgement.gain_nm2:
+            if other.name != cause.name and gain_nm2 < 0.1 * other.judgement.gain_nm2:
                 if get_effect(other.name).knowledge == "law":
                     return other.name
                 neither = without.without(other.name)

@@ -190,14 +190,15 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     """
     study = start.study
     # Tables describe heights, not films.
-    laws = [*(FILM_LAWS if study.of_films else LAWS).values()]
+    families = [*(FILM_LAWS if study.of_films else LAWS).values()]
     tables = [] if study.of_films else [*TABLES.values()]
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
         # A law with the formula of a named cause would only replace its name.
         formulas = {get_effect(name).apply for name in named.names}
-        lawful = search(named.state, [law for law in laws if law.apply not in formulas], 4, secants)
+        laws = [law for law in families if law.apply not in formulas]
+        lawful = search(named.state, laws, 4, secants)
         study.report("describing the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:

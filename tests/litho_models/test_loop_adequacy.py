@@ -237,3 +237,10 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     monkeypatch.setattr(checking, "get_effect", lambda name: get_effect("slope-thinning"))
     assert check._larger(minor, without[small]) == corrected
     assert check._larger(large, without["slope-x-power"]) == ""
+
+
+def test_a_cause_does_not_correct_its_own_formula(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the other causes it may gain less than a tenth of what it gained before they were added."""
+    monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 100.0)
+    cause = gaining("slope-thinning", 60)
+    assert not Check(leaving(95), [cause], [], [], 1000.0, None).of(cause).corrects
