@@ -8,8 +8,9 @@ PUBLISH ?=
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 CPUS ?=
-# Errors only: setuptools warns of every editable installation.
-INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
+# Errors only: setuptools warns of every editable installation. Python compiles what it imports; to compile every
+# file of every package takes longer than to install them.
+INSTALL := $(BIN)/python -m pip install -qq --no-compile --disable-pip-version-check --constraint constraints.txt
 # Two test processes on two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal

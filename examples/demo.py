@@ -23,6 +23,7 @@ from litho_models.loop.report import said
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
+WORKERS = ("--workers", 2)
 # Seeds of the draws of the paper's split.
 PAPER_SEEDS = (0, 1, 2, 3)
 # The networks are not trained with whole prints left out: that would double the time of the demo.
@@ -49,8 +50,8 @@ class Effort:
 # An element of 256 px resolves wavelength x distance / side: 0.6 µm at a distance of 25 µm. The target's
 # letters have strokes of 0.8 µm.
 QUICK = Effort(
-    models="identity,affine,blur-table,physics,pbl",
-    arms=("physics", "pbl"),
+    models="identity,affine,blur-table,physics",
+    arms=("physics",),
     training_steps=60,
     folds=2,
     element_px=256,
@@ -119,7 +120,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         source,
         Step(
             "Build the dataset",
-            _data("build", card, "--out", store, "--workers", 2),
+            _data("build", card, "--out", store, *WORKERS),
             store,
             out / "store-report" / "report.html",
         ),
@@ -127,14 +128,14 @@ def plan(out: Path, dataset: str) -> list[Step]:
             "Compare the models on held-out scans",
             _models(
                 "benchmark", store, "--models", effort.models,
-                "--folds", effort.folds, *training, "--out", out / "benchmark",
+                "--folds", effort.folds, *training, *WORKERS, "--out", out / "benchmark",
             ),
             out / "benchmark" / "benchmark.json",
             out / "benchmark" / "report.html",
         ),
         Step(
             "Close the loop: what does the model lack?",
-            _models("close-loop", store, *anew, "--out", loop),
+            _models("close-loop", store, *anew, *WORKERS, "--out", loop),
             loop / "close_loop.json",
             loop / "report.html",
         ),
@@ -181,30 +182,41 @@ def plan(out: Path, dataset: str) -> list[Step]:
     judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")
     arms = effort.arms if dataset else (*effort.arms, CORRECTED)
     models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in arms)])
-    steps += [
-        Step("Freeze the corrected model", _models("freeze", loop, "--out", corrected), corrected),
-        Step(
-            "Design a hologram through the learned printer",
-            _design("hoe", "--model", out / "models" / "pbl", *element, "--out", out / "hoe"),
-            out / "hoe" / "design.json",
-            out / "hoe" / "report.html",
-        ),
-        Step(
-            "Judge it by a printer that it was not designed with",
-            _design("score", out / "hoe", "--judge", f"corrected={corrected}", "--out", out / "score"),
-            out / "score" / "score.json",
-            out / "score" / "report.html",
-        ),
+    steps.append(Step("Freeze the corrected model", _models("freeze", loop, "--out", corrected), corrected))
+    if dataset:
+        steps += [
+            Step(
+                "Design a hologram through the learned printer",
+                _design("hoe", "--model", out / "models" / "pbl", *element, "--out", out / "hoe"),
+                out / "hoe" / "design.json",
+                out / "hoe" / "report.html",
+            ),
+            Step(
+                "Judge it by a printer that it was not designed with",
+                _design("score", out / "hoe", "--judge", f"corrected={corrected}", "--out", out / "score"),
+                out / "score" / "score.json",
+                out / "score" / "report.html",
+            ),
+        ]
+    steps.append(
         Step(
             "Designed with × judged with",
             _design(
-                "compare", "--models", models, *judge, *element,
-                "--seeds", effort.seeds, "--out", out / "compare",
+                "compare",
+                "--models",
+                models,
+                *judge,
+                *element,
+                "--seeds",
+                effort.seeds,
+                *WORKERS,
+                "--out",
+                out / "compare",
             ),
             out / "compare" / "gap.json",
             out / "compare" / "report.html",
-        ),
-    ]  # fmt: skip
+        )
+    )
     return steps
 
 
