@@ -1,13 +1,13 @@
-"""Measure whether `litho-design correct` brings prints closer to reliefs, by independent judges.
+"""Measure with independent judges whether `litho-design correct` makes prints match their target reliefs.
 
     python -m benchmarks.corrections --out runs/corrections [--publish]
 
-Five reliefs are printed by three virtual fabs, with the effects of benchmarks.gap that no model has, and by
-a model of the zoo. Three models of different form make each correction. For a fab they are trained on scans
-of its prints. For the measured prints they are models of the zoo, and PBL is the judge. Each correction is
-compared with two layouts that are not optimised: nominal heights, and the best affine layout (gain and zero).
-Gain and zero are chosen by the models of the search and also by the judge, which is impossible before a
-print. An interrupted run resumes.
+Five reliefs are printed by three virtual fabs and by a model of the zoo. The fabs have the effects of
+benchmarks.gap, which no model has. Each correction is made with three models that have different formulas.
+For a fab, they are trained on scans of its prints. For the measured prints, they are models of the zoo, and
+PBL is the judge. Each correction is compared with two simple layouts: nominal heights, and the best affine
+layout (gain and zero). Its gain and zero are chosen once by the models of the search, and once by the judge,
+which is impossible before printing. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ FAB_MODELS = ("physics", "blur-table", "linear")
 ZOO_MODELS, ZOO_JUDGE = tuple(f"zoo:{name}" for name in FAB_MODELS), "zoo:pbl"
 SCANS, SCAN_PX, SIZE_PX, POLISH = 6, 128, 128, 40
 COLUMNS = {
-    "uncorrected": "nominal",
-    "best affine": "best affine, by the models",
-    "affine by the judge": "by the judge",
+    "uncorrected": "nominal heights",
+    "best affine": "best affine, chosen by the models",
+    "affine by the judge": "best affine, chosen by the judge",
     "corrected": "corrected",
 }
 ALLOWED = 1.05
@@ -78,7 +78,7 @@ def main() -> None:
 def corrected(
     relief: str, seed: int, models: Sequence[Printer], judge: Printer, out: Path, settings: ReliefSettings
 ) -> dict[str, Any]:
-    """Make one correction; return the rms errors, nm, of its print and of the uncorrected layouts' prints."""
+    """Make one correction; return the rms errors, nm, of the prints of all layouts in `COLUMNS`."""
     wanted = wanted_um(relief, seed, settings)
     made = correct(wanted, models[0], out, settings=settings, judges=models[1:], announce=False)
     inputs = {"relief_um": wanted}
@@ -120,7 +120,7 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return the summary, and a table with one line for each relief and kind of printer, over all seeds."""
+    """Return the summary, and a table with a row for each relief and printer; a cell covers all seeds."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in record["rows"]:
         groups.setdefault((row["relief"], row["judge"]), []).append(row)
@@ -130,7 +130,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     ]
     heads = ("relief", "printed by", *COLUMNS.values())
     note = (
-        "Rms error of the print in nm, without its mean error; the reliefs are 0.6 µm high and "
+        "Rms error of the print in nm, after its mean error is subtracted. The reliefs are 0.6 µm high and "
         f"{record['size_px']} px wide."
     )
     return f"{summary(record['rows'])}\n\n{markdown_table(heads, lines, note)}"
@@ -150,11 +150,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
     named = f" ({', '.join(listed)})" if listed else ""
     median = np.median([over_idle(row) for row in rows])
     return (
-        f"Of {len(rows)} corrections {len(worse)} print more than 5 % worse than nominal heights or the "
-        f"best affine, whichever is better{named}. In the median, the error of a correction is "
-        f"{median:.2f} × that of the better of these two layouts; for a blaze it is "
-        f"{np.median(blazes):.2f} × that of the best affine. "
-        f"{len(inside)} of {len(rows)} prints have an error in the stated range."
+        f"Of {len(rows)} corrections, {len(worse)} print more than 5 % worse than nominal heights or the "
+        f"best affine layout, whichever is better{named}. The median error of a correction is "
+        f"{median:.2f} × that of the better of these two layouts; for a blaze, it is "
+        f"{np.median(blazes):.2f} × that of the best affine layout. "
+        f"The errors of {len(inside)} of {len(rows)} prints lie in the stated range."
     )
 
 
@@ -165,13 +165,13 @@ def holds(row: Mapping[str, Any]) -> bool:
 
 
 def over_idle(row: Mapping[str, Any], idle: Sequence[str] = ("uncorrected", "best affine")) -> float:
-    """Return the error of a correction relative to the best of the ``idle`` layouts, by the judge."""
+    """Return the error of a correction divided by that of the best ``idle`` layout, both by the judge."""
     printed = row["printed_nm"]
     return float(printed["corrected"] / min(printed[name] for name in idle))
 
 
 def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[Printer], Printer]]:
-    """Yield seed, models of a printer, and judge; what exists in the folder is not made again."""
+    """Yield the seed, the models and the judge of each printer; make those missing in the folder."""
     for seed in SEEDS:
         folder = out / f"fab-{seed}"
         store = folder / "prints.zarr"
@@ -191,7 +191,7 @@ def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[P
 
 
 class _Plain(ReliefTask):
-    """Find the affine layouts of least rms error, without the models' errors on their training prints."""
+    """Find the best affine layouts; the loss omits the models' errors on their training prints."""
 
     loss_by = Task.loss_by
 
@@ -202,7 +202,7 @@ def _rms_nm(task: ReliefTask, level: torch.Tensor) -> float:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = options(__doc__, "write record and table into docs")
+    parser = options(__doc__, "write the record and the table into docs")
     parser.add_argument("--out", type=Path, required=True, help="folder of fabs, models and designs")
     parser.add_argument("--size", type=int, default=SIZE_PX, help="side of the reliefs, pixels")
     return parser.parse_args()

@@ -2,10 +2,10 @@
 
     python -m benchmarks.fan_out [--publish]
 
-The element is 12.8 µm wide. Neighbouring spots are two diffraction limits apart. Power and uniformity of the
-spots are those of the printed layout. The printer is Physics of the zoo or prints nominal heights. The
-element is compared with a continuous phase designed with the same loss, and with the phase of
-Gerchberg-Saxton, continuous and rounded to the nearest of 13 levels.
+The element is 12.8 µm wide. Neighbouring spots are two diffraction limits apart. The power and uniformity of
+the spots are computed for the printed layout. The printer is Physics of the zoo, or prints nominal heights.
+The element is compared with a continuous phase designed with the same loss, and with the Gerchberg-Saxton
+phase, both continuous and rounded to the nearest of 13 levels.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class FanOut(Task):
     errors = ("uniformity_error",)
 
     def powers(self, seen: Tensor) -> Tensor:
-        """Return the share of power in each spot (49,), up to two thirds of a diffraction limit away."""
+        """Return the share of power in each spot (49,), within 2/3 of a diffraction limit of its centre."""
         return torch.einsum("kyx,vyx->k", _spots().to(seen), seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ class FanOut(Task):
         return nearest_levels(_gerchberg_saxton(self), level_phase)
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Return the share of light outside the spots plus the relative standard deviation of powers."""
+        """Return the share of light outside the spots plus the relative standard deviation of power."""
         powers = self.powers(seen)
         return 1 - powers.sum() + powers.std(correction=0) / powers.mean()
 
@@ -80,7 +80,7 @@ class FanOut(Task):
 def main() -> None:
     """Design and compare the elements, print the table, and write the record."""
     given = options(
-        __doc__, "write record, table and figure into docs", Path("runs/fan_out.json")
+        __doc__, "write the record, the table and the figure into docs", Path("runs/fan_out.json")
     ).parse_args()
     torch.set_num_threads(1)
     settings = design_settings(SETTINGS)
@@ -128,7 +128,7 @@ def _spots() -> Tensor:
 
 
 def _phases(task: FanOut) -> dict[str, Tensor]:
-    """Return the phase of each cell, in radians, of the elements with continuous phase."""
+    """Return, for each element with continuous phase, the phase of each cell in radians."""
     phase = _gerchberg_saxton(task)
     free = phase.clone().requires_grad_()
     optimiser = torch.optim.Adam([free], lr=0.1)
@@ -152,7 +152,7 @@ def _height_um(task: FanOut, phase: Tensor) -> Tensor:
 
 
 def _draw(task: FanOut, seen: Mapping[str, Tensor], path: Path) -> None:
-    """Draw the power of each spot relative to their mean, and the image of the designed element."""
+    """Draw the power of each spot relative to the mean power, and the image of the designed element."""
     shown = [name for name in seen if "13 levels" in name or name.startswith(("continuous", "designed"))]
     figure = new_figure(10, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))

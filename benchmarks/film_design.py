@@ -1,9 +1,10 @@
-"""A film corrected through the printer of parts of the second machine, and judged by other models.
+"""Correct the layout of a film through the model of the second machine, and judge it by other models.
 
     python -m benchmarks.film_design prefab-soi.zarr [--publish]
 
-What is wanted is the layout of a locked pattern, so no model was trained on it. `e-beam` corrects, a blur
-with a table and random features judge. They share its micrographs, but no formula.
+The target is the layout of a locked pattern, so no model was trained on it. The layout is corrected through
+`e-beam`. `blur-table` and `random-features` judge it: they were trained on the same micrographs, but have
+other formulas.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ if TYPE_CHECKING:
 RESULT = MACHINE.with_name("film_design.json")
 PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
 DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
-# Beyond the design nothing is written, which the pattern does not say of its surroundings.
+# The prediction assumes that nothing is written outside the design. So the rim is not scored.
 RIM_PX = 24
-PICTURE = """![Corrected layout; wanted film and edges of both prints](results/second-machine/design.png)
+PICTURE = """![Corrected layout; target film and edges of both prints](results/second-machine/design.png)
 
-*The corrected layout (grey: part of the dose), and the edges that `blur-table` predicts for both layouts.*"""
+*The corrected layout (grey: partial dose), and the edges that `blur-table` predicts for both layouts.*"""
 
 
 def main() -> None:
-    """Train, correct, judge, write."""
-    parser = options(__doc__, "write the table into the page", RESULT)
+    """Train the models, correct the layout, judge both layouts, and write the record."""
+    parser = options(__doc__, "write table and picture into docs", RESULT)
     parser.add_argument("store", type=Path)
     parser.add_argument("--cache", type=Path, default=Path("runs/film-design"), help="models and design")
     given = parser.parse_args()
@@ -84,7 +85,7 @@ def main() -> None:
 
 
 def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
-    """A relief of one height, at the pitch and levels of the store."""
+    """Return settings for a relief with the pitch and levels of a scan."""
     geometry = {"pitch_um": scan.pitch_um, "cell_um": scan.pitch_um, "levels": scan.levels}
     geometry |= {"size_px": size_px, "level_height_um": scan.level_height_um}
     changes = {f"layout.{name}": value for name, value in geometry.items()}
@@ -92,7 +93,7 @@ def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
 
 
 def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
-    """The middle square of the layout as the film that is to be printed; its rim is not scored."""
+    """Return the middle square of the layout as the target film; its rim is not scored."""
     top, left = ((length - size_px) // 2 for length in scan.shape)
     level = scan.mask_level[top : top + size_px, left : left + size_px]
     inner = np.pad(np.ones([size_px - 2 * RIM_PX] * 2, bool), RIM_PX)
@@ -101,7 +102,7 @@ def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
 
 
 def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Printer:
-    """A model trained on the store, frozen, as a printer."""
+    """Return a printer with a model trained on the store; train and freeze the model if necessary."""
     folder = cache / name
     if not (folder / "printer" / "card.json").is_file():
         train(store, name, folder / "run", settings={"nuisance": "none"})
@@ -111,14 +112,14 @@ def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Pr
 
 @torch.no_grad()
 def printed(by: Printer, layout_um: np.ndarray, settings: ReliefSettings) -> np.ndarray:
-    """Predicted height (y, x), µm, of a layout in heights."""
+    """Return the predicted height (y, x), µm, of a layout whose values are heights in µm."""
     levels = torch.from_numpy(layout_um / np.float32(settings.layout.level_height_um))
     return by(levels[None, None])[0, 0].numpy()
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """A row for each model and layout."""
-    heads = ("predicted by", "layout", "edges, mean", "P95", "area", "missing", "extra", "merged")
+    """Return the picture, and a table with a row for each model and layout, as Markdown."""
+    heads = ("predicted by", "layout", "edge error, mean", "P95", "area error", "missing", "extra", "merged")
     rows = [
         (
             *(row[key] for key in ("model", "layout")),
@@ -132,7 +133,7 @@ def text_of(record: Mapping[str, Any]) -> str:
 
 
 def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.ndarray]) -> Figure:
-    """The corrected layout, and the edges of both prints on the film that is wanted."""
+    """Draw the corrected layout, and the edges of both prints on the target film."""
     figure = new_figure(10, 3.6)
     first, *others = figure.subplots(1, 3)
     cut = (slice(RIM_PX, -RIM_PX),) * 2
@@ -141,7 +142,7 @@ def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.
     for axes, (kind, height_um) in zip(others, prints.items(), strict=True):
         axes.imshow(wanted_um[cut], cmap="Greys_r", alpha=0.5)
         axes.contour(height_um[cut], [wanted_um.max() / 2], colors=["#c23b22"], linewidths=1.3)
-        axes.set_title(f"wanted film, edges of the {kind} print", fontsize=9)
+        axes.set_title(f"target film, edges of the {kind} print", fontsize=9)
     for axes in (first, *others):
         axes.set_axis_off()
     return figure

@@ -1,9 +1,10 @@
-"""Blind trials on films: the fab plants a cause or none, and the loop has to name it and nothing else.
+"""Run blind trials on films: the fab plants one cause or none, and the loop has to name exactly this.
 
     python -m benchmarks.film_trials [--process e-beam] [--seed 1] [--only 0,3] [--publish]
 
-Ten trials a process: seven with one cause each, three empty. Dose and charging differ in all. The loop sees
-the store alone, with the bare printer of the process as its base. An interrupted run resumes.
+Each process has ten trials: seven with one cause each, and three without. Dose and charging differ in all
+trials. The loop sees only the store. Its base model is the bare printer of the process. An interrupted run
+resumes.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, simulate_film
 from litho_models.loop.run import close_loop
 
 RESULT = MACHINE.with_name("film_trials.json")
-# Two films are locked, coarse ones may not register, and eight have to remain to confirm anything.
+# Two films are locked, and coarse films may fail to register. To confirm anything, eight must remain.
 COUNT, SIZE_PX = 18, 208
 EFFECTS = {
     "backscatter": "electron-backscatter",
@@ -43,7 +44,7 @@ BASES: dict[str, dict[str, Any]] = {
 
 
 class Trial(NamedTuple):
-    """What is planted, by its knob; empty for nothing."""
+    """One trial: its number, the knob of the planted cause (empty for none), and all knobs."""
 
     number: int
     cause: str
@@ -51,7 +52,7 @@ class Trial(NamedTuple):
 
 
 def draw(process: str, seed: int) -> list[Trial]:
-    """The trials of a process, in random order; sizes in pixels of the layout."""
+    """Draw the trials of a process in random order; lengths are drawn in layout pixels."""
     rng = np.random.default_rng([seed, *process.encode()])
     pitch_um = FILM_PRINTERS[process].pitch_um
     causes = rng.permutation([*PLANTED, *[""] * EMPTY]).tolist()
@@ -71,7 +72,7 @@ def draw(process: str, seed: int) -> list[Trial]:
 
 
 def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
-    """Print, build, close the loop, judge: ``right`` where the cause, or nothing, is all that is named."""
+    """Run and judge one trial. It is ``right`` if exactly the planted cause, or nothing, is named."""
     own = folder / f"{trial.number}"
     card = simulate_films(
         own / "fab", process, count=COUNT, size_px=SIZE_PX, seed=seed * 100 + trial.number, knobs=trial.knobs
@@ -96,7 +97,7 @@ def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
 
 
 def line_of(row: Mapping[str, Any]) -> str:
-    """One trial in a line."""
+    """Return one trial as one line of text."""
     named = "; ".join(" or ".join(one) for one in row["named"]) or "nothing"
     named += "".join(f", law {one}" for one in row["laws"])
     edges = "{:.2f} → {:.2f} nm".format(*row["edges_nm"])
@@ -104,7 +105,7 @@ def line_of(row: Mapping[str, Any]) -> str:
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """A row for each process and cause."""
+    """Return a table with a row for each process and cause."""
     table = []
     for process, rows in record["processes"].items():
         for planted in dict.fromkeys(sorted(row["planted"] for row in rows)):
@@ -112,16 +113,16 @@ def text_of(record: Mapping[str, Any]) -> str:
             edges = np.mean([row["edges_nm"] for row in own], axis=0)
             counts = (f"{sum(bool(row[key]) for row in own)} of {len(own)}" for key in ("right", "laws"))
             table.append((process, planted, *counts, "{:.2f} → {:.2f} nm".format(*edges)))
-    return markdown_table(("process", "planted", "right", "with a law", "edges, held out"), table)
+    return markdown_table(("process", "planted", "right", "with a law", "held-out edge error"), table)
 
 
 def main() -> None:
-    """Run the trials of the processes, keep each, and write what came out."""
-    parser = options(__doc__, "write the table into the page of the second machine", RESULT)
+    """Run the missing trials of the processes, and write the record of all trials."""
+    parser = options(__doc__, "write the table into docs/second_machine.md", RESULT)
     parser.add_argument("--cache", type=Path, default=Path("runs/film-trials"), help="a folder per trial")
-    parser.add_argument("--process", default=",".join(BASES), help="with commas")
+    parser.add_argument("--process", default=",".join(BASES), help="processes, separated by commas")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="numbers of trials, with commas; all by default")
+    parser.add_argument("--only", default="", help="numbers of trials, separated by commas; all by default")
     given = parser.parse_args()
     wanted = [int(one) for one in given.only.split(",") if one] or range(len(PLANTED) + EMPTY)
     processes: dict[str, list[dict[str, Any]]] = {}

@@ -1,4 +1,4 @@
-"""Write tables in Markdown, and errors with their intervals for a cell."""
+"""Make tables in Markdown, and the text of errors with their confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: 
 
 
 def with_interval(value: float, interval: Sequence[float] | None) -> str:
-    """Return the text of an error and of its interval, if there is one, in nm."""
+    """Return the text of an error in nm, with its confidence interval if there is one."""
     return f"{value:.2f} nm" + (f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else "")

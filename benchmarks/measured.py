@@ -1,9 +1,9 @@
-"""Copy the results of the run on measured prints into the documentation: small files, tables, figures.
+"""Copy the results for the measured prints into the documentation: small files, tables and figures.
 
     make demo DATASET=neural-lithography
     python -m benchmarks.measured runs/neural-lithography
 
-Writes all figures that the pages quote from the result files; a test checks that the pages agree with them.
+Writes all numbers that the pages quote from the result files. A test checks that the pages agree with them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PAGES = {
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the text to publish at each mark of the pages, from the result files in a folder."""
+    """Return the text to publish at each mark of the pages, made from the result files in a folder."""
     benchmark, noise = in_table(folder), _found(folder, "noise.json")
     return {
         "headline": headline_table(benchmark, noise),
@@ -55,7 +55,7 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def in_table(folder: Path) -> dict[str, Any]:
-    """Return the benchmark that the table shows: the newest result of each model."""
+    """Return the benchmark that the table shows, with the newest result of each model."""
     networks = in_one(_found(folder, "benchmark.json"), _found(folder, "benchmark_pbl.json"))
     return in_one(networks, _found(folder, "benchmark_least_squares.json"))
 
@@ -77,7 +77,7 @@ def main() -> None:
     if "benchmark_pbl.json" in made:
         draw_prediction(runs / "store.zarr", runs / "benchmark-pbl", FOLDER / "prediction.jpg")
     if kept := [name for name in RESULTS if name not in made]:
-        print(f"not in {runs}, left as they were: {', '.join(kept)}")
+        print(f"not found in {runs}, so the published files are kept: {', '.join(kept)}")
     written = texts(FOLDER)
     for page, name in PAGES.items():
         publish(page, name, written[name])

@@ -1,4 +1,4 @@
-"""Publish the closed loop on the measured prints: its record, and the tables and picture of its page.
+"""Publish the results of the closed loop on the measured prints: the record, the tables and the picture.
 
 litho-models close-loop runs/neural-lithography/store.zarr --nested prints --out runs/causes
 python -m benchmarks.measured_causes runs/causes
@@ -27,17 +27,17 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "measured_prints.md"
 FOLDER = ROOT / "docs" / "results" / "neural-lithography" / "causes"
 PICTURE = "errors.png"
-_MODELS = {"base": "the base", "causes": "with the causes", "all": "with all that was found"}
+_MODELS = {"base": "base model", "causes": "with the causes", "all": "with all findings"}
 _MEASURED = {
     "print alone": "nothing",
-    "published": "the smooth background that all scans share (published protocol)",
+    "published": "the shared smooth background (published protocol)",
     "shared": "the measurement model",
 }
 _HELD_OUT = {
     "scans": "five folds of scans",
-    "prints": "whole prints, chosen with them",
-    "nested prints": "whole prints, everything chosen without them",
-    "nested folds": "five folds of scans, everything chosen without them",
+    "prints": "whole prints; causes chosen with them",
+    "nested prints": "whole prints; all chosen without them",
+    "nested folds": "five folds of scans; all chosen without them",
 }
 
 
@@ -47,7 +47,7 @@ def texts(result: CloseLoop) -> dict[str, str]:
 
 
 def errors_table(result: CloseLoop) -> str:
-    """Return the table of errors: a row per model, measurement model and choice of held-out scans."""
+    """Return the table of errors, with a row per model, measurement model and kind of held-out scans."""
     keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
     rows = []
     for model, measurement, held_out in keys:
@@ -66,18 +66,26 @@ def errors_table(result: CloseLoop) -> str:
             ]
         )
     return markdown_table(
-        ["model", "what is added to the print", "held out", "numbers", "k = 1", "k = 7"],
+        ["model", "what is added to the print", "held out", "parameters", "k = 1", "k = 7"],
         rows,
-        f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans; only "
-        "k terms are fitted to a scored scan, on its other pixels. Numbers: of the printer + measurement "
-        "model. Intervals: 95 %, bootstrap over scans.",
+        f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans. Only "
+        "k terms are fitted to a scored scan, on pixels that are not scored. Parameters: printer + "
+        "measurement model. Intervals: 95 %, bootstrap over scans.",
     )
 
 
 def causes_table(result: CloseLoop) -> str:
     """Return the table of the effects that the loop added, with their strengths."""
     return markdown_table(
-        ["added", "by", "size (95 % over prints)", "error without it", "scans better", "or", "also on"],
+        [
+            "effect",
+            "groups",
+            "size (95 % over prints)",
+            "error without it",
+            "scans improved",
+            "looks like",
+            "also with base",
+        ],
         [
             [
                 f"`{one.name}`{' (described)' if one.knowledge == 'description' else ''}",
@@ -110,8 +118,8 @@ def picture(result: CloseLoop) -> Figure:
     rows: list[tuple[str, ErrorRow | None]] = [
         ("base, published protocol", result.error("base", "offset", "published")),
         ("base with the measurement model", result.error("base")),
-        ("with what was found", result.error("all")),
-        ("the same, whole prints left out", result.error("all", held_out="prints")),
+        ("with all findings", result.error("all")),
+        ("with all findings, whole prints held out", result.error("all", held_out="prints")),
     ]
     shown = [(label, row) for label, row in rows if row is not None]
     figure = new_figure(9, 0.7 * len(shown) + 1)
@@ -124,7 +132,7 @@ def picture(result: CloseLoop) -> Figure:
     axes.set_yticks(range(len(shown)), [label for label, _ in shown])
     axes.invert_yaxis()
     axes.margins(y=0.25)
-    axes.set_xlabel("mean absolute error of each held-out scan, its zero free (nm)")
+    axes.set_xlabel("mean absolute error of each held-out scan, offset fitted (nm)")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 

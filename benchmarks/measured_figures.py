@@ -12,7 +12,7 @@ from litho_data.store import open_store
 
 
 def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl") -> None:
-    """Draw layout, print, held-out prediction and difference, for the scan with the model's median error."""
+    """Draw layout, print, held-out prediction and difference for the scan with the model's median error."""
     result = json.loads((benchmark / "benchmark.json").read_text(encoding="utf-8"))
     rows = next(s for s in result["scores"] if s["model"] == model)["scans"]
     errors = [row["mae_datum_free_nm"] for row in rows]
@@ -22,7 +22,7 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
     difference = 1e3 * np.where(scan.valid, scan.height_um - prediction, np.nan)
     difference -= np.nanmedian(difference)
     measured = np.where(scan.valid, scan.height_um, np.nan)
-    # Layout and print have different scales: a print is lower than its layout and has another zero.
+    # Layout and print have separate colour scales, because a print is lower and has another zero height.
     low, high = np.nanpercentile(measured, (0.1, 99.9))
     printed = float(low), float(high)
     panels: list[tuple[str, np.ndarray, str, tuple[float, float]]] = [

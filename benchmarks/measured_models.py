@@ -1,4 +1,4 @@
-"""Write the tables of the run on measured prints: errors of models on held-out scans, and the noise."""
+"""Make the tables for the measured prints: errors of the models on held-out scans, and the noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FREE = {
 
 
 def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
-    """Merge two benchmarks on the same scans: models of the newer one, and those that only the older one has.
+    """Merge two benchmarks on the same scans; for a model in both, use the newer result.
 
     Networks take long to train, so a changed model is benchmarked again without the others.
 
@@ -46,9 +46,9 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     """Return the table of held-out errors, one row per model, with the noise floor in the last row."""
     heads = (
         "model",
-        "datum-free error (zero of each scan free, k = 1)",
-        "the same without the shared background",
-        "with tilt, bow and gain free, k = 7",
+        "datum-free error (offset fitted per scan, k = 1)",
+        "the same, without the shared background",
+        "gain, tilt and bow also fitted, k = 7",
         "absolute error",
         "parameters",
     )
@@ -67,19 +67,19 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     return markdown_table(
         heads,
         rows,
-        f"Mean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
-        f"by scan, seed {split['seed']}; {len(split['lock_box'])} locked scans are in no fold and in no "
-        f"figure of this table; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. "
-        "Per-scan terms are fitted on pixels that are not scored. Levelling leaves a shared background in "
-        "every map. Its five numbers come from the training scans; it is added to predictions of measured "
-        "maps, but not to designs. The noise is an upper estimate ([how](../../noise.md)); its intervals "
-        "are over prints. A better model can reduce an error at least by its excess over the noise. "
-        f"This excess at k = 1 and 7: {_above(benchmark, floor)}.",
+        f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds by scan, "
+        f"seed {split['seed']}; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. The "
+        f"{len(split['lock_box'])} locked scans are in no fold and in no number of this table. Per-scan "
+        "terms are fitted on pixels that are not scored. Levelling leaves a shared background in every map. "
+        "Its five coefficients come from the training scans. It is added to predictions of measured maps, "
+        "but not to designs. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
+        "prints. A better model can reduce an error at least by its excess over the noise. The excess at "
+        f"k = 1 and at k = 7 is: {_above(benchmark, floor)}.",
     )
 
 
 def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
-    """Return the table of a few models' errors, the noise and the paper's error, for the README."""
+    """Return the README's table: the errors of a few models, the noise, and the error in the paper."""
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
     rows: list[tuple[str, ...]] = []
@@ -89,25 +89,25 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
         rows.append((name, f"{parameters[name]:,}", free, f"{full:.2f} nm"))
     no_model = _floor_row(noise["noise_floor"], None, "offset", "full")
-    rows.append(("what the layout cannot tell, at most", *no_model[1:]))
-    rows.append(("PBL in the paper: other split, levelling and zero", "–", "24.35 nm, not comparable", "–"))
+    rows.append(("what the layout cannot explain (upper estimate)", *no_model[1:]))
+    rows.append(("PBL in the paper (other split, levelling and zero)", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
     return markdown_table(
-        ("model", "parameters", "zero height free (k = 1)", "offset, gain, tilt and bow free (k = 7)"),
+        ("model", "parameters", "offset fitted (k = 1)", "offset, gain, tilt and bow fitted (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds. Each is predicted by models not trained on it, plus the smooth background of their "
-        "training scans. k terms are fitted to each scan, on pixels that are not scored. Intervals: "
-        "95 %, over scans, or over the 6 prints in the last row but one. That row is an upper estimate: "
-        "it includes errors common to a place, field or print.",
+        "folds. Each scan is predicted by models not trained on it, plus the smooth background of "
+        "their training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
+        "Intervals: 95 % confidence over scans, in the last row but one over the 6 prints. That row "
+        "includes errors common to a place, field or print.",
     )
 
 
 def noise_table(noise: dict[str, Any]) -> str:
-    """Return the noise of the measured prints by fitted scan terms, then by level where they are flat."""
+    """Return two tables of the noise of the measured prints: by scan terms, and by level on flat areas."""
     budget = noise["budget"]
     by_terms = markdown_table(
-        ("free in each scan", "terms k", "noise, MAE", "noise, σ"),
+        ("fitted to each scan", "terms k", "noise, MAE", "noise, σ"),
         [
             (
                 _FREE[row["policy"]],
@@ -117,8 +117,8 @@ def noise_table(noise: dict[str, Any]) -> str:
             )
             for row in budget["floor"]["by_policy"]
         ],
-        f"{noise['run']['n_scans']} development scans of the measured prints, residuals of "
-        f"`{budget['model']}`, all scored pixels, 95 % intervals over prints.",
+        f"All scored pixels of {noise['run']['n_scans']} unlocked scans of the measured prints, from "
+        f"residuals of `{budget['model']}`, with 95 % intervals over prints.",
     )
     by_level = markdown_table(
         ("level", "pixels", "σ where flat", "MAE where flat"),
@@ -131,21 +131,21 @@ def noise_table(noise: dict[str, Any]) -> str:
             )
             for row in budget["flat_levels"]
         ],
-        "The quarter of the pixels where the layout is flattest (slope at most "
-        f"{budget['flat_slope']:.3f}); offset, gain, tilt, bow and lines of each scan are free.",
+        "Only the quarter of the pixels where the layout is flattest (slope at most "
+        f"{budget['flat_slope']:.3f}). Offset, gain, tilt, bow and lines are fitted to each scan.",
     )
     return f"{by_terms}\n\n{by_level}"
 
 
 def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
-    """Return a row with the noise for the scan terms of each column of errors; None leaves a cell empty."""
+    """Return the row of the noise: a cell per policy of scan terms; for None, the cell is empty."""
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
     return (f"noise ({floor['kind'].replace('-', ' ')})", *cells)
 
 
 def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
-    """Return how far the error of each model is above the noise with the same scan terms."""
+    """Return as text how far the error of each model exceeds the noise, with the same scan terms."""
     least = {row["policy"]: row["mae_nm"] for row in floor["by_policy"]}
     parts = []
     for score in benchmark["scores"]:
@@ -156,6 +156,6 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
 
 
 def _steps_text(benchmark: dict[str, Any]) -> str:
-    """Return the numbers of optimiser steps of the networks as text."""
+    """Return as text how many optimiser steps each network was trained for."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())

@@ -1,10 +1,10 @@
-"""Copy the plan for the measured prints into the documentation: files for a lab, tables and pictures.
+"""Copy the plan for new prints by the measured printer into the docs: files for a lab, tables, pictures.
 
     litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
         --steps 20
     python -m benchmarks.measured_plan runs/neural-lithography/next-print
 
-The results of the page receive the whole plan except its report; the tables of the page are rewritten.
+Copies the plan, except its report and CSV tables, into docs/results, and rewrites the tables of the page.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ def texts(plan: NextPrint) -> dict[str, str]:
         for q in plan.questions
         for pair in q.pairs
     ]
-    heads = ("question", "rivals", "difference, nm rms", "with random layouts", "noise along it, nm")
-    more = ("model's own error, nm", f"power, {count} prints", "prints for 0.95", "status")
-    of_pairs = ("rival", "rival", "difference, nm rms", "noise along it, nm", f"power, {count} prints")
+    heads = ("question", "rivals", "difference, nm rms", "with random layouts", "noise, nm rms")
+    more = ("error of the model, nm", f"power, {count} prints", "prints for power 0.95", "status")
+    of_pairs = ("rival", "rival", "difference, nm rms", "noise, nm rms", f"power, {count} prints")
     return {
         "measured questions": markdown_table((*heads, *more), questions),
         "measured rivals": markdown_table(of_pairs, pairs),

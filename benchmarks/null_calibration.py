@@ -1,11 +1,11 @@
-"""Measure how often the loop finds a cause although the model is complete: prints of the model plus noise.
+"""Measure how often the loop finds a cause where none is missing: in prints of its own model plus noise.
 
     python -m benchmarks.null_calibration [--stores 40] [--workers 2] [--publish]
 
-Each store has 12 scans of random layouts, printed by a Physics model with other values than its starting
-values. The noise is stationary and Gaussian, 16 nm with the spectrum of the virtual fab's flat print (lines
-along x included). Each scan also has a datum and a tilt. The right result is to find nothing: every cause or
-law is a false positive. An interrupted run resumes.
+Each store has 12 scans of random layouts, printed by a Physics model whose values differ from the loop's
+starting values. The noise is stationary and Gaussian, 16 nm, with the spectrum of the virtual fab's flat
+print (lines along x included). Each scan also has a datum and a tilt. The right result is to find nothing:
+every cause or law is a false positive. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ RESULT = PAGE.parent / "results" / "null-calibration" / "null_calibration.json"
 NAME = "null_calibration.json"
 SCANS, SIZE_PX, PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 12, 192, 0.1, 13, 0.1
 ROUGHNESS_UM, DATUM_SD_UM, TILT_SD_UM = 0.016, 0.03, 0.005
-# The rate that the loop claims, and the probability below which a count of false positives contradicts it.
+# The false-positive rate that the loop claims; a count that is less likely than UNLIKELY contradicts it.
 RATE, UNLIKELY = 0.05, 0.025
 FOLDS, FIRST_SEED = 5, 7000
 
 
 def main() -> None:
     """Run the missing stores, print the outcome, and write the record."""
-    parser = options(__doc__, "write the figures into the page")
+    parser = options(__doc__, "write the outcome into docs/closing_the_loop.md")
     parser.add_argument("--stores", type=int, default=40)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def calibrate_one(seed: int) -> dict[str, Any]:
-    """Return the causes that the loop finds in one store, and its error before and after, nm."""
+    """Return the causes that the loop finds in one store, and the error before and after the loop, nm."""
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     closed = close(Study.dealt(null_scans(seed), FOLDS), {"physics": base})
     return {
@@ -131,7 +131,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def most_at_the_rate(stores: int) -> int:
-    """Return the largest number of false positives that is still likely in ``stores`` at a rate of 5 %."""
+    """Return the largest number of false positives in ``stores`` stores that is consistent with 5 %."""
     from scipy.stats import binom
 
     return max(count for count in range(stores + 1) if binom.sf(count - 1, stores, RATE) > UNLIKELY)

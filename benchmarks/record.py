@@ -1,4 +1,4 @@
-"""Functions shared by the benchmarks: facts of the run, result files, and text in pages of the docs."""
+"""Functions shared by the benchmarks: facts of the run, result files, and generated text in the docs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOT_MEASURED = "Not measured yet."
 
 
 def options(doc: str | None, publishing: str, out: Path | None = None) -> argparse.ArgumentParser:
-    """Return a parser with ``--publish`` (help: ``publishing``), and with ``--out`` if ``out`` is given."""
+    """Return a parser with ``--publish`` (help text: ``publishing``), and ``--out`` if ``out`` is given."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if out is not None:
         parser.add_argument("--out", type=Path, default=out, help="JSON file to write")
@@ -45,7 +45,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 def conclude(
     record: Mapping[str, Any], text: str, out: Path, page: Path, name: str, *, published: bool
 ) -> None:
-    """End a benchmark: write its record to ``out``, print its text, and publish the text if ``published``.
+    """Finish a benchmark: write its record to ``out``, print its text, and publish the text if asked to.
 
     Raises:
         InputError: see ``publish``.
@@ -57,10 +57,10 @@ def conclude(
 
 
 def publish(page: Path, name: str, text: str) -> None:
-    """Replace the text between the two marks ``name`` in a Markdown page.
+    """Replace the text between the two marks called ``name`` in a Markdown page.
 
     Raises:
-        InputError: the page does not have the two marks in this order.
+        InputError: the page lacks one of the marks, or they are in the wrong order.
     """
     before, _, after = _parts(page, name)
     with atomic_file(page) as temporary:
@@ -68,15 +68,15 @@ def publish(page: Path, name: str, text: str) -> None:
 
 
 def published(page: Path, name: str) -> str:
-    """Return the text between the marks; raise InputError for a page without them."""
+    """Return the text between the two marks called ``name``; raise InputError if the page lacks them."""
     return _parts(page, name)[1].strip("\n")
 
 
 def _parts(page: Path, name: str) -> tuple[str, str, str]:
-    """Split a page into the text up to the first mark (included), between the marks, and from the second."""
+    """Split a page into three parts: up to and with the first mark, between the marks, and the rest."""
     start, end = f"<!-- {name}: written by the benchmark -->", f"<!-- end of {name} -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(start)
     inside, found_end, after = rest.partition(end)
     if not found or not found_end:
-        raise InputError(f"marks in {page}", got="not both", wanted=f"{start} … {end}")
+        raise InputError(f"marks in {page}", got="one or both are missing", wanted=f"{start} … {end}")
     return before + start, inside, end + after

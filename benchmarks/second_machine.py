@@ -1,10 +1,11 @@
-"""A second machine, measured: silicon written by electron beam, etched, and seen by an electron microscope.
+"""Measure how well models predict a second machine: silicon patterned by electron beam, imaged by a SEM.
 
     litho-data build datasets/prefab-soi.toml --out prefab-soi.zarr
     python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--loop FOLDER] [--publish]
 
-Models are fitted per fold, with whole patterns held out, and judged by their edges. Then the loop is closed
-on the same folds, from a printer of a spot and a threshold. An interrupted run resumes.
+Models are fitted per fold, with whole patterns held out, and judged by the edges that they predict. Then the
+closed loop runs on the same folds, starting from a model with a spot and a threshold. An interrupted run
+resumes.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ RESULT = PAGE.parent / "results" / "second-machine" / "second_machine.json"
 BASELINES = ("identity", "affine", "blur-table")
 BASE, WHOLE = "spot and threshold", "e-beam"
 BARE: dict[str, Any] = {"parts": ["spot", "etch"], "spot.sigma_um": 0.02, "fixed": ["etch.bias_px"]}
-# A printer of few numbers needs no more patterns than every second; each gives a window of 256 px.
+# A model with few parameters is fitted to a window of 256 px of every second pattern; more is not needed.
 FITTED_EVERY = 2
 LEARNED: dict[str, dict[str, int]] = {
     "features": {},
@@ -56,12 +57,12 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    """Fit, judge, close the loop, write."""
-    parser = options(__doc__, "write the tables into the page", RESULT)
+    """Fit and judge the models, run the closed loop, and write the record."""
+    parser = options(__doc__, "write the tables into docs/second_machine.md", RESULT)
     parser.add_argument("store", type=Path)
     parser.add_argument("--cache", type=Path, default=Path("runs/second-machine"), help="a file per fit")
-    parser.add_argument("--learned", default="", help=f"models to learn too, of {', '.join(LEARNED)}")
-    parser.add_argument("--loop", type=Path, help="folder of the loop, closed if it is not there")
+    parser.add_argument("--learned", default="", help=f"models to train, of {', '.join(LEARNED)}")
+    parser.add_argument("--loop", type=Path, help="folder of the closed loop, run if it has no result")
     arguments = parser.parse_args()
     store = open_store(arguments.store)
     folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
@@ -90,23 +91,23 @@ def main() -> None:
 
 
 class Bench:
-    """Fits of models on the folds, each kept in a file."""
+    """Fits of the models to the folds; each fit is kept in a file."""
 
     def __init__(self, folds: Sequence[Fold], cache: Path):
         self.folds, self._cache = folds, cache
         cache.mkdir(parents=True, exist_ok=True)
 
     def rows(self, name: str) -> list[Row]:
-        """The figures of every held-out pattern."""
+        """Return the scores of every held-out pattern."""
         kept = [self.fit(name, fold) for fold in progress(self.folds, name)]
         return sorted((row for one in kept for row in one["rows"]), key=lambda row: row["scan"])
 
     def values(self, name: str) -> list[dict[str, float]]:
-        """The fitted values of every fold."""
+        """Return the fitted values of every fold."""
         return [self.fit(name, fold)["values"] for fold in self.folds]
 
     def fit(self, name: str, fold: Fold) -> dict[str, Any]:
-        """Fitted values, and the figures of the held-out patterns."""
+        """Return the fitted values of a model, and the scores of the held-out patterns of a fold."""
         file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
         if not file.exists():
             bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
@@ -115,10 +116,10 @@ class Bench:
 
 
 def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str, Any]:
-    """One model fitted to the training patterns of a fold and judged on the held-out ones.
+    """Fit one model to the training patterns of a fold and judge it on the held-out patterns.
 
-    A printer of parts starts from its default values and from those of the bare printer; the better fit
-    counts.
+    A model composed of parts is fitted twice: from its default values, and from the fitted values of the
+    bare model. The better fit counts.
     """
     geometry = common_geometry(fold.training)
     if name in LEARNED:
@@ -136,18 +137,18 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
 
 
 def made(name: str, values: Mapping[str, Any], **geometry: Any) -> Simulator:
-    """A model of the table, unfitted, with these numbers."""
+    """Return a model of the table, not yet fitted, with these values."""
     fields = {**BARE, **values} if name == BASE else values
     return build_model("e-beam" if name == BASE else name, **geometry, **fields)
 
 
 def started(bare: Mapping[str, float]) -> dict[str, float]:
-    """Where the printer of all parts starts that begins as the bare one ended."""
+    """Return the starting values of the model with all parts that equal the fitted bare model."""
     return {"two-spots.sigma_um": bare["spot.sigma_um"], "hill.threshold": bare["etch.threshold"]}
 
 
 def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
-    """Edges, area, features and height error of one pattern."""
+    """Return the errors of edges, area, features and height of one pattern."""
     residual_um = np.where(scan.usable, scan.height_um - prediction_um, np.nan)
     edges = edges_of_scan(scan, prediction_um, residual_um)
     films = films_of_scan(scan, prediction_um, residual_um)
@@ -162,7 +163,7 @@ def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
 
 
 def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str, Any]:
-    """What the loop found, edges before and after, and the corrected printer against one of all parts."""
+    """Return what the loop found, the edge errors, and a comparison with the model that has all parts."""
     before, after = loop.error("base"), loop.error("all")
     assert before is not None
     assert after is not None
@@ -181,7 +182,7 @@ def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str,
 
 
 def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
-    """Gain in edge error over the same patterns: mean, interval, p, and how many patterns improved."""
+    """Return by how much the edge error falls: mean, interval, p, and number of improved patterns."""
     gains = [was["edge_mean_nm"] - now["edge_mean_nm"] for was, now in zip(before, after, strict=True)]
     found = over_units(gains)
     better = [found.positive, found.count]
@@ -189,7 +190,7 @@ def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
 
 
 def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Means over patterns, sums of counts, and the fitted values over folds."""
+    """Return mean errors over patterns, sums of counts, and the range of fitted values over folds."""
     errors = [row["edge_mean_nm"] for row in rows]
     means = {
         key: float(np.mean([row[key] for row in rows]))
@@ -208,7 +209,7 @@ def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]
 
 
 def draw_places(store: Store, bench: Bench, name: str) -> Figure:
-    """The narrowest neck, the smallest island and the most rounded corner, each of a held-out pattern."""
+    """Draw the narrowest neck, the smallest island and the most rounded corner of the held-out patterns."""
     kept = [bench.fit(name, fold) for fold in bench.folds]
     values = {row["scan"]: one["values"] for one in kept for row in one["rows"]}
     scans = [store.scan(scan_id) for scan_id in values]
@@ -233,7 +234,7 @@ def draw_places(store: Store, bench: Bench, name: str) -> Figure:
 
 
 def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Half the width (px) and the place of the narrowest film that goes on at both sides."""
+    """Return half the width (px) and the place of the narrowest film that continues at both ends."""
     from scipy.ndimage import binary_dilation, convolve
     from skimage.morphology import medial_axis
 
@@ -244,7 +245,7 @@ def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
 
 
 def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Size (px) and place of the smallest island."""
+    """Return the size (px) and place of the smallest island."""
     from scipy.ndimage import label as labels
 
     parts, _ = labels(_inner_film(scan))
@@ -253,7 +254,7 @@ def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
 
 
 def corner(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Where an edge of the film differs most from the layout's, as a negative number, and its place."""
+    """Return the largest difference between film and layout at an edge, negated, and its place."""
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     film = _inner_film(scan)
@@ -278,16 +279,16 @@ PLACES = {"neck": neck, "island": island, "corner": corner}
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """Both tables."""
+    """Return the two tables and the edge errors as Markdown."""
     heads = (
         "model",
-        "edges, mean (95 % over patterns)",
+        "edge error, mean (95 % over patterns)",
         "P95",
-        "area",
+        "area error",
         "missing",
         "extra",
         "merged",
-        "height",
+        "height error",
     )
     rows = [
         (
@@ -314,8 +315,10 @@ def text_of(record: Mapping[str, Any]) -> str:
     found += [
         (one["name"], "–", "–", "–", f"{one['verdict']}: {one['reason']}") for one in loop["candidates"]
     ]
-    edges = "Edges of held-out patterns: {:.2f} nm before, {:.2f} nm after.".format(*loop["edges_nm"])
-    loop_heads = ("cause", "size", "gain, squared error", "patterns improved", "verdict")
+    edges = "Mean edge error of held-out patterns: {:.2f} nm before, {:.2f} nm after the loop.".format(
+        *loop["edges_nm"]
+    )
+    loop_heads = ("effect", "size", "squared error removed", "patterns improved", "verdict")
     return f"{markdown_table(heads, rows)}\n\n{markdown_table(loop_heads, found)}\n\n{edges}"
 
 

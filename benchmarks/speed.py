@@ -1,4 +1,4 @@
-"""Measure time and memory of prediction and design with each model of the zoo.
+"""Measure the time and memory that prediction and design need with each model of the zoo.
 
     python -m benchmarks.speed [--size-px 256] [--threads 1] [--device cuda] [--publish]
 
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, Any]:
-    """Measure a prediction with the gradient of its layout, and an iteration of a hologram, in seconds."""
+    """Measure the seconds of a prediction with its gradient, and of an iteration of a hologram design."""
     torch.set_num_threads(threads)
     settings = hologram_settings(changes={"layout.size_px": size_px})
     printer = load_printer(f"{zoo.PREFIX}{name}", settings.layout, device=device)
@@ -118,20 +118,20 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "model",
         "training on 20 scans",
         "prediction with its gradient",
-        "an iteration of a hologram",
-        "memory",
+        "an iteration of a hologram design",
+        "peak memory",
     )
     return markdown_table(
         heads,
         rows,
-        f"{size_px} × {size_px} px, float32, {record['device']}, {record['threads']} thread, seconds of "
-        f"the processor, median of {REPEATS}, torch {record['versions']['torch']}. Training is wall-clock "
-        "time, on a machine with other work.",
+        f"{size_px} × {size_px} px, float32, {record['device']}, {record['threads']} thread, "
+        f"processor time, median of {REPEATS} runs, torch {record['versions']['torch']}. Training is "
+        "wall-clock time on a machine with other work.",
     )
 
 
 def _seconds(work: Callable[[], None], device: str) -> float:
-    """Return the median seconds: processor time, which other work hardly affects, or clock time on a GPU."""
+    """Return the median time of ``work`` in seconds: processor time, or clock time on a GPU."""
     clock = time.process_time if device == "cpu" else time.perf_counter
 
     def once() -> float:

@@ -1,13 +1,14 @@
-"""Run two rounds on the virtual fab: a loop, the prints that it plans, and the decisions from them.
+"""Run two rounds of prints on the virtual fab: the second, which the loop plans, decides open questions.
 
     python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
 Each trial has its own fab and plants one knob in it, with an effect of 12 to 30 nm rms. Knobs and sizes are
 drawn from the seed before anything is run. The first round is a loop on 14 scans of random layouts. For
 its open questions, four prints are planned and printed in the same fab. As a control, as many prints of
-random layouts are scanned in the same ways. An answer is right if only the planted cause is left, attributed
-to the right machine (printer or microscope). A trial whose first round leaves no question that scans can
-decide is counted separately. Every seed has its own result file and table. An interrupted run resumes.
+random layouts are scanned in the same ways. An answer is right if only the planted cause remains and is
+attributed to the right machine (printer or microscope). If the first round leaves no question that scans can
+decide, the trial is counted separately. Every seed has its own result file and table. An interrupted run
+resumes.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def main() -> None:
     parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest effect")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="layouts of the second round")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
-    parser.add_argument("--publish", action="store_true", help="write the figures into the page")
+    parser.add_argument("--publish", action="store_true", help="write the results into docs/next_print.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
@@ -100,7 +101,7 @@ def main() -> None:
 def draws(
     count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
 ) -> list[dict[str, Any]]:
-    """Draw what each trial plants: knobs in turn, log-uniform sizes, and a seed per trial."""
+    """Draw the cause that each trial plants: knobs in turn, log-uniform sizes, and a seed per trial."""
     random = np.random.default_rng([seed, 17])
     return [
         {
@@ -120,7 +121,7 @@ def run_trial(
     arms: Sequence[Arm],
     report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run both rounds of one trial, with each kind of layouts in ``arms`` (optimised, random)."""
+    """Run both rounds of one trial; run the second once for each kind of layouts in ``arms``."""
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
@@ -163,7 +164,7 @@ def run_trial(
 
 
 def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str, Any]:
-    """Return one answer with the truth and the predicted power."""
+    """Return one decision with its predicted power, and whether it is right or wrong."""
     truth = KNOBS[knob]
     owner = MICROSCOPE if truth.role == "measurement" else PRINTER
     asked = {truth.effect, f"{truth.effect} as {owner}'s", owner} & set(decision.declared)
@@ -200,7 +201,7 @@ def line_of(trial: dict[str, Any]) -> str:
 
 
 def summary(trials: list[dict[str, Any]]) -> str:
-    """Return a table of the number of questions decided rightly, by arm and predicted power."""
+    """Return a table of how many questions were decided correctly, by arm and predicted power."""
     rows = []
     for arm in (one for one in ARMS if any(one in trial["answers"] for trial in trials)):
         every = [one for trial in trials for one in trial["answers"].get(arm, [])]
@@ -220,7 +221,7 @@ def summary(trials: list[dict[str, Any]]) -> str:
                     str(sum(one["status"] == "no experiment separates" for one in some)),
                 )
             )
-        rows.append((arm, "not about what was planted", "–", "–", "–", str(stray), "–"))
+        rows.append((arm, "not about the planted cause", "–", "–", "–", str(stray), "–"))
     with_question = sum(any(one["counts"] for one in t["answers"].get("optimised", [])) for t in trials)
     return markdown_table(
         (
@@ -228,16 +229,15 @@ def summary(trials: list[dict[str, Any]]) -> str:
             "predicted power",
             "questions",
             "mean power",
-            "decided rightly",
+            "decided correctly",
             "wrongly",
-            "not separable",
+            "declared not separable",
         ),
         rows,
-        f"{len(trials)} trials with each knob in turn. In {with_question} the first round left a question "
-        f"about the planted cause. Powers are those of the plan for {PRINTS} prints; shares with 95 % "
-        "intervals (Wilson). "
-        "The last column was declared before printing.",
-        f"Correct decisions with computed layouts, about planted causes: {_by_knob(trials)}.",
+        f"{len(trials)} trials, with the knobs planted in turn. In {with_question}, the first round left a "
+        f"question about the planted cause. Powers are those that the plan predicts for {PRINTS} prints. "
+        "Shares have 95 % confidence intervals (Wilson). The last column was declared before printing.",
+        f"Questions about the planted cause that optimised layouts decided correctly: {_by_knob(trials)}.",
     )
 
 

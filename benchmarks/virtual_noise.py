@@ -1,4 +1,4 @@
-"""Publish the noise analysis of virtual prints, whose roughness is known, in the documentation.
+"""Publish the noise analysis of virtual prints with known roughness in the documentation.
 
     litho-data masks --out doses --pattern dose-matrix --count 7 --size-px 512
     litho-data simulate --out doses-printed --layouts doses/card.toml
@@ -10,7 +10,7 @@
     litho-models noise fab.zarr --out fab-noise --residuals fab-benchmark
     python -m benchmarks.virtual_noise doses-noise fab-noise
 
-Writes all figures that the page quotes from the result files; a test checks that the page agrees with them.
+Writes all numbers that the page quotes from the result files. A test checks that the page agrees with them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DOSES, REFERENCES = "dose-matrix", "references"
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the text to publish at each mark of the page, from the two results in a folder."""
+    """Return the text to publish at each mark of the page, made from the two results in a folder."""
     doses, references = (NoiseAnalysis.read(folder / name) for name in (DOSES, REFERENCES))
     return {
         "dose matrix": dose_table(doses),
@@ -40,7 +40,7 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def dose_table(found: NoiseAnalysis) -> str:
-    """Return a table of height, roughness, lost steps and readability of every dose, and the best dose."""
+    """Return a table of height, roughness, lost steps and readability for every dose, with the best dose."""
     assert found.dose is not None
     rows = [
         (
@@ -54,10 +54,10 @@ def dose_table(found: NoiseAnalysis) -> str:
         for row in found.dose.rows
     ]
     return markdown_table(
-        ("dose", "gain", "highest level", "roughness", "lost steps, low + high", "worst step"),
+        ("dose", "gain", "highest level", "roughness", "lost steps, low + high levels", "worst readability"),
         rows,
-        f"Recommended: {found.dose.recommended_dose:g}, {found.dose.reason}. Left out of the other "
-        f"estimates: {', '.join(found.run.dropped)}.",
+        f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. Left out of the "
+        f"other estimates: {', '.join(found.run.dropped)}.",
     )
 
 
@@ -68,9 +68,10 @@ def planted_text(found: NoiseAnalysis) -> str:
     noise = found.budget.floor.at("full")
     assert noise is not None
     return (
-        f"On virtual prints, planted {Noise().roughness_nm:g} nm: the flat print gives {flat.sigma_nm:.2f} ± "
-        f"{flat.sigma_uncertainty_nm:.2f} nm, the budget {with_interval(noise.rmse_nm, noise.rmse_ci95_nm)} "
-        f"at k = 7, from residuals of `{found.budget.model}` on {found.run.n_scans} scans."
+        f"Virtual prints, planted roughness {Noise().roughness_nm:g} nm: the flat print gives "
+        f"{flat.sigma_nm:.2f} ± {flat.sigma_uncertainty_nm:.2f} nm, and the noise budget "
+        f"{with_interval(noise.rmse_nm, noise.rmse_ci95_nm)} at k = 7, from residuals of "
+        f"`{found.budget.model}` on {found.run.n_scans} scans."
     )
 
 
@@ -80,7 +81,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     for name in (DOSES, REFERENCES):
-        parser.add_argument(name, type=Path, help="result folder of litho-models noise")
+        parser.add_argument(name, type=Path, help="folder with a result of litho-models noise")
     given = vars(parser.parse_args())
     for name in (DOSES, REFERENCES):
         NoiseAnalysis.read(given[name]).write(FOLDER / name)

@@ -1,10 +1,10 @@
-"""Make the models that ship with the package: those of the benchmark's table, with the same settings.
+"""Make the models that ship with the package: those of the benchmark's table, trained alike.
 
     make zoo
     python -m benchmarks.zoo runs/zoo --models pbl,fno
 
 Training uses all scans except the locked ones. A finished run is reused; an interrupted one continues.
-Each card first lists the errors of the table, which come from five fits to fewer scans each.
+Each card first lists the errors of the table, which come from five other fits, each to fewer scans.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from litho_models.scoring.scores import score_model
 
 CARD = ROOT / "datasets" / "neural-lithography.toml"
 LARGEST_ZOO_BYTES = 10_000_000
-# The scored PBL includes the scan axis. The prints cannot show whether printer or microscope causes it.
+# The scored PBL includes its scan-axis network. The prints cannot show whether printer or microscope causes
+# what this network describes.
 WHOLE: dict[str, dict[str, Attribution]] = {"pbl": {SCAN_AXIS: "printer"}}
 LIMITATIONS = [
-    "Trained on prints of one machine, resist and protocol: retrain for any other.",
-    "The locked scans took no part.",
-    "Out-of-fold errors are of other fits by the same settings, each to fewer scans.",
+    "Trained on prints of one machine, resist and protocol. Retrain the model for any other.",
+    "The locked scans were not used in training.",
+    "The out-of-fold errors are those of other fits with the same settings, each to fewer scans.",
 ]
 
 
@@ -48,24 +49,24 @@ def make_zoo(
     root: str | Path = zoo.ZOO_FOLDER,
     models: Sequence[str] = (),
 ) -> dict[str, ModelCard]:
-    """Train, freeze and describe the models of a table; an interrupted call continues.
+    """Train, freeze and describe the models of a table; a repeated call continues an interrupted one.
 
     Args:
         store: dataset store.
         runs: folder of the run folders.
         table: benchmark of that store with split ``grouped``.
-        root: the zoo to write into, a folder per model.
+        root: folder of the zoo, which gets a folder per model.
         models: names of models in the table; all by default.
 
     Raises:
-        InputError: the table is of other data, a model had other training settings, or the zoo is too large.
+        InputError: the table is of other data, a model has other training settings, or the zoo is too large.
     """
     dataset = open_store(store)
     if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
         raise InputError(
             "table of the zoo",
             got=f"split {table.split.kind} of {table.dataset.name}",
-            wanted=f"split grouped of {dataset.name}, the store given",
+            wanted=f"split grouped of the given store, {dataset.name}",
         )
     scans = [scan for scan in dataset.scans() if scan.id not in dataset.locked_ids]
     scores = {row.model: row for row in table.scores}
@@ -92,7 +93,7 @@ def make_zoo(
 
 
 def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
-    """Return the errors in a row of the table, in the order of its columns."""
+    """Return the errors of one model, in the order of the columns of the table."""
     bare = {row.policy: row for row in scores.without_background}
     used: BackgroundUse = "training" if bare else "none"
     free = {row.policy: row for row in scores.by_policy}

@@ -1,4 +1,4 @@
-"""The whole path in one run: prints and scans → dataset → models → closed loop → design → score.
+"""Run the whole workflow: prints and scans → dataset → models → closed loop → design → score.
 
 Without ``--dataset`` the virtual fab makes the prints and adds effects that no model contains.
 ``--dataset neural-lithography`` uses the measured prints. Every step runs one command of the project and
@@ -24,17 +24,17 @@ from litho_models.loop.report import said
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
 WORKERS = ("--workers", 2)
-# Seeds of the draws of the paper's split.
+# Seeds of the random draws of the paper's split.
 PAPER_SEEDS = (0, 1, 2, 3)
-# The networks are not trained with whole prints left out: that would double the time of the demo.
+# The networks are not trained with whole prints left out, because that would double the time of the demo.
 BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random-features"
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is trained and designed: enough to try every step, or as much as the figures in the docs need.
+    """The extent of training and design: enough to try every step, or as much as the docs' numbers need.
 
-    ``training_steps``: None uses the default of each model.
+    If ``training_steps`` is None, each model uses its default.
     """
 
     models: str
@@ -74,7 +74,7 @@ MEASURED = Effort(
 
 @dataclass(frozen=True)
 class Step:
-    """One command, the file or folder that exists once it has finished, and its report."""
+    """One command, the file or folder that exists once the command has finished, and its report."""
 
     title: str
     command: tuple[str, ...]
@@ -87,7 +87,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--dataset", default="", help="name of a card in datasets/, e.g. neural-lithography")
-    parser.add_argument("--out", type=Path, default=Path("runs"), help="folder for everything that is made")
+    parser.add_argument("--out", type=Path, default=Path("runs"), help="folder for all results")
     arguments = parser.parse_args()
 
     name = arguments.dataset or "demo"
@@ -148,7 +148,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 for seed in PAPER_SEEDS
             ),
             Step(
-                "The same on prints of which no scan was seen",
+                "Compare the models on whole held-out prints",
                 _models(
                     "benchmark", store, "--models", BY_PRINT, "--split", "leave-one-print-out",
                     "--out", out / "leave-one-print-out",
@@ -178,7 +178,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
         "--iterations", effort.iterations,
     )  # fmt: skip
-    # A virtual printer is itself the judge; the corrected model can then be one of the arms.
+    # If the printer is virtual, it is the judge itself, and the corrected model can be one of the arms.
     judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")
     arms = effort.arms if dataset else (*effort.arms, CORRECTED)
     models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in arms)])
@@ -192,7 +192,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 out / "hoe" / "report.html",
             ),
             Step(
-                "Judge it by a printer that it was not designed with",
+                "Score it with a printer that was not used to design it",
                 _design("score", out / "hoe", "--judge", f"corrected={corrected}", "--out", out / "score"),
                 out / "score" / "score.json",
                 out / "score" / "report.html",
@@ -200,7 +200,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         ]
     steps.append(
         Step(
-            "Designed with × judged with",
+            "Compare designs: designed with × judged with",
             _design(
                 "compare",
                 "--models",
@@ -221,7 +221,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
 
 
 def run(step: Step, number: str) -> float:
-    """Run one step unless its result exists, and return its seconds; a failed step ends the demo."""
+    """Run one step unless its result exists, and return its time in s; a failed step ends the demo."""
     print(f"\n{number} {step.title}\n$ {_spell(step.command)}", flush=True)
     if step.result.exists():
         print("  already done")
@@ -249,7 +249,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
         page.verdict(answer)
         rows = {"the base model": loop.error("base"), "what the loop found": loop.error("all")}
         tiles = [
-            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans, one term per scan free")
+            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans, one term per scan fitted")
             for name, row in rows.items()
             if row is not None
         ]
@@ -260,7 +260,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     table = pd.DataFrame(
         {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
     )
-    page.table(table, "0 s: the result was there from an earlier run.", "steps.csv", digits=1)
+    page.table(table, "0 s: the result existed from an earlier run.", "steps.csv", digits=1)
     return answer, page.write(out, "index.html")
 
 
@@ -270,7 +270,7 @@ def _spell(command: tuple[str, ...]) -> str:
 
 def _paper_split(store: Path, models: str, out: Path, seed: int) -> Step:
     return Step(
-        f"The same on the paper's split, draw {seed}",
+        f"Compare the models on the paper's split, draw {seed}",
         _models(
             "benchmark", store, "--models", models, "--split", "paper", "--seed", seed, "--out", out,
         ),

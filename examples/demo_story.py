@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FAB = "fab"
 # Name of the base model with the effects that the loop added.
 CORRECTED = "corrected"
-# Found in every scan, because the fab, like an AFM, always gives each scan another zero.
+# Found in every scan, because the fab, like an AFM, gives each scan a different zero.
 ZERO = "datum-offset"
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
 # All images have the same scale, so that dim images look dim.
@@ -57,16 +57,16 @@ def tell(page: Page, out: Path) -> str:
     answer = (
         f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
         f"{': ' if hit else ''}{' and '.join(hit)}"
-        f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
+        f"{_also([name for name in found if name not in planted])}. On held-out scans, the error "
         f"went from {before.mae_nm:.1f} to {after.mae_nm:.1f} nm, {abs(less):.0f} % "
         f"{'less' if less >= 0 else 'more'}. A hologram designed through "
-        f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it, and "
-        f"{psnr['none']:.1f} dB designed without a model. One run, so nothing is said about chance."
+        f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it; "
+        f"designed without a model, it has {psnr['none']:.1f} dB. A single run cannot show what is chance."
     )
     page.verdict(answer)
     page.heading("1. What was planted")
     told = [f"{get_effect(name).title} ({knob})" for name, knob in planted.items()]
-    page.paragraph(f"In the virtual fab, and in no file that the programs read: {'; '.join(told)}.")
+    page.paragraph(f"In the virtual fab only, in no file that the programs read: {'; '.join(told)}.")
     page.figure(_first_scan(out / "store.zarr"), "The first field: its layout, its scan, and the difference.")
     page.links([("store-report/report.html", "The dataset, scan by scan")])
     page.heading("2. What was found")
@@ -74,16 +74,16 @@ def tell(page: Page, out: Path) -> str:
                    f"{', '.join(name for name in planted if name not in found) or 'none'}."
                    f"{_width(loop)}")  # fmt: skip
     page.figure(
-        _gains(loop, set(planted)), "How much larger the error is without each cause; blue if it was planted."
+        _gains(loop, set(planted)), "How much the error grows without each cause. Planted causes are blue."
     )
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
-    page.heading("3. The error before and after, at equal freedom")
+    page.heading("3. The error before and after, with equally many fitted terms")
     over = loop.over_scans
-    interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, resampling scans)".format(*over.ci95_nm)
+    interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, 95 % over scans)".format(*over.ci95_nm)
     page.paragraph(
-        f"Mean absolute error of {over.count} scans, each predicted without being fitted to, "
-        f"with {before.k:g} term per scan free before and {after.k:g} after: "
-        f"{loop.gain_nm:.2f} nm less{interval}, better in {over.positive} of {over.count} scans."
+        f"The mean absolute error of {over.count} held-out scans is {loop.gain_nm:.2f} nm smaller{interval}, "
+        f"and it is smaller in {over.positive} of {over.count} scans. "
+        f"Terms fitted per scan: {before.k:g} before and {after.k:g} after."
     )
     pairs = {"before": before, "after": after}
     page.figure(
@@ -97,7 +97,7 @@ def tell(page: Page, out: Path) -> str:
     colours = [model_colour(name) for name in scores]
     page.figure(
         _bars(scores, "error, nm", colours),
-        "Errors of the models on held-out scans, zero of each scan free.",
+        "Errors of the models on held-out scans, with the zero of each scan fitted.",
     )
     page.links(
         [("benchmark/report.html", "The benchmark"), ("compare/report.html", "Designed × judged with")]
@@ -107,13 +107,13 @@ def tell(page: Page, out: Path) -> str:
         folder = design_folder(Path("compare"), arm, gap.seeds[0])
         page.heading(f"{number}. A hologram designed {how}")
         page.paragraph(f"Printed by the fab itself, its image has {psnr[arm]:.1f} dB.")
-        page.figure(_hologram(out / folder, out / "fab" / "truth"), "Wanted; printed; what the print shows.")
+        page.figure(_hologram(out / folder, out / "fab" / "truth"), "The target, the print, and its image.")
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
     return answer
 
 
 def _causes(loop: CloseLoop) -> list[FoundEffect]:
-    """Return the effects of the corrected model, which contains no mere descriptions."""
+    """Return the effects in the corrected model, without those that only describe the residual."""
     return [effect for effect in loop.effects if effect.knowledge != "description"]
 
 
@@ -124,11 +124,11 @@ def _width(loop: CloseLoop) -> str:
         return ""
     # The moments grow by s² along one axis: Cxx - Cyy and 2 Cxy are s² cos 2a and s² sin 2a.
     stretch, shear = (spot.strengths[name][0].value for name in ("stretch_um2", "shear_um2"))
-    return f" By the loop's own estimate the spot gains {math.hypot(stretch, shear) ** 0.5:.2f} µm."
+    return f" The loop estimates that the spot gains {math.hypot(stretch, shear) ** 0.5:.2f} µm on one axis."
 
 
 def _also(names: list[str]) -> str:
-    return f", and besides them {', '.join(names)}" if names else ""
+    return f", and also {', '.join(names)}" if names else ""
 
 
 def _first_scan(store: Path) -> Figure:
@@ -148,7 +148,7 @@ def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
     gains = [effect.left_out_nm or 0.0 for effect in effects]
     axis.barh(names, gains, color=[PLANTED if name in planted else OTHER for name in names])
     axis.invert_yaxis()
-    axis.set_xlabel("error without it, nm more")
+    axis.set_xlabel("increase of the error without it, nm")
     return figure
 
 
@@ -157,7 +157,7 @@ def _bars(values: dict[str, float], label: str, colours: list[str]) -> Figure:
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
-    # On the screen of a telephone the numbers beside the bars take a fifth of the width.
+    # On a phone's screen, the numbers beside the bars need a fifth of the width.
     axis.margins(x=0.22)
     axis.invert_yaxis()
     axis.set_xlabel(label)
@@ -174,7 +174,7 @@ def _hologram(folder: Path, fab: Path) -> Figure:
 
 
 def _row(maps: dict[str, np.ndarray], scales: dict[str, dict[str, Any]]) -> Figure:
-    """Draw maps side by side; a map without an entry in ``scales`` spans its own range of values."""
+    """Draw maps side by side; the colours of a map without an entry in ``scales`` span its own values."""
     figure = new_figure(10.5, 3.6)
     for axis, (title, picture) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         figure.colorbar(axis.imshow(picture, **scales.get(title, {})), ax=axis, shrink=0.75)

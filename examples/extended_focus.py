@@ -20,7 +20,7 @@ WAVELENGTH_UM, PLANES = 0.6328, 9
 
 
 class Axis:
-    """Brightness of the central spot in several planes, relative to a perfect lens at its focus."""
+    """Compute the central spot's brightness in several planes, relative to a perfect lens at its focus."""
 
     def __init__(self, element: litho_design.Element, focal_um: float, range_um: float):
         size, pitch = element.layout.size_px, element.layout.pitch_um
@@ -64,7 +64,7 @@ def main() -> None:
         optimiser = torch.optim.Adam(element.free.parameters(), lr=0.2)
         for _ in range(iterations):
             optimiser.zero_grad()
-            # A soft minimum: the dimmest planes weigh most.
+            # A soft minimum gives the dimmest planes the largest weight.
             torch.logsumexp(-3 * axis.brightness(element).log(), 0).backward()
             optimiser.step()
         judge.start_from_levels(element.levels())

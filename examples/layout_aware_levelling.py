@@ -2,8 +2,8 @@
 
     python examples/layout_aware_levelling.py STORE.zarr
 
-Compares the layout-aware background with a plain polynomial, on the raw heights of a store, in the
-frame of the scan. Prints one table, in nm.
+The script fits a layout-aware background and a plain polynomial to the raw heights of each scan in a store,
+and prints one table in nm.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from litho_data.store import Store, open_store
 
 def main() -> None:
     """Compare both backgrounds on every scan of the store, and print the table."""
-    parser = argparse.ArgumentParser(description="Layout-aware against plain background, per scan.")
+    parser = argparse.ArgumentParser(description="Compare both backgrounds, scan by scan.")
     parser.add_argument("store", help="dataset store built from raw scans")
     store = open_store(parser.parse_args().store)
     rows = [compare(store, scan_id) for scan_id in progress(store.ids, "levelling")]
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def compare(store: Store, scan_id: str) -> dict[str, float]:
-    """Return the range of each plane over the field, and the rms difference of the second-degree fits, nm."""
+    """Return in nm each plane's range over the field, and the rms difference of the second-degree fits."""
     print_ = store.scan(scan_id)
     height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
     own = store.quality["scan"] == scan_id

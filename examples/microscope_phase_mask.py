@@ -29,7 +29,7 @@ class Microscope:
         self.pupil = (torch.hypot(y, x) <= 1).to(torch.complex64)
         axial = (IMMERSION**2 - (APERTURE * torch.hypot(y, x).clamp(max=1)) ** 2).sqrt()
         depths = depth_um * torch.linspace(-0.5, 0.5, 7)
-        # At each depth the emitter takes small steps along z, y and x; image differences are the derivatives.
+        # At each depth, the emitter moves slightly along z, y and x. Image differences give the derivatives.
         axes = torch.eye(3)
         steps = STEP_UM * torch.stack([torch.zeros(3), *(sign * axis for axis in axes for sign in (1, -1))])
         path = torch.stack([axial, APERTURE * y, APERTURE * x])
@@ -41,7 +41,7 @@ class Microscope:
     def errors_nm(self, element: litho_design.Element) -> torch.Tensor:
         """Return the smallest possible standard error along z, y and x at each depth (depths, 3), nm."""
         behind = element(self.waves, WAVELENGTH_UM)
-        # Padded to twice the width of the pupil: the image has pixels of wavelength / (4 aperture).
+        # The pupil is padded to twice its width, so image pixels are wavelength / (4 aperture) wide.
         image = torch.fft.fft2(behind, s=(2 * self.size_px,) * 2, norm="ortho").abs().square()
         image = torch.fft.fftshift(image / self.pupil.abs().sum(), dim=(-2, -1)) * PHOTONS
         middle = slice(self.size_px - 24, self.size_px + 24)

@@ -2,8 +2,8 @@
 
     python examples/own_effect.py STORE.zarr --out loop
 
-Registers a process effect (the first layers sink into the adhesion promoter) and a term of single scans
-(a scanner whose bow has a cubic part), then closes the loop as `litho-models close-loop` does. Nothing else
+The script registers a process effect (the first layers sink into the adhesion promoter) and a per-scan term
+(the scanner's bow has a cubic part). It then closes the loop as `litho-models close-loop` does. Nothing else
 needs to change: `close_loop.json` and `report.html` contain a verdict on both effects.
 """
 

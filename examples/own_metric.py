@@ -2,9 +2,9 @@
 
     python examples/own_metric.py zoo:pbl STORE.zarr --out evaluation
 
-Registers the share of pixels that are wrong by more than half a level, then evaluates as `litho-models
-evaluate` does. Nothing else needs to change: the metric appears in the JSON, `report.html`, `metrics.csv` and
-`scans.csv`.
+The script registers a metric, the share of pixels that are wrong by more than half a level. It then evaluates
+a model as `litho-models evaluate` does. Nothing else needs to change: the metric appears in the JSON file,
+`report.html`, `metrics.csv` and `scans.csv`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> None:
         "off_by_half_a_level is the share of pixels wrong by more than half a level.",
     )
     scores = evaluate(given.model, given.store, given.out).scores
-    print(f"{scores.model}: {scores.metrics[metric.key]:.1f} % of the pixels are off by half a level")
+    print(f"{scores.model}: {scores.metrics[metric.key]:.1f} % of the pixels are off by over half a level")
 
 
 if __name__ == "__main__":

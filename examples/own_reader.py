@@ -1,6 +1,6 @@
 """Add a reader of your own: Python, cards and commands can then read files that begin with TOYAFM.
 
-In your own project a file like this one is all you need. In this package a reader is a module of
+In your own project, a file like this one is all you need. In this package, a reader is a module of
 `litho_data/readers/` that ends in `READER = Reader(...)`, with an entry in `registry.py`.
 """
 

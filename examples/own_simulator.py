@@ -2,8 +2,8 @@
 
     python examples/own_simulator.py STORE.zarr --out FOLDER
 
-Registers a printer whose spot is the sum of two Gaussians, then trains it as `litho-models train` does.
-Nothing else needs to change: benchmark, loop and design accept the name of the model. In a plug-in
+The script registers a printer whose spot is the sum of two Gaussians, and trains it as `litho-models train`
+does. Nothing else needs to change: benchmark, loop and design accept the name of the model. In a plug-in
 (docs/extending.md), `@register_simulator` above the class registers it, and all commands accept it.
 """
 

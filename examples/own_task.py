@@ -47,7 +47,7 @@ def spots(size_px: int) -> np.ndarray:
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, print both with the model, export the second."""
+    """Design for a perfect printer and through a model, print both with the model, and export the latter."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

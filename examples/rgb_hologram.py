@@ -29,7 +29,7 @@ def discs(size_px: int) -> torch.Tensor:
 
 
 class Scene:
-    """The images at a distance behind the element, illuminated in three colours."""
+    """Compute the images at a distance behind the element when three colours illuminate it."""
 
     def __init__(self, size_px: int, distance_um: float, element: litho_design.Element):
         grid = centred_grid((size_px, size_px), element.layout.pitch_um)
@@ -47,7 +47,7 @@ class Scene:
 
 
 def loss(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-    """Return the rms error of the worst colour at its best scale, plus 0.1 of the light outside the discs."""
+    """Return the rms error of the worst colour at its best scale, plus 0.1 × the light outside the discs."""
     scale = (images * targets).sum((1, 2)) / images.square().sum((1, 2))
     error = (scale[:, None, None] * images - targets).square().mean((1, 2)).sqrt()
     return error.max() + 0.1 * (1 - (images * targets).sum((1, 2))).mean()

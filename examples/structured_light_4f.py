@@ -2,7 +2,7 @@
 
     python examples/structured_light_4f.py zoo:pbl
 
-The system is two lenses with the element between them, in torchoptics (extra ``torchoptics``), in metres.
+The system has two lenses with the element between them. It uses torchoptics (extra ``torchoptics``), in m.
 A vortex beam has zero overlap with a Gaussian beam; the element in the Fourier plane must unwind its phase.
 """
 
@@ -24,7 +24,7 @@ WAVELENGTH, PITCH = 632.8e-9, 0.1e-6
 def overlap(
     element: litho_design.Element, f: float, vortex: torchoptics.Field, wanted: torchoptics.Field
 ) -> torch.Tensor:
-    """Return the share of the light behind the 4f system of focal length ``f`` that is in the wanted beam."""
+    """Return the share of the light behind the 4f system of focal length ``f`` that is in the target beam."""
     shape = vortex.shape
     between = element.as_torchoptics(z=2 * f, unit_um=1e6)
     system = torchoptics.System(Lens(shape, f, f), between, Lens(shape, f, 3 * f))
@@ -57,7 +57,7 @@ def main() -> None:
         judge.start_from_levels(element.levels())
         with torch.no_grad():
             share = float(overlap(judge, f, vortex, wanted))
-        print(f"designed with {name}: {100 * share:.1f} % of the vortex in the Gaussian beam as printed")
+        print(f"designed with {name}: {100 * share:.1f} % of the light in the Gaussian beam as printed")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Design diffractive optics through a frozen model of the printer, score them, and export them for the
-printer.
+"""Design diffractive optics through a frozen model of the printer, score the designs, and export them for
+printing.
 """
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""The interface of every model of the printer: a layout goes in, a printed height comes out."""
+"""Define the interface of every model of the printer, which maps a layout to a printed height."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
 SMALL_PARAMETERS = 64
 FIRST_SPOT_UM = 0.2
-"""Spot of the first printer, standard deviation, µm: the default lengths of models are multiples of it."""
+"""Spot of the first printer (standard deviation, µm). Default lengths of models are multiples of it."""
 _RESOLVED_PX = (0.5, 10.0)
 _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Return the spot (standard deviation, µm) that sets the default lengths for layouts of a pitch.
+    """Return the spot (standard deviation, µm) that sets the default lengths for layouts with this pitch.
 
-    This is the spot of the first printer if that is between half a pixel and ten pixels wide. Otherwise the
+    This is the spot of the first printer if it is between half a pixel and ten pixels wide. Otherwise the
     layouts belong to another printer, whose spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
@@ -62,7 +62,7 @@ class SimulatorConfig(BaseModel):
     pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
     level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
     levels: int = Field(13, ge=2, le=65536, description="number of layout levels, 0 included")
-    fixed: tuple[str, ...] = Field((), description="numbers that no fit changes, by their names in ranges")
+    fixed: tuple[str, ...] = Field((), description="parameters that no fit changes, by name in ranges")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
@@ -133,15 +133,17 @@ class Simulator(nn.Module, ABC):
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field; its outermost pixels are repeated beyond the edge."""
+        """Return the height of the whole field; beyond its edge, the outermost pixels of the layout are
+        repeated.
+        """
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Return the height that ``forward`` gives, without a border of ``border_px``, µm.
+        """Return the result of ``forward`` with ``border_px`` cropped on each side, µm.
 
         A model without a receptive radius overrides this method if it need not compute the border. For other
-        models ``predict_inside`` computes only the pixels that are needed.
+        models, ``predict_inside`` computes only the pixels that are needed.
         """
         return crop_border(self(layout_um), border_px)
 
@@ -191,7 +193,7 @@ def is_small(model: nn.Module) -> bool:
 
 
 def crop_border(field: Tensor, border_px: int) -> Tensor:
-    """Cut ``border_px`` from all four sides of (..., y, x)."""
+    """Crop ``border_px`` from all four sides of a field (..., y, x)."""
     if border_px == 0:
         return field
     return field[..., border_px:-border_px, border_px:-border_px]

@@ -1,4 +1,4 @@
-"""Show pages in a real browser: headless Chromium, controlled over a pipe by the DevTools protocol."""
+"""Show pages in headless Chromium, which is controlled through a pipe with the DevTools protocol."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-# The limit for every request to the browser. One answer takes milliseconds, the start takes seconds.
+# The time limit of a request to the browser. Answers take milliseconds, but starting it takes seconds.
 TIMEOUT_S = 60.0
 OPTIONS = (
     "--headless=new",
@@ -28,8 +28,9 @@ OPTIONS = (
 )
 
 PHONE_PX, DESK_PX = 390, 1280
-# Lists what is wrong with the page as shown: low contrast (WCAG 2 AA: 4.5, large letters 3), a page that is
-# wider than the screen, and pictures without content. A picture is drawn small and its colours are counted.
+# This script lists what is wrong with the page as shown: low contrast (WCAG 2 AA requires 4.5, or 3 for large
+# letters), a page wider than the screen, and pictures without content. To judge the content of a picture,
+# the script draws it at a small size and counts its colours.
 FAULTS = """(async () => {
   const found = [], channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
   const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
@@ -106,18 +107,18 @@ class Browser:
         self._profile.cleanup()
 
     def show(self, page: Path | str, width_px: int, dark: bool) -> None:
-        """Load a file or an address and wait for it. ``errors`` then lists the errors that it reports."""
+        """Load a page from a file or an address. Afterwards, ``errors`` lists the errors that it reported."""
         self.errors = []
         self.screen(width_px, dark)
         self._loaded = False
         self.ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._take(self._receive())
-        # The browser decodes pictures far down only when they are needed. This decodes all and lays them out.
+        # The browser would decode pictures far down the page only when scrolled to. Decode all of them now.
         self.run("Promise.all([...document.images].map(i => i.decode().catch(() => 0))).then(() => 1)")
 
     def screen(self, width_px: int, dark: bool) -> None:
-        """Set the screen size and the light or dark colours that the page is shown in."""
+        """Set the size of the screen and its colour scheme, light or dark."""
         self.ask(
             "Emulation.setDeviceMetricsOverride", width=width_px, height=844 if width_px < 600 else 800,
             deviceScaleFactor=1, mobile=False,
@@ -126,13 +127,13 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
 
     def run(self, script: str) -> Any:
-        """Return the value of a JavaScript expression in the page."""
+        """Evaluate a JavaScript expression in the page and return its value."""
         answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def picture(self, file: Path) -> None:
-        """Write a picture of the whole page to a PNG file."""
+        """Write a screenshot of the whole page to a PNG file."""
         height = self.run("document.documentElement.scrollHeight")
         width = self.run("innerWidth")
         clip = {"x": 0, "y": 0, "width": width, "height": min(height, 16000), "scale": 1}
@@ -168,9 +169,9 @@ class Browser:
         until = time.monotonic() + TIMEOUT_S
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._read], [], [], max(0.0, until - time.monotonic()))
-            assert ready, f"the browser said nothing for {TIMEOUT_S:g} s"
+            assert ready, f"the browser did not answer within {TIMEOUT_S:g} s"
             part = os.read(self._read, 1 << 16)
-            assert part, "the browser has ended"
+            assert part, "the browser has exited"
             self._buffer += part
         line, _, self._buffer = self._buffer.partition(b"\0")
         return json.loads(line)

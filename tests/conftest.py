@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # This must run before any test loads torch.
 let_waiting_threads_sleep()
 
-# Stands in for a figure. Drawing one takes half a second, and the tests make some hundreds of them.
+# A blank picture that replaces figures: drawing one takes half a second, and the tests make hundreds.
 BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
 
 
@@ -43,20 +43,20 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the modules that collection has loaded from all later searches for garbage."""
+    """Exclude the modules loaded during collection from all later garbage collections."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session")
 def measured_prints() -> Path:
-    """Return the folder `neural-lithography` with `mask_ug/`, `afm_ug/`, `mask/`, `afm/`."""
+    """Return the folder `neural-lithography`, which contains `mask_ug/`, `afm_ug/`, `mask/` and `afm/`."""
     return _folder_or_skip("LITHO_DATA_DIR", "neural-lithography")
 
 
 @pytest.fixture(scope="session")
 def oracles() -> Path:
-    """Return the folder with `gwyddion/` and `formats/`."""
+    """Return the folder of reference fields, which contains `gwyddion/` and `formats/`."""
     return _folder_or_skip("LITHO_ORACLE_DIR", "")
 
 
@@ -66,5 +66,5 @@ def _folder_or_skip(variable: str, name: str) -> Path:
         pytest.skip(f"{variable} is not set")
     folder = Path(root) / name
     if not folder.is_dir():
-        pytest.skip(f"{variable} is set, but {name or 'its folder'} is not there")
+        pytest.skip(f"{variable} is set, but {name or 'its folder'} does not exist")
     return folder.resolve()

@@ -1,10 +1,10 @@
-"""Draw small faults at random places of the whole product, to see how many the tests notice.
+"""Draw small faults at random places of the product, to see how many of them the tests notice.
 
-``python -m tests.drawn_faults SEED COUNT`` prints the faults. With a FILE of lines ``NUMBER TESTS`` it puts
-in each listed fault, runs mypy and then runs those tests. Every line of code is equally likely, and so is
-every possible change of a line. Three kinds of change are left out because they are no faults: another value
-of a named constant or a default, which is a choice; the other order of two numbers of which the smaller or
-larger is taken; and the argument ``strict`` of ``zip``, which only adds a check.
+``python -m tests.drawn_faults SEED COUNT`` prints the faults. A third argument FILE tries them: each of its
+lines, ``NUMBER TESTS``, names a fault and the tests to run with it, after mypy. Every line of code is equally
+likely to be drawn, and so is every possible change of that line. Three kinds of change are never drawn,
+because they are no faults: a new value of a named constant or a default, swapped arguments of functions such
+as ``min`` and ``max``, and a change of the argument ``strict`` of ``zip``, which only adds a check.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NAMES = {one: other for pair in PAIRS.split(",") for one, other in (pair.split()
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the expressions that a slip could put in place of this one."""
+    """Yield the wrong expressions that a programmer could have written by mistake instead of this one."""
     new = copy.deepcopy(node)
     match new:
         case ast.BinOp() | ast.BoolOp() if type(new.op) in OTHER:
@@ -74,7 +74,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
-    """Yield all expressions in the bodies of functions, except those in types and messages."""
+    """Yield all expressions in function bodies, except those in type annotations and messages."""
     for child in ast.iter_child_nodes(tree):
         types = getattr(tree, "annotation", 0), getattr(tree, "returns", 0)
         if isinstance(child, ast.arguments | ast.JoinedStr | ast.Raise) or child in types:
@@ -87,7 +87,7 @@ def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
 
 
 def drawn(seed: int, count: int) -> list[Fault]:
-    """Draw ``count`` faults. Each holds the whole text of its file, and names no tests yet."""
+    """Draw ``count`` faults. Each contains the whole text of its file, but names no tests yet."""
     places: dict[tuple[Path, int], list[tuple[ast.expr, ast.AST]]] = {}
     for file in sorted(file for package in PRODUCT for file in (ROOT / package).rglob("*.py")):
         for node in expressions(ast.parse(file.read_bytes())):
@@ -111,7 +111,7 @@ def drawn(seed: int, count: int) -> list[Fault]:
 
 
 def main(seed: str, count: str, file: str = "") -> int:
-    """Print the faults, or try those that ``file`` names tests for; return how many were not noticed."""
+    """Print the faults, or try those listed in ``file`` and return how many of them were not noticed."""
     faults = drawn(int(seed), int(count))
     if not file:
         print(*(one.name for one in faults), sep="\n")

@@ -1,8 +1,8 @@
-"""Put small faults into a copy of the project, one at a time: the tests named beside each have to catch it.
+"""Put small faults into a copy of the project, one at a time, and check that the named tests catch each.
 
-``python -m tests.faults [WORDS]`` tries the faults whose name contains one of the words, all by default. It
-exits with 1 if a fault is not caught. It takes minutes, so the test suite does not run it. Each fault is
-tried in a fork of a process that has already loaded the libraries the project uses.
+``python -m tests.faults [WORDS]`` tries the faults whose name contains one of the words; without words it
+tries all. It exits with 1 if any fault is not caught. It takes minutes, so the test suite does not run it.
+Each fault is tried in a fork of a process that has already loaded the libraries of the project.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PRELOADED = ["torch", "scipy.optimize", "scipy.stats", "xarray", "zarr", "pandas
 
 
 class Fault(NamedTuple):
-    """State which text of which file is changed, and which tests have to notice."""
+    """Describe a fault: the changed file, its right and wrong text, and the tests that must notice."""
 
     name: str
     file: str
@@ -81,7 +81,7 @@ FAULTS = [
           "return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}",
           "return [_hashed(value.mask_level), _hashed(value.height_um), _hashed(value.valid)]",
           "tests/litho_data/test_scan_key.py"),
-    # Checks that refuse or leave out.
+    # Checks that refuse input or leave scans out.
     Fault("an error that the fit has made small is judged", "litho_models/monitoring/check.py",
           'if figure.name != "error" or not optimistic]', "if figure.name]", CHECK),
     Fault("a path that leaves its folder by a/../../b", "litho_data/cards/card.py",
@@ -103,7 +103,7 @@ FAULTS = [
           "tests/litho_models/test_loop_search.py -k reason"),
     Fault("the inverse of the prints' information", "litho_models/planning/open_questions.py",
           "information = stands_for * ", "information = 1 / stands_for * ", f"{NEXT} -k know"),
-    # Folders that were begun and not finished.
+    # Folders whose writing was begun but not finished.
     Fault("no mark of a begun folder", "litho_data/foundation/begun.py",
           "mark = Path(out), Path(out) / BEGUN", 'mark = Path(out), Path(out) / "other"', BEGUN),
     Fault("an older folder is not put back", "litho_data/foundation/files.py",
@@ -148,7 +148,7 @@ FAULTS = [
           "over_scans=over_units(list(after.by_scan_nm.values()), seed=", f"{RUN} -k errors_are_means"),
     Fault("a dead worker takes all jobs with it", "litho_data/sharing/workers.py",
           "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
-    # Of sixty faults drawn at random, those that no test of their room noticed.
+    # Sixty faults were drawn at random. No test of their room noticed the following ones.
     Fault("an interval only for too few units", "litho_models/scoring/statistics.py",
           "seed=seed) if enough else None", "seed=seed) if not enough else None",
           "tests/litho_models/test_metrics.py -k enough"),
@@ -197,7 +197,7 @@ FAULTS = [
     Fault("errors and spread exchanged", "litho_models/noise/calibration.py",
           "ence=normalised_calibration_error(residual[mine], sigma[mine])",
           "ence=normalised_calibration_error(sigma[mine], residual[mine])",
-          "tests/litho_models/test_noise.py -k half_as_large"),
+          "tests/litho_models/test_noise.py -k larger_than_stated"),
     Fault("noise along a difference by the inverse transform", "litho_models/planning/rivalry.py",
           "torch.fft.fft2(together)", "torch.fft.ifft2(together)", f"{NEXT} -k white_noise"),
     Fault("the worst model called the best", "litho_models/evaluation/wording.py",
@@ -208,7 +208,7 @@ FAULTS = [
           "tests/litho_models/test_learner.py -k from_both_ends"),
     Fault("lines along the other axis", "litho_models/loop/prepared.py",
           'write.get("slow_axis", "y")', 'write.get("y", "slow_axis")',
-          "tests/litho_models/test_loop_model.py -k record_says"),
+          "tests/litho_models/test_loop_model.py -k of_a_scan_states"),
     Fault("advice on a full wave only where it is unknown", "litho_design/reports/advice.py",
           "level_height_for_one_wave_um is None:", "level_height_for_one_wave_um is not None:",
           "tests/litho_design/test_fabrication.py -k full_wave"),
@@ -248,8 +248,8 @@ FAULTS = [
     Fault("one flat scan counts as all flat", "litho_models/loop/search.py",
           "one_level = all(", "one_level = any(", "tests/litho_models/test_loop_search.py -k cannot_test"),
     Fault("outcomes of the rivals in another order", "litho_models/planning/answers.py",
-          "it is {name}\" for name in names),\n            \"two fit",
-          "it is {name}\" for name in names[::-1]),\n            \"two fit", f"{NEXT} -k waiting"),
+          "it is the cause\" for name in names),\n            \"if two",
+          "it is the cause\" for name in names[::-1]),\n            \"if two", f"{NEXT} -k waiting"),
     Fault("a meaning stands before its name", "litho_data/reports/page.py",
           '[(column["name"], column["meaning"])', '[(column["meaning"], column["name"])',
           "tests/test_tables.py -k meaning"),
@@ -260,7 +260,7 @@ FAULTS = [
 
 
 def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
-    """Return the test that fails with a fault, or "mypy" if that runs first and fails; "" if none fails."""
+    """Return the name of the check that a fault makes fail, either a test or "mypy"; "" if none fails."""
     with _put_in(fault, copy):
         if typed and subprocess.run([*_MYPY], cwd=copy, capture_output=True).returncode:
             return "mypy"
@@ -273,8 +273,8 @@ def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
             code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
             said.seek(0)
             failed = re.search(r"^(?:FAILED|ERROR) (\S+)", said.read(), re.MULTILINE)
-    # 0: the tests passed; 1: a test failed; 2: a module that they import does not load.
-    assert code in (0, 1, 2), f"{fault.name}: no answer of {fault.tests}"
+    # 0: the tests passed; 1: a test failed; 2: a module that the tests import could not be loaded.
+    assert code in (0, 1, 2), f"{fault.name}: {fault.tests} could not be run"
     return failed[1] if failed else ""
 
 
@@ -282,7 +282,7 @@ def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
 def _put_in(fault: Fault, copy: Path) -> Iterator[None]:
     file = copy / fault.file
     text = file.read_text(encoding="utf-8")
-    assert text.count(fault.right) == 1, f"{fault.name}: {fault.file} no longer holds {fault.right!r} once"
+    assert text.count(fault.right) == 1, f"{fault.name}: {fault.file} does not hold {fault.right!r} once"
     file.write_text(text.replace(fault.right, fault.wrong), encoding="utf-8")
     try:
         yield
@@ -308,7 +308,7 @@ def _run(copy: Path, arguments: list[str], said: int) -> None:
 
 
 def try_all(faults: list[Fault], typed: bool = False) -> int:
-    """Put in one fault after the other; return how many were not caught.
+    """Put the faults into a copy of the project one after the other; return how many were not caught.
 
     Args:
         typed: whether to run mypy before the tests, as CI does.

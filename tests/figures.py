@@ -1,4 +1,4 @@
-"""Check that everything drawn in a figure can be seen, and that its axes say what they show.
+"""Check that everything drawn in a figure is visible, and that its axes are labelled.
 
 ``tests/conftest.py`` checks every figure of every report that a test makes.
 """
@@ -15,34 +15,34 @@ if TYPE_CHECKING:
 
 
 def require_legible(figure: Figure) -> None:
-    """Fail where a line, a dot, a bar or a map of a figure cannot be seen, or an axis has no name."""
-    assert figure.axes, "a figure without axes"
+    """Fail if a line, dot, bar or map of a figure is invisible, or if an axis has no label."""
+    assert figure.axes, "the figure has no axes"
     for axes in figure.axes:
         drawn = [*axes.lines, *axes.patches, *axes.images, *axes.collections]
-        assert drawn or not axes.axison, "empty axes"
+        assert drawn or not axes.axison, "the axes are empty"
         for one in drawn:
-            assert one.get_alpha() is None or np.all(np.asarray(one.get_alpha()) > 0), f"transparent {one}"
+            assert one.get_alpha() is None or np.all(np.asarray(one.get_alpha()) > 0), f"{one} is transparent"
         for line in axes.lines:
             stroke = line.get_linestyle() != "None" and line.get_linewidth() > 0
             dots = line.get_marker() not in ("None", None, "") and line.get_markersize() > 0
             assert stroke or dots, f"{line} has no width"
         for image in axes.images:
             low, high = image.get_clim()
-            assert low is None or not low > high, f"colours from {low} to {high}"
+            assert low is None or not low > high, f"the colour scale runs from {low} to {high}"
         if axes.axison and (axes.lines or axes.patches) and not hasattr(axes, "_colorbar"):
             _require_names(axes)
 
 
 def _require_names(axes: Axes) -> None:
-    """Fail unless each axis has tick labels or a name, which axes that share it may carry instead."""
+    """Fail unless each axis, or another axis that shares its scale, has tick labels or a name."""
     for axis, others in ((axes.xaxis, axes.get_shared_x_axes()), (axes.yaxis, axes.get_shared_y_axes())):
         which = f"{axis.axis_name}axis"
         alike = [getattr(one, which) for one in others.get_siblings(axes)]
         named = any(one.get_label_text() for one in alike)
-        assert named or any(text.get_text() for text in axis.get_ticklabels()), f"{which} without a name"
+        assert named or any(text.get_text() for text in axis.get_ticklabels()), f"{which} has no name"
     labelled = [text for text in axes.get_legend_handles_labels()[1] if text]
     assert axes.figure is not None
     first = axes.get_subplotspec()
     shares = first is not None and not first.is_first_col()
     shown = axes.get_legend() or axes.figure.legends or shares
-    assert shown or not labelled, f"no legend says what {labelled} are"
+    assert shown or not labelled, f"no legend explains {labelled}"

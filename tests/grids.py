@@ -1,8 +1,8 @@
-"""Grids on which a mistaken axis always changes the result; all rooms test their axes on them.
+"""Grids on which confusing the axes always changes the result; the tests of all rooms use them.
 
-Some fields are higher than wide, others wider than high. Their sizes are even and odd, their pixels are
-longer along one axis, and their corners are off the origin. So a transposed pair, the size of the wrong axis
-and a shift by half a pixel all show.
+Some fields are higher than wide, others wider than high. Their sizes are even or odd, their pixels are
+longer along one axis, and their corners lie off the origin. So a transposed pair, the size of the wrong axis
+and a shift by half a pixel are all noticed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Jobs for the tests of workers; the processes that run them import no other test module."""
+"""Jobs for the tests of workers. The processes that run these jobs import no other test module."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Job = tuple[int, list[int]]
 
 
 def large(count: int) -> dict[str, list[int]]:
-    """Return the large object that all jobs may read."""
+    """Return a large object, which all jobs may read."""
     return {"all": list(range(count))}
 
 
 def told(job: Job) -> tuple[list[int], int, tuple[str, str, str | None]]:
-    """Return the list that all jobs know, its entry with this job's number, and the facts of the run."""
+    """Return the list that all jobs share, its entry at this job's number, and facts about the run."""
     number, known = job
     return known, known[number], (run_facts()["command"], os.getcwd(), os.environ.get("OMP_NUM_THREADS"))
 
@@ -28,7 +28,7 @@ def refuse(number: int) -> None:
 
 
 def die_once(job: tuple[int, Path]) -> int:
-    """Kill the process at the first try of job 2, after leaving a mark; else return the number."""
+    """Return the number of the job, but kill the process at the first try of job 2, after leaving a mark."""
     number, mark = job
     if number == 2 and not mark.exists():
         mark.touch()
@@ -37,7 +37,7 @@ def die_once(job: tuple[int, Path]) -> int:
 
 
 def die_at_first(job: tuple[int, int, Path]) -> int:
-    """Kill the process ``deaths`` times, leaving a mark each time, and then return the number."""
+    """Kill the process at the first ``deaths`` tries, leaving a mark each time; then return the number."""
     number, deaths, marks = job
     for death in range(deaths):
         if not (mark := marks / f"{number}.{death}").exists():
@@ -51,7 +51,7 @@ def die(_: int) -> None:
 
 
 def new_pages(mib: int) -> int:
-    """Count the new memory pages of this process as it makes and frees a ``mib`` MiB array 20 times."""
+    """Count the new memory pages that the process gets while it makes and frees ``mib`` MiB 20 times."""
     import resource
 
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

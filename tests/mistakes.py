@@ -1,4 +1,4 @@
-"""Run the three commands and the packages with typical mistakes of users, on small inputs."""
+"""Run the three commands and the packages with typical user mistakes, on small inputs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-# Run as if torch were missing, as after `pip install litholoop` alone.
+# Make torch appear to be missing, as it is after `pip install litholoop` without extras.
 NO_TORCH = "litho-models zoo list"
-# The mistakes by theme: each is a command line or a Python statement.
+# The mistakes, grouped by theme. Each is a command line or a Python statement.
 MISTAKES: dict[str, dict[str, str]] = {
     "Words of the command line": {
         "a command misspelt": "litho-models trian prints.zarr --model pbl --out new",
@@ -161,7 +161,7 @@ MISTAKES: dict[str, dict[str, str]] = {
 
 
 def build_world() -> None:
-    """Write the files that the mistakes use to the current folder: raw prints, stores, models, results."""
+    """Write the files that the mistakes need (raw prints, stores, models, results) to the current folder."""
     from litho_data import open_store, simulate
     from litho_data.foundation.begun import BEGUN
     from litho_data.layouts import write_layout_set
@@ -185,7 +185,7 @@ def build_world() -> None:
         Path(name, "card.toml").write_text(text.replace(old, new), "utf-8")
     shutil.copy("raw/scans/P11.txt", "lost/scans/P12.txt")
     with warnings.catch_warnings():
-        # xarray warns of strings in this store, which our build command has not written.
+        # xarray warns about strings in this store, because it was not written by our build command.
         warnings.simplefilter("ignore")
         scans = make_scans(3, 32)
         write_store(here / "prints.zarr", scans)
@@ -218,7 +218,7 @@ def build_world() -> None:
 
 @contextlib.contextmanager
 def world() -> Iterator[Path]:
-    """Make a folder with everything that the mistakes need, and work in it meanwhile."""
+    """Make a folder with all files that the mistakes need, and make it the current folder for the tests."""
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         os.chdir(folder)
@@ -230,7 +230,7 @@ def world() -> Iterator[Path]:
 
 
 def answer(mistake: str) -> tuple[int | str, str]:
-    """Return exit code and stderr of a command, or the exception's name and message of a statement."""
+    """Return the exit code and stderr of a command, or the name and message of a statement's exception."""
     if not mistake.startswith("litho-"):
         import litho_data
         import litho_design

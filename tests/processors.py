@@ -1,10 +1,10 @@
-"""Run the numerical tests on this processor, and again as if it were an older one.
+"""Run the numerical tests on this processor, and again while it imitates older processors.
 
     python tests/processors.py [--all] [--after-native] [native] [avx2] [avx512]
 
-Without names the tests run as each of the three. With --all every test runs, not only the quick numerical
-ones. An older processor is left out if this processor has the same instructions and the tests also run as
-"native". With --after-native the native tests have just passed, so it is left out then too.
+Without names, the tests run as each of the three. With --all, every test runs, not only the quick numerical
+ones. An older processor is skipped if this processor has no further instructions and the tests also run as
+"native". The option --after-native states that the native tests have just passed, so that they count as run.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ _QUICK = ["-m", "numerics and not slow and not long"]
 
 
 class Processor(NamedTuple):
-    """A processor that this one can imitate.
+    """Describe a processor that this one can imitate.
 
-    ``capability`` is the capability that imitating it needs, and ``environment`` makes the libraries imitate
-    it. ``beyond`` lists capabilities that it lacks: a processor that lacks them too gives the same numbers.
+    This processor needs the ``capability`` to imitate it, and the variables in ``environment`` make the
+    libraries do so. ``beyond`` lists capabilities that the imitated processor lacks. Any processor without
+    them gives the same numbers.
     """
 
     capability: str
@@ -46,7 +47,7 @@ PROCESSORS = {
         },
         ("avx512_f", "avx_ne_convert"),
     ),
-    # Without the bfloat16 unit, which oneDNN then replaces by arithmetic in float32.
+    # This processor has no bfloat16 unit, so oneDNN computes in float32 instead.
     "avx512": Processor(
         "avx512_f",
         {
@@ -60,23 +61,23 @@ PROCESSORS = {
 
 
 def can_play(name: str) -> bool:
-    """Return whether this processor has the instructions of the named one."""
+    """Return whether this processor has all instructions of the named one and can imitate it."""
     capability = PROCESSORS[name].capability
     return not capability or bool(torch.cpu.get_capabilities().get(capability))
 
 
 def why_left_out(name: str, beside: Collection[str]) -> str:
-    """Return why the tests do not run as the named processor too, beside the others; "" if they do."""
+    """Return why the tests are not run as the named processor, or "" if they are."""
     if not can_play(name):
-        return "this processor has other instructions"
+        return "this processor lacks the instructions"
     known = torch.cpu.get_capabilities()
     if name != "native" and "native" in beside and not any(known.get(one) for one in PROCESSORS[name].beyond):
-        return "this processor is one, and they pass on it as it is"
+        return "this processor gives the same numbers natively"
     return ""
 
 
 def main(arguments: list[str]) -> int:
-    """Run the tests as each of the named processors; the exit status is 1 where one of them fails."""
+    """Run the tests as each of the named processors, and return 1 as the exit status if any run fails."""
     names = [argument for argument in arguments if not argument.startswith("--")]
     passed = ["native"] if "--after-native" in arguments else []
     chosen, what = ([], "all tests") if "--all" in arguments else (_QUICK, "numerics")
@@ -89,7 +90,7 @@ def main(arguments: list[str]) -> int:
     names = names or list(PROCESSORS)
     for name in names:
         if reason := why_left_out(name, [*names, *passed]):
-            outcomes.append((name, f"left out: {reason}"))
+            outcomes.append((name, f"skipped: {reason}"))
             continue
         print(f"== {what}, {name}", flush=True)
         started = time.perf_counter()

@@ -1,9 +1,9 @@
-"""Stop commands after their writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
+"""Stop a command after some of its writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
 
-This runs in a separate process with one thread, because a stopped command is a fork of it. Every command is a
-function of the folder that it works in, where its input is made beforehand. The module gives each stopped
-command again, and prints how many stops ended with the result of an uninterrupted run. A test tries six
-stops, ``every`` tries all.
+This must run in a separate process with one thread, because each stopped command is a fork of that process.
+Every command is a function of its working folder, which already contains its input. The module runs each
+stopped command again, checks that the result equals that of an uninterrupted run, and prints the number of
+stops. By default it tries up to six stops; ``every`` tries all.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from tests.litho_models.loop_scans import base_model, planted
 from tests.litho_models.prints import make_scans, write_store
 from tests.stops import stopped_after, writes_of
 
-# Fields that differ between two runs of one command.
+# Fields of records that differ between two runs of the same command.
 _VOLATILE = {
     "seconds",
     "seconds_per_iteration",
@@ -170,7 +170,7 @@ def judge(folder: Path) -> None:
 
 
 def _planted(folder: Path) -> None:
-    """Write prints of a small base with write-order memory, and make the loop try few other causes."""
+    """Write prints with write-order memory, and make the loop use a small base and try only a few causes."""
     strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
     write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
     causes = [get_effect(one) for one in ("write-order-memory", "slope-thinning")]
@@ -182,7 +182,7 @@ def _planted(folder: Path) -> None:
 
 
 def _once(close: Callable[..., Any]) -> Callable[..., Any]:
-    """Cache what a search finds for the forks of this process, which repeat only the rest and all writes."""
+    """Cache the result of a search, so that the forks repeat only the other work and all writes."""
     kept: dict[tuple[str, ...], Any] = {}
 
     def found(study: Any, models: Any) -> Any:
@@ -254,13 +254,13 @@ def export_design(folder: Path) -> None:
 
 
 def score_design(folder: Path) -> None:
-    # The record keeps the design's folder as it was given, so use a relative path.
+    # The record keeps the path of the design's folder as given, so use a relative path.
     os.chdir(folder)
     score("design", "out", judges=["zoo:physics"])
 
 
 def sheet(folder: Path) -> None:
-    # Random layouts of a smaller field would have a coarser pattern.
+    # Random layouts of a smaller field would be coarser.
     made = hologram_settings(changes=_SMALL_OPTICS | {"layout.size_px": 64})
     new_sheet(folder / "out", model="zoo:physics", settings=made, format="png16", layouts=6, announce=False)
 
@@ -269,7 +269,7 @@ def nothing(folder: Path) -> None:
     pass
 
 
-# Per command: the function that makes its input, and the function that runs it.
+# For each command, the function that makes its input and the function that runs it.
 COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "simulate": (nothing, simulate_prints),
     "simulate-films": (nothing, films),
@@ -303,7 +303,7 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
 
 
 def content(folder: Path) -> dict[str, Any]:
-    """Return all that a command left, hidden files too, without the fields that differ between two runs."""
+    """Return all files that a command left, hidden ones too, without fields that differ between two runs."""
     if (folder / "out" / "zarr.json").exists():
         assert not verify(folder / "out").findings
         found: dict[str, Any] = {"dataset": open_store(folder / "out").sha256}
@@ -328,18 +328,18 @@ def _steady(value: Any) -> Any:
 
 
 def chosen(count: int, most: int) -> list[int]:
-    """Return stops that are spread over all writes, and the last three, where results are put in place."""
+    """Return stops spread over all writes, and the last three writes, which put the results in place."""
     spread = range(0, count, max(1, -(-count // most)))
     return sorted({*spread, *range(max(0, count - 3), count)})
 
 
 def stop_everywhere(name: str, place: Path, most: int) -> int:
-    """Stop a command after some of its writes and give it again each time; return the number of stops."""
+    """Stop a command after some of its writes, run it again each time, and return the number of stops."""
     need, command = COMMANDS[name]
     prepared = place / "prepared"
     prepared.mkdir(parents=True)
     need(prepared)
-    # Run it once in this process, so that its forks need not import anything.
+    # Run the command once in this process, so that the forks need not import anything.
     command(Path(shutil.copytree(prepared, place / "first")))
     whole = Path(shutil.copytree(prepared, place / "whole"))
     count = writes_of(lambda: command(whole), whole)
@@ -359,5 +359,5 @@ def stop_everywhere(name: str, place: Path, most: int) -> int:
 
 
 if __name__ == "__main__":
-    assert os.environ.get("OMP_NUM_THREADS") == "1", "forks need one thread"
+    assert os.environ.get("OMP_NUM_THREADS") == "1", "forks need a single thread: set OMP_NUM_THREADS=1"
     stop_everywhere(sys.argv[1], Path(sys.argv[2]), 10**9 if "every" in sys.argv else 3)

@@ -1,7 +1,7 @@
-"""Stop a process after each of its writes, so that a second start can be compared with a whole run.
+"""Stop a process after a chosen number of writes, so that a restart can be compared with a whole run.
 
-A write is a Python call that changes the file system: it opens a file for writing, makes a folder, renames or
-removes. A stopped process ends at once, as if killed: no clean-up runs.
+A write is a Python call that changes the file system: it opens a file for writing, makes a folder, or renames
+or removes something. A stopped process ends at once without clean-up, as if killed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _STOPPED = 77
 
 
 def writes_of(work: Callable[[], object], below: Path) -> int:
-    """Run the work in a child process and return how many writes it makes below a folder."""
+    """Run the work in a child process and return how many writes it makes inside a folder."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -27,18 +27,18 @@ def writes_of(work: Callable[[], object], below: Path) -> int:
     with os.fdopen(reader) as stream:
         said = stream.read()
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code == 0, f"the work itself ended with {code}"
+    assert code == 0, f"the work ended with exit code {code} without being stopped"
     return int(said)
 
 
 def stopped_after(count: int, work: Callable[[], object], below: Path) -> bool:
-    """Run the work in a child process; return whether it was stopped after ``count`` writes in ``below``."""
+    """Run the work in a child process, stop it after ``count`` writes, and return whether it got that far."""
     child = os.fork()
     if child == 0:
         _watch(below, stop_before=count)
         _end(work, lambda: None)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in (0, _STOPPED), f"the work ended with {code}"
+    assert code in (0, _STOPPED), f"the work ended with exit code {code}"
     return code == _STOPPED
 
 
@@ -55,7 +55,7 @@ def _end(work: Callable[[], object], last: Callable[[], object]) -> None:
 
 
 def _watch(below: Path, stop_before: int | None) -> list[int]:
-    """Count writes from now on, and end the process before the write with this number."""
+    """Count the writes from now on, and end the process after ``stop_before`` of them."""
     count, root = [0], str(below.resolve())
 
     def seen(event: str, arguments: tuple[Any, ...]) -> None:

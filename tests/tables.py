@@ -1,4 +1,4 @@
-"""Check tables: each row is one object of the record, and each column the field that it names."""
+"""Check that each row of a table is one object of the record, and each column the field that it names."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def require_tables_equal_record(
     pivoted: Collection[str] = (),
     besides: str = "noise floor",
 ) -> None:
-    """Fail where a row of a CSV file in the folder is no object of the record.
+    """Fail if a row of a CSV file in the folder does not match any object of the record.
 
     Args:
-        names: by table, the columns whose name differs from that of their field, and the name of the field;
+        names: for each table, the field of each column whose name differs from that of its field;
             "" for a column that is made from several fields.
         pivoted: tables whose rows are not objects; other tests check them.
-        besides: the first word of rows that belong to the whole record; they are not checked.
+        besides: how rows begin that describe the whole record; they are not checked.
     """
     objects = list(_objects(json.loads((folder / record).read_text(encoding="utf-8")), {}))
     fields = {name for one in objects for name in one}
@@ -46,24 +46,24 @@ def require_tables_equal_record(
 
 
 def require_figures_by_column(file: Path, columns: Mapping[str, Mapping[str, float]]) -> None:
-    """Fail where a cell is not the figure named by its row, for the print named by its column.
+    """Fail if a cell is not the number that its row names, for the print that its column names.
 
     Args:
-        columns: the figures of each print, by the title of its column.
+        columns: the numbers of each print, by the title of its column.
     """
     with file.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert rows, f"{file.name} is empty"
-    assert set(rows[0]) - {"name", "meaning"} == set(columns), f"{file.name} has other columns"
+    assert set(rows[0]) - {"name", "meaning"} == set(columns), f"{file.name} has the wrong columns"
     for row in rows:
         for title, figures in columns.items():
             value = figures.get(row["name"], math.nan)
             same = row[title] == "" if math.isnan(value) else _same(value, row[title])
-            assert same, f"{file.name}: {row['name']} of {title}"
+            assert same, f"{file.name}: wrong value for {row['name']} of {title}"
 
 
 def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield each object of a record, together with the plain fields of the objects that contain it."""
+    """Yield each object of a record, joined with the plain fields of the objects that contain it."""
     if isinstance(value, list):
         for one in value:
             yield from _objects(one, above)
@@ -74,13 +74,13 @@ def _objects(value: Any, above: dict[str, Any]) -> Iterator[dict[str, Any]]:
         parts = {name: one for name, one in value.items() if isinstance(one, dict | list)}
         for part in parts.values():
             yield from _objects(part, own)
-            # An object without inner objects also comes with the plain fields of the object around it.
+            # An object without inner objects is also yielded with the plain fields of the object around it.
             if isinstance(part, dict) and all(not isinstance(one, dict | list) for one in part.values()):
                 yield {**own, **part}
 
 
 def _flat(value: Mapping[str, Any], of: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the fields, those of inner objects too, whose names get the name of the object as a prefix."""
+    """Yield all fields. Names of fields of inner objects are prefixed with the name of the object."""
     for name, one in value.items():
         if isinstance(one, dict):
             yield from _flat(one, f"{of}{name}_")
@@ -100,7 +100,7 @@ def _same(value: Any, text: str) -> bool:
     if isinstance(value, list):
         ends = text.split(" … ")
         if len(ends) == len(value) == 2:
-            # An interval written for readers, so rounded.
+            # An interval that is rounded for readers.
             pairs = zip(value, ends, strict=True)
             return all(
                 abs(one - _number(end)) <= 0.51 * 0.1 ** len(end.partition(".")[2]) for one, end in pairs

@@ -1,4 +1,4 @@
-"""Laws on the structure of the project: imports go one way, and importing is cheap."""
+"""Check the structure of the project: imports go one way only, and importing is cheap."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ALLOWED = {
     "litho_models": {"litho_data", "litho_models"},
     "litho_design": {"litho_data", "litho_models", "litho_design"},
 }
-# litho_design may only use the parts of litho_models that find and load a frozen model. Its room ``sheets``
-# also learns from a sheet that comes back from a lab, so it may call these public functions.
+# litho_design may use only those parts of litho_models that find and load a frozen model. Its room ``sheets``
+# also trains on a sheet that a lab has printed and measured, so it may call the functions in LEARNING.
 FROZEN_ONLY = {"load_frozen", "zoo"}
 LEARNING = {"sheets": {"close_loop", "evaluate", "freeze"}}
-# Rooms from the lowest up: a room imports only from those before it. `simulator` is a module.
+# The rooms, starting with the lowest. A room imports only from the rooms before it. `simulator` is a module.
 ROOMS = {
     "litho_data": (
         "foundation", "sharing", "commands", "reports", "scan", "readers", "register", "level",
@@ -44,12 +44,12 @@ HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "S
 
 def _sources(package: str, root: Path = ROOT) -> list[Path]:
     files = sorted((root / package).rglob("*.py"))
-    assert files, f"{package} has no source files: the test would pass on nothing"
+    assert files, f"{package} has no source files, so the test would check nothing"
     return files
 
 
 def _imports(file: Path) -> set[str]:
-    """Return the dotted names of everything that a file imports, at any level of nesting."""
+    """Return the dotted names of everything that a file imports, also inside its functions."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -90,8 +90,8 @@ def test_design_uses_only_frozen_models() -> None:
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_modules_import_each_other_in_no_circle(package: str) -> None:
     graph = _module_graph(package)
-    assert sum(map(len, graph.values())) > len(graph), "hardly an import found: would pass on nothing"
-    assert not (found := _circles(graph)), f"modules import each other in circles: {found}"
+    assert sum(map(len, graph.values())) > len(graph), "hardly any imports were found"
+    assert not (found := _circles(graph)), f"these modules import each other in a circle: {found}"
 
 
 @pytest.mark.parametrize("package", sorted(ROOMS))
@@ -100,7 +100,7 @@ def test_rooms_import_only_from_those_before_them(package: str) -> None:
 
 
 def test_a_circle_and_an_import_upwards_are_found(tmp_path: Path) -> None:
-    """Check that both laws find their breach in a package where only a function makes the import."""
+    """Check that both tests above find a forbidden import that is inside a function."""
     for name, text in {
         "pack/__init__.py": "from pack.low.a import f",
         "pack/low/__init__.py": "",
@@ -117,7 +117,7 @@ def test_a_circle_and_an_import_upwards_are_found(tmp_path: Path) -> None:
 
 
 def _circles(graph: Mapping[str, set[str]]) -> list[set[str]]:
-    """Return sets of modules in which each imports every other one, directly or through others."""
+    """Return the sets of modules that all import each other, directly or through other modules."""
     reached = {name: _reached(graph, name) for name in graph}
     circles = [{other for other in reached[name] if name in reached[other]} for name in graph]
     return [circle for place, circle in enumerate(circles) if circle and circle not in circles[:place]]
@@ -133,7 +133,7 @@ def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
 
 
 def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
-    """Return the imports of a room from a room that stands after it in the list."""
+    """Return the imports from a room that comes later in the list than the importing room."""
     place = {room: number for number, room in enumerate(rooms)}
     pairs = [(name, other) for name, imported in graph.items() for other in imported]
     steps = [(name, other, name.split(".")[1], other.split(".")[1]) for name, other in pairs]
@@ -145,9 +145,9 @@ def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
 
 
 def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
-    """Return, for each module of a package, the modules of that package that it imports anywhere in its file.
+    """Return for each module of a package which modules of the same package it imports.
 
-    The package's ``__init__.py`` is left out: it names everything, and no module inside imports it.
+    The package's ``__init__.py`` is excluded: it names everything, but no module of the package imports it.
     """
     modules = {}
     for file in _sources(package, root):
@@ -156,7 +156,7 @@ def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
     del modules[package]
     graph = {}
     for name, file in modules.items():
-        # `from room.module import name` imports room.module; `from room import module` that module too.
+        # `from room.module import name` and `from room import module` both import room.module.
         whole = {n if n in modules else n.rpartition(".")[0] for n in _imports(file)}
         graph[name] = (whole & modules.keys()) - {name}
     return graph
@@ -186,11 +186,11 @@ def test_the_main_path_of_the_loop_takes_six_files() -> None:
         used = set().union(*(graph[before] for before in modules[:place]))
         # A name may be imported through the ``__init__.py`` of its folder.
         faces = [graph[name] for name in used if (ROOT / name.replace(".", "/")).is_dir()]
-        assert module in used.union(*faces), f"{module}: nothing before it uses it"
+        assert module in used.union(*faces), f"no earlier module of the list uses {module}"
 
 
 def _between(page: str, name: str) -> str:
-    """Return the text between the two comments of a page."""
+    """Return the text of a page between the two comments with this name."""
     return page.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
 
 
@@ -207,7 +207,7 @@ def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
 
 
 def test_importing_litho_data_takes_less_than_half_a_second() -> None:
-    # The best of three, because another process may use the core. The limit is for our own work only.
+    # Take the best of three, because another process may slow this one down.
     code = "import time; t = time.perf_counter(); import litho_data; print(time.perf_counter() - t)"
     assert min(float(_python(code)) for _ in range(3)) < 0.5
 
@@ -219,7 +219,7 @@ def test_a_public_face_is_small_and_every_name_on_it_is_there(package: str) -> N
     assert set(dir(face)) == {*face.__all__, "__version__"}
     assert len(face.__all__) <= 20
     rooms = {path.stem for path in (ROOT / package).iterdir()}
-    assert not rooms & set(face.__all__), "importing a room binds its name and hides what the face shows"
+    assert not rooms & set(face.__all__), "importing a room would hide the public name that is the same"
     assert all(getattr(face, name) is not None for name in face.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = face.nothing

@@ -1,4 +1,4 @@
-"""Check the list of what a user can do: it is complete, and each entry names tests or says why not."""
+"""Check that the list of capabilities is complete and that each entry names tests or a reason for none."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from typer.main import get_command
 ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "capabilities.toml"
 PACKAGES = ("litho_data", "litho_models", "litho_design")
-# Rooms whose `__all__` is meant for other rooms and is on no page.
+# Rooms whose `__all__` is meant only for other rooms, so no page documents it.
 INNER = {"litho_data.foundation", "litho_models.fitting"}
-# Options that every command has, and one of torchrun.
+# Options that every command has, and one option of torchrun.
 ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python", "--plugin"}
 
 
@@ -30,7 +30,7 @@ def entries() -> list[dict[str, Any]]:
 
 @cache
 def names_in_file(file: str) -> frozenset[str]:
-    """Return the names of a file's tests, `Class::test_name` in a class, without importing the file."""
+    """Return the test names of a file without importing it; in a class they read `Class::test_name`."""
 
     def names(nodes: list[ast.stmt], place: str) -> Iterator[str]:
         for node in nodes:
@@ -44,7 +44,7 @@ def names_in_file(file: str) -> frozenset[str]:
 
 
 def faults(entry: dict[str, Any]) -> list[str]:
-    """Return in words what is wrong with an entry."""
+    """Describe in words what is wrong with an entry."""
     kinds = entry.keys() & {"test", "gone", "untested"}
     found = []
     if len(kinds) != 1 or entry.keys() - kinds != {"what", "how"}:
@@ -62,7 +62,7 @@ def faults(entry: dict[str, Any]) -> list[str]:
 
 
 def commands() -> dict[str, set[str]]:
-    """Return every command of the three command lines with its options."""
+    """Return the options of every command of the three command lines."""
     found: dict[str, set[str]] = {}
 
     def walk(command: Any, name: str) -> None:
@@ -78,7 +78,7 @@ def commands() -> dict[str, set[str]]:
 
 
 def public_names() -> set[str]:
-    """Return `room.name` for every name that the source of a package's or room's `__init__.py` exports."""
+    """Return `room.name` for every name that the `__init__.py` of a package or room exports."""
     names = set()
     for file in (one for package in PACKAGES for one in (ROOT / package).rglob("__init__.py")):
         room = ".".join(file.parent.relative_to(ROOT).parts)
@@ -91,7 +91,7 @@ def public_names() -> set[str]:
 
 
 def names_in(how: str) -> set[str]:
-    """Return the public names in a `how` text, written `room.name` or `room: name, name`."""
+    """Return the public names in a `how` text, where they are written `room.name` or `room: name, name`."""
     named = set(re.findall(r"litho_\w+(?:\.\w+)+(?=[\s,;()]|$)", how))
     for room, listed in re.findall(r"(litho_[\w.]+): ([^;]+)", how):
         named |= {f"{room}.{name}" for name in re.findall(r"\w+", listed)}
@@ -117,7 +117,7 @@ def test_a_fault_in_an_entry_is_found():
     for spoiled, said in (
         ({**good, "test": f"{here}_not"}, "no test"),
         ({**good, "test": [here, "tests/test_nowhere.py::test_nothing"]}, "no test"),
-        # A test within a class is not named by the file alone.
+        # A test inside a class needs the name of the class.
         (
             {**good, "test": "tests/litho_data/test_layouts.py::test_a_random_layout_follows_the_equation"},
             "no test",
@@ -146,7 +146,7 @@ def test_every_public_name_is_listed(hows):
 
 
 def test_every_command_option_and_name_in_the_list_exists():
-    """Check that all listed names exist, except in entries for what has gone, which say why."""
+    """Check that all listed names exist, except in entries for capabilities that were removed."""
     known, public = commands(), public_names()
     options = ANYWHERE | {option for own in known.values() for option in own}
     for how in (entry["how"] for entry in entries() if "gone" not in entry):

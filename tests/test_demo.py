@@ -1,4 +1,4 @@
-"""The index of the demo tells its story in six cards, each with a picture and a link to a page."""
+"""Check the demo: its index page has six cards, each with a picture and a link to a page."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     text = page.write(tmp_path, "index.html").read_text("utf-8")
     assert re.findall(r"<h2[^>]*>\s*(\d)\. ", text) == list("123456")
     assert text.count("<figure") == 6
-    # The result for the measured prints is used here. Slope-thinning is among the effects it found.
+    # This uses the result for the measured prints, in which slope-thinning is one of the effects found.
     assert "2 effects were hidden in the prints, and the loop found 1 of them" in answer
     assert answer in text
     assert "Planted and not found: write-order-memory" in text
@@ -58,7 +58,7 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
 
 @pytest.mark.long
 def test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page(tmp_path):
-    """Run what ``make demo`` runs in its environment."""
+    """Check the command that ``make demo`` runs."""
     recipe = re.search(
         r"^demo:.*\n\t\$\(BIN\)/python (-m examples\.demo --out) ", (ROOT / "Makefile").read_text(), re.M
     )

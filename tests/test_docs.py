@@ -1,4 +1,4 @@
-"""Check the documentation: links and anchors exist, every page is on the site, tutorials show what ran."""
+"""Check the documentation: its links and anchors, the site's list of pages, and the code of the tutorials."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 _FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
-# Replacements that make a tutorial small for the test. Each text must occur in the tutorial.
+# Replacements that make a tutorial run fast in the test. Each replaced text must occur in the tutorial.
 SMALLER = {
     "datasets": {"count=6, size_px=160": "count=2, size_px=128", "(16.8, 16.8)": "(13.6, 13.6)"},
     "models": {
         "count=8": "count=4",
-        # Too few scans for an interval.
+        # There are too few scans for a confidence interval.
         "scores.mae_datum_free_ci95_nm": "scores.mae_datum_free_ci95_nm or (0.0, 0.0)",
         '("affine", "linear", "physics"), folds=2': '("affine", "linear"), folds=2',
         '"physics", "run"': '"affine", "run"',
@@ -34,7 +34,7 @@ SMALLER = {
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as GitHub and the site make them."""
+    """Return the anchors that GitHub and the site make from the headings of a page."""
     text = _FENCED.sub("", page.read_text("utf-8"))
     found = set()
     for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE):
@@ -69,22 +69,22 @@ def test_a_broken_link_and_a_wrong_anchor_are_found(tmp_path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_an_empty_line_separates_a_list_from_the_text_before_it(page):
-    """The site's Markdown, unlike GitHub's, needs an empty line before a list to show it as a list."""
+    """Check for an empty line before each list, which the site's Markdown needs, unlike GitHub's."""
     text = _FENCED.sub("", page.read_text("utf-8"))
     assert re.findall(r"^(?![-*|#<]|\d+\. | |$).*\n(?:[-*]|\d+\.) .*$", text, re.MULTILINE) == []
-    # A second paragraph of a list item, and the next item right below it.
+    # This finds a second paragraph of a list item that is directly followed by the next item.
     assert re.findall(r"\n\n {4,}(?![-*]|\d+\. ).*(?:\n .*)*\n(?:[-*]|\d+\.) .*", text) == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_no_cell_ends_in_braces(page):
-    """The site's Markdown takes braces at the end of a cell as attributes of the cell and drops them."""
+    """Check that no table cell ends in braces. The site's Markdown would drop them as attributes."""
     assert re.findall(r"^\|.* \{[^`|\n]*\} *\|.*$", page.read_text("utf-8"), re.MULTILINE) == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_further_lines_of_a_list_item_are_indented_by_four_spaces(page):
-    """With fewer spaces the site's Markdown ends the list there, and joins the following items."""
+    """Check the indentation. With fewer than four spaces, the site's Markdown would end the list there."""
     text = _FENCED.sub("", page.read_text("utf-8"))
     assert re.findall(r"\n\n {1,3}(\S.*)", text) == []
 
@@ -98,7 +98,7 @@ def test_every_page_is_on_the_site():
 
 
 def misspelt(text: str, known: dict[str, set[str]]) -> list[str]:
-    """Return the command lines in code blocks and text whose command or option does not exist."""
+    """Return the command lines of a text that use a command or an option that does not exist."""
     lines = re.findall(r"^(?:torchrun .*? )?(litho-(?:data|models|design) .*)$", text, re.MULTILINE)
     lines += re.findall(r"`(litho-(?:data|models|design) [^`]*)`", text)
     found = []
@@ -141,7 +141,7 @@ def test_a_tutorial_runs_and_its_page_shows_its_code(renderer, name, tmp_path, m
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     ran = [renderer.run_cell(text, names) for kind, text in renderer.cells(script) if kind == "code"]
-    # The page shows an output below each cell that printed one. The numbers differ, as the test is smaller.
+    # The page shows the output below each cell that printed any. The numbers of this smaller run differ.
     outputs = re.findall(r"^```text\n(.*?)\n```", page, re.MULTILINE | re.DOTALL)
     assert len(outputs) == len([said for said, _ in ran if said])
     assert page.count("](" + name + "-") == len([value for _, value in ran if hasattr(value, "savefig")]) > 0
@@ -154,7 +154,7 @@ def test_a_notebook_is_its_tutorial_after_one_cell_that_installs(renderer, name)
     first, *others = [(cell["cell_type"], "".join(cell["source"])) for cell in made["cells"]]
     assert others == renderer.cells((folder / f"{name}.py").read_text("utf-8"))
     assert "%pip install" in first[1]
-    # Format 4.5 requires a unique id of every cell, and outputs and an execution count of every code cell.
+    # Format 4.5 requires that every cell has a unique id and every code cell has outputs and a count.
     ids = [cell["id"] for cell in made["cells"]]
     assert (made["nbformat"], made["nbformat_minor"], len(set(ids))) == (4, 5, len(ids))
     for cell in made["cells"]:
@@ -183,7 +183,7 @@ def figures(text: str) -> set[str]:
 
 
 def not_said_again(text: str, linked: str) -> set[str]:
-    """Return the figures of a page's short answer that are neither elsewhere on it nor on linked pages."""
+    """Return the numbers of a page's short answer that are found nowhere else, also not on linked pages."""
     short, _, rest = text.partition("**In short")[2].partition("\n\n")
     found = figures(f"{rest} {linked}")
     rounded = {f"{float(one):.{places}f}" for one in found for places in (1, 2)}
@@ -192,7 +192,7 @@ def not_said_again(text: str, linked: str) -> set[str]:
 
 @pytest.mark.parametrize("page", SHORT, ids=lambda page: page.name)
 def test_the_short_answer_has_no_figure_of_its_own(page):
-    """The short answer at the top is written by hand, so a figure could stay there after it has changed."""
+    """Check the numbers of the short answer at the top, because it is written by hand and may be outdated."""
     text = page.read_text("utf-8")
     links = re.findall(r"\]\(([\w./-]+\.md)", text.partition("**In short")[2].partition("\n\n")[0])
     linked = "".join((page.parent / link).read_text("utf-8") for link in links)

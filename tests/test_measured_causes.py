@@ -1,4 +1,4 @@
-"""The page on the causes found in the measured prints quotes each figure of the committed record."""
+"""Check that the page on the causes found in the measured prints quotes the committed record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_the_record_is_of_the_measured_prints_and_its_rows_are_made_alike():
     scans = {frozenset(row.by_scan_nm) for row in result.errors if row.held_out != "locked"}
     (development,) = scans
     assert not development & set(result.split.lock_box)
-    # Policy "none" leaves no term of a scan free, policy "offset" one: equally for every model.
+    # For every model alike, policy "none" fits no per-scan term, and policy "offset" fits one.
     assert {row.k for row in result.errors if row.policy == "none"} == {0.0}
     assert {row.k for row in result.errors if row.policy == "offset"} == {1.0}
 

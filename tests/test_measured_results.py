@@ -1,4 +1,4 @@
-"""The pages quote each figure of the committed results for the measured prints."""
+"""Check that the pages quote the committed results for the measured prints correctly."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_pages_say_where_the_locked_scans_take_part():
     assert paper.split.lock_box_opened
     page = (FOLDER / "README.md").read_text("utf-8")
     assert "These draws include the locked scans" in page
-    assert "4 locked scans are in no fold and in no figure of this table" in texts(FOLDER)["benchmark"]
+    assert "4 locked scans are in no fold and in no number of this table" in texts(FOLDER)["benchmark"]
 
 
 def test_every_result_is_there():

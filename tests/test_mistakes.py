@@ -1,4 +1,4 @@
-"""A typical mistake is answered in one line that says what to do."""
+"""Check that every typical mistake of a user is answered in one line that says what to do."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def test_a_mistake_is_answered_in_one_line(did, mistake, files):
     code, said = answer(mistake)
     *skipped, last = said.strip().splitlines()
     assert code == (2 if mistake.startswith("litho-") else "InputError"), said
-    # Lines about progress, and those of a build about the scans that it skips, are no answers.
+    # Lines that report progress, or the scans that a build skips, do not count.
     assert [
         line
         for line in skipped
         if not (line.startswith(("skipped ", "building ", "training ", "checking ")) or "is at work" in line)
     ] == []
-    # The answer says what was found and wanted, or what to do. It is never Python's own message.
+    # The answer says what was given and what is wanted, or what to do. It is never Python's own message.
     assert any(word in last for word in ("wanted", ";", ": no ")), last
     assert not any(word in last for word in ("Errno", "PosixPath", "Traceback", "codec")), last
     assert sorted(path.name for path in files.iterdir()) == before

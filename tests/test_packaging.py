@@ -1,4 +1,4 @@
-"""Check installation (litho_data without torch, the wheel in an empty folder) and the project's files."""
+"""Check the project's files and installations: litho_data without torch, the wheel in an empty folder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_litho_models_and_litho_design_say_in_one_line_which_extra_they_need(
     tmp_path: Path, name: str
 ) -> None:
     hint = f"pip install 'litholoop[{name}]'"
-    # In an environment without torch find_spec returns None. The blocked one above raises instead.
+    # In an environment without torch, find_spec returns None, whereas WITHOUT_EXTRAS raises an error.
     hidden = "import importlib.util; importlib.util.find_spec = lambda name: None\n"
     done = run(f"{hidden}from litho_{name}.cli import main; main()", tmp_path)
     assert done.returncode == 2
@@ -68,11 +68,11 @@ def test_litho_models_and_litho_design_say_in_one_line_which_extra_they_need(
 
 @pytest.mark.long
 def test_the_wheel_designs_a_hologram_from_an_empty_folder(tmp_path: Path) -> None:
-    """Check that a wheel built by pip contains the zoo, templates and cards that this needs."""
+    """Check that a wheel built by pip contains the zoo, templates and cards that a hologram design needs."""
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     wheels, target, home = tmp_path / "wheels", tmp_path / "site", tmp_path / "home"
     home.mkdir()
-    # Build from a copy, because setuptools leaves its own folders beside the sources.
+    # Build from a copy, because setuptools creates folders beside the sources.
     source = tmp_path / "source"
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "NOTICE"):
@@ -110,7 +110,7 @@ def test_on_a_package_index_the_links_of_the_page_lead_to_the_repository(tmp_pat
 
 
 TODAY = datetime.date.today().isoformat()
-# Scripts in place of the Python that builds the wheel (BUILDS) and of the Pythons that try it (TRIES).
+# These scripts replace the Python that builds the wheel (BUILDS) and the Pythons that try it (TRIES).
 BUILDS = """#!/bin/sh
 case "$1" in -c) echo 9.8.7;; *) mkdir -p dist; touch dist/litholoop-9.8.7-py3-none-any.whl;; esac
 """
@@ -144,7 +144,7 @@ def released(
     checks: int = 0,
     **of_312: object,
 ) -> tuple[int, str]:
-    """Release a small project in ``folder``; return the exit code and the last line."""
+    """Release a small project in ``folder``, and return the exit code and the last line of the output."""
     files = {
         ".venv/bin/python": BUILDS,
         ".gitignore": ".venv/\nbin/\ndist/\nlog\ntmp/\n",
@@ -215,6 +215,6 @@ def test_a_release_that_is_not_ready_is_not_tagged(tmp_path: Path, fault: dict, 
     assert code != 0
     assert said in line
     assert tags(tmp_path) == ([fault["tag"]] if "tag" in fault else [])
-    # A release is refused before the tests, which take minutes, where possible. No trial folder is left.
+    # Where possible, a release is refused before the tests, which take minutes. No temporary folder is left.
     assert (tmp_path / "log").exists() == (not said)
     assert list((tmp_path / "tmp").iterdir()) == []

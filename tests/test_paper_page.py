@@ -1,4 +1,4 @@
-"""The page on the paper has a row for every numbered equation, figure and table of the paper."""
+"""Check that the page on the paper has a row for every numbered equation, figure and table of the paper."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "docs" / "paper.md"
-# Display equations of the text and its appendix. Figures and tables are identified by some words of each.
+# The display equations of the paper and its appendix. Figures and tables are identified by a few words.
 EQUATIONS = ["1, 2", "3", "4, 5, 6a–c", "7a, b", "8", "9a, b", "10", "A1, A2", "A3a, b", "A4", "A5", "A6"]
 FIGURES = """teaser, chained simulators, bilevel, design pipelines, anatomy, example of the data set, forward
     prediction, hologram: measured, lens: PSF, micrographs, ΔSSIM, PSF profiles, aleatoric, laser power,
@@ -16,7 +16,7 @@ DISCUSSION = """limits the optimisation, no guarantee, calibrating the optics, H
     SEM, grid search, e-beam, neural fields, depth from defocus"""
 AUTHORS = PAGE.with_name("from_the_authors_code.md")
 CARD = PAGE.parents[1] / "datasets" / "neural-lithography.toml"
-# Python files of the commit from which the card fetches the data.
+# The authors' Python files in the commit from which the card fetches the data.
 THEIR_FILES = """cuda_config data/__init__ data/afm_dataio litho/learned_litho litho/net/__init__
     litho/net/fno litho/net/simple_conv main_fwd_litho_training main_inv_holo_optim main_inv_lens_optim
     param/__init__ param/param_fwd_litho param/param_inv_design_holography param/param_inv_design_imaging
@@ -33,7 +33,7 @@ def test_every_equation_figure_and_table_has_a_row() -> None:
 
 
 def test_every_row_names_where_it_is_or_says_why_not() -> None:
-    """Each row names a file, a test, a command or a page of ours; else its verdict gives a reason."""
+    """Check that each row names a file, test, command or page of this project, or gives a reason."""
     lines = PAGE.read_text(encoding="utf-8").split("## 24.35 nm")[0].splitlines()
     heads = {number - 1 for number, line in enumerate(lines) if line.startswith("|---")}
     rows = [line for number, line in enumerate(lines) if line.startswith("| ") and number not in heads]
@@ -41,7 +41,7 @@ def test_every_row_names_where_it_is_or_says_why_not() -> None:
     for row in rows:
         *_, verdict = row.rstrip(" |").split(" | ")
         reason = re.search(r"nothing to test|cannot be tested: \w|^open$|^as in the equations$", verdict)
-        # A file, a test, an option, a command or something to import.
+        # This matches a link, a file, a test, an option, a command or an importable name.
         named = re.search(r"\]\(|`[\w/]+\.py`|`test_\w+`|`--\w|`litho-\w|`litho_\w", row)
         assert reason or named, row
 

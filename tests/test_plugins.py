@@ -1,4 +1,4 @@
-"""A plug-in, which is an installed package or a file, is available to every command and worker."""
+"""Check that a plug-in, either an installed package or a file, is available to every command and worker."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ register_reader(TOY)
 register_simulator(TwoSpots)
 register_metric("off_by_half_a_level", "percent", share_off_by_half_a_level, "off_by_half_a_level: a share.")
 """
-# All commands run in one process, because imports would take most of the time of separate ones.
+# Run all commands in one process, because separate processes would spend most of their time on imports.
 COMMANDS = """
 import importlib, sys
 def run(*words):
@@ -75,7 +75,7 @@ OWN = "class Number(int):\n    def twice(self):\n        return 2 * self\n"
 
 @pytest.fixture
 def unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unload after a test the plug-ins that it loaded."""
+    """Unload the plug-ins that a test has loaded."""
     monkeypatch.setattr(plugins, "_LOADED", {})
     before = set(sys.modules)
     yield

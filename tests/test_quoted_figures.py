@@ -1,4 +1,4 @@
-"""Figures that pages quote in their text equal those of the committed records."""
+"""Check that numbers quoted in the text of pages equal those in the committed records."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def photographs(record: dict[str, Any]) -> list[str]:
         f"Of {len(record['rows'])} photographs of simulated prints, {len(errors)} were scored",
         f"off by −{-errors.min():.2f} to +{errors.max():.2f} dB (rms {np.sqrt((errors**2).mean()):.2f} dB)",
         f"{len(record['rows']) - len(errors)} were refused, among them all {len(faulty)} with",
-        f"None of {len(unsaid)} mirrored or turned ones",
+        f"None of {len(unsaid)} mirrored or rotated ones",
     ]
 
 
@@ -39,7 +39,7 @@ def alarms(record: dict[str, Any]) -> list[str]:
     boards = [one for board in record["virtual"].values() for one in board["references"].items()]
     false = [one["false_alarms"] for _, one in boards]
     noticed = {n: [one["noticed"] / 10 for count, one in boards if count == n] for n in ("12", "24", "48")}
-    # At most one of 100 unchanged sets may raise an alarm: 10 of the 1,000 sets of a board.
+    # At most 1 % of the unchanged sets may raise an alarm, which is 10 of the 1,000 sets of a board.
     assert max(false) <= 10
     return [
         f"raised {min(false)} to {max(false)} false alarms",
@@ -54,7 +54,7 @@ def warps(record: dict[str, Any]) -> list[str]:
     creep = [case["error_px"] for case in record["creep"]]
     return [
         f"{min(defects):.3f} to {max(defects):.3f} px",
-        f"it leaves {min(creep):.2f} to {max(creep):.2f} px",
+        f"0.4–1.2 px to {min(creep):.2f}–{max(creep):.2f} px",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Check the README: it is short, its Python code runs (made smaller), and its links exist."""
+"""Check the README: it is short, its links exist, and a smaller version of its Python code runs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tests.test_capabilities import names_in_file
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text("utf-8")
-# Replacements that make the code small for the test. Each text must occur on the page.
+# Replacements that make the code run fast in the test. Each replaced text must occur on the page.
 SMALLER = {
     "count=12, size_px=256": "count=3, size_px=128",
     '"layout.size_px": 256': '"search.iterations": 2, "search.polish_rounds": 0, '
     '"window.yield_draws": 5, "layout.size_px": 64',
 }
-# Commands of the README, of the site's first page and of the tutorials, with the test that runs each.
+# The commands in the README, on the site's first page and in the tutorials, each with the test that runs it.
 WHEEL = "tests/test_packaging.py::test_the_wheel_designs_a_hologram_from_an_empty_folder"
 RUN_BY = {
     "make demo": "tests/test_demo.py::test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page",

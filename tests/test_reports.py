@@ -1,4 +1,4 @@
-"""Check reports in a browser: no errors, nothing too wide for a phone, pictures and words visible."""
+"""Check reports in a browser: no errors, nothing wider than a phone, all pictures and words visible."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 from tests.litho_models.prints import make_scans, write_store
 
 pytestmark = pytest.mark.pictures
-# The most screens that a report may fill while its foldable part is closed.
+# The largest height of a report, in screens, while its foldable part is closed.
 MOST_SCREENS = 6
 TINY = {
     "layout.size_px": 64,
@@ -38,7 +38,7 @@ TINY = {
 @pytest.fixture(scope="module")
 def browser():
     if browser_path() is None:
-        pytest.skip("no Chromium on this machine")
+        pytest.skip("Chromium is not installed on this machine")
     with Browser() as one:
         yield one
 
@@ -105,7 +105,7 @@ def shown_as(dark: bool) -> str:
 
 
 def test_what_is_wrong_with_a_page_is_found(browser, tmp_path):
-    """Check a page with one fault of each kind, so that the test above cannot pass without looking."""
+    """Check that each kind of fault is found on a page that has them all."""
     blank = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' width='9' height='9'></svg>"
     (tmp_path / "bad.html").write_text(
         f'<p style="color:#999">pale</p><div style="width:2000px">wide</div><img src="none.png">'
@@ -130,7 +130,7 @@ def test_a_click_sorts_by_number_with_gaps_last_and_a_second_click_reverses_the_
 
 
 def test_a_tap_enlarges_a_wide_figure_on_a_telephone(browser, reports):
-    """The whole figure shows at first. After a tap its letters are as high as the page's, and it scrolls."""
+    """Check that a wide figure fits the screen at first, and that a tap enlarges it and lets it scroll."""
     browser.show(reports["every part"], PHONE_PX, dark=False)
     browser.run("document.querySelector('details').open = true")
     browser.ask("Emulation.setFocusEmulationEnabled", enabled=True)
@@ -174,7 +174,7 @@ def test_the_foot_says_how_the_page_was_made(reports):
 
 
 def test_colours_stand_out_from_both_papers():
-    """WCAG 2 wants contrast 4.5 for words on paper and bands, 3 for lines and bars, in figures too."""
+    """Check the contrasts that WCAG 2 requires, in figures too: 4.5 for words, and 3 for lines and bars."""
     for colours in (LIGHT, DARK):
         for ink in ("ink", "soft", "accent"):
             assert min(contrast(colours[ink], colours[ground]) for ground in ("paper", "band")) >= 4.5

@@ -1,4 +1,4 @@
-"""The ``repr`` of scans, stores, models and results is one line, in a notebook a small table."""
+"""Check that the ``repr`` of objects for users is one line, or a small table in a notebook."""
 
 from __future__ import annotations
 
@@ -53,6 +53,6 @@ def test_the_repr_of_a_result_names_its_dataset_and_counts_its_entries():
     shown = repr(result)
     assert f"scores: {len(result.scores)}" in shown
     assert "dataset: neural-lithography" in shown
-    # The 64 digits of the hash are of no use to readers, and would not fit.
+    # The line omits the hash, whose 64 digits would not fit and do not help readers.
     assert len(shown) < 400
     assert f"<td>{len(result.scores)}</td>" in result._repr_html_()

@@ -1,4 +1,4 @@
-"""Check how printers are compared on the second machine, and that the page shows what was measured."""
+"""Check the comparison of printers on the second machine, and that the page shows the measured results."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_printer_of_all_parts_can_start_where_the_bare_one_ended() -> None:
     assert spots == pytest.approx([0.017, 0.017])
     assert models[0].values["etch.threshold"].item() == pytest.approx(0.42)
     assert models[1].values["hill.threshold"].item() == pytest.approx(0.42)
-    # The bare printer has no fitted bias.
+    # The bias of the bare printer is not fitted.
     assert not models[0].raw_etch__bias_px.requires_grad
 
 
@@ -48,7 +48,7 @@ def test_the_error_of_a_print_is_the_displacement_of_its_edges() -> None:
     level = np.zeros((128, 128), np.uint8)
     level[40:90, 40:90] = scan.levels - 1
     film = film_design.wanted_film(replace(scan, mask_level=level), 112)
-    # All four edges of the square are off by one pixel, and by less at its rounded corners.
+    # All four edges of the square are displaced by one pixel, and its rounded corners by less.
     smaller = binary_erosion(film.mask_level) * film.height_um.max()
     for printed, pixels in ((film.height_um, 0.0), (smaller, 1.0)):
         found = judged(film, printed)

@@ -1,4 +1,4 @@
-"""Check every page of the documentation site in a real browser, at two widths, light and dark."""
+"""Check every page of the documentation site in a browser, at two widths and in light and dark colours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 
 ROOT = Path(__file__).parents[1]
-# A script of the site changes its colours, with a transition.
+# A script of the site switches its colours, with a transition that takes time.
 COLOURED = "new Promise(done => setTimeout(() => done(document.body.dataset.mdColorScheme), 300))"
 
 
@@ -28,12 +28,12 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 @pytest.mark.long
 def test_every_page_of_the_site_is_sound_on_every_screen(tmp_path):
     if browser_path() is None:
-        pytest.skip("no Chromium on this machine")
+        pytest.skip("Chromium is not installed on this machine")
     if importlib.util.find_spec("mkdocs") is None:
-        pytest.skip("needs mkdocs; make docs installs it")
+        pytest.skip("mkdocs is not installed; run make docs to install it")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
-    # Serve the pages as to a visitor. From files, scripts may not read pictures, and the search fails.
+    # Serve the pages over HTTP. In pages opened as files, scripts cannot read pictures, and the search fails.
     serve = functools.partial(Quiet, directory=str(tmp_path))
     found = {}
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), serve) as server, Browser() as browser:

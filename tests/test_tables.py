@@ -1,4 +1,4 @@
-"""Tables and bars show the figures of the record, and the check of this notices a swapped column."""
+"""Check that tables and bars show the numbers of the record, and that a swapped column is noticed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.tables import require_tables_equal_record
 
 ROOT = Path(__file__).parents[1]
 PUBLISHED = ROOT / "docs" / "results" / "neural-lithography"
-# All tables that the product writes, by the test file that checks their columns.
+# All tables that the product writes, listed under the test file that checks their columns.
 HELD = {
     "test_tables.py": "gratings left_out findings warnings recipes holograms errors levels",
     "litho_data/test_height_sigma.py": "quality summary uncertainty",
@@ -137,7 +137,7 @@ def of_a_sheet(folder: Path) -> list[dict[str, Any]]:
         *({"image": kind, **dict(zip(arms, values, strict=True))} for kind, values in said.items()),
         {"model": "zoo:pbl", "mae_nm": 9.5},
         {"model": "physics, fitted to these prints", "mae_nm": 8.5},
-        {"model": "the same, with what the loop found", "mae_nm": 7.5},
+        {"model": "the same model with the effects that the loop found", "mae_nm": 7.5},
     ]
 
 
@@ -169,20 +169,20 @@ def test_graphs_of_layouts_show_shares_by_level_jump_and_frequency(
 def test_each_column_of_a_composed_table_is_the_field_that_it_names(
     made: Callable[[Path], list[dict[str, Any]]], tmp_path: Path
 ) -> None:
-    """Every number and name in these tables is different, so an exchange of two columns shows."""
+    """Check tables whose numbers and names are all different, so that swapped columns are noticed."""
     (tmp_path / "record.json").write_text(json.dumps({"rows": made(tmp_path)}))
     require_tables_equal_record(tmp_path, "record.json", {})
 
 
 class Row(Record):
-    """A row of a report."""
+    """A row of a report, used to test tables."""
 
     scan: str
     mae_nm: float
 
 
 class LongerRow(Row):
-    """The same row with one more figure."""
+    """The row of a report with one more number."""
 
     tallest_um: float
 

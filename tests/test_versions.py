@@ -1,4 +1,4 @@
-"""Every command states its version, an example, its options in one style, and at its end what to open."""
+"""Check the version, examples and option texts of commands, and that each ends by saying what to open."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def commands_in(command):
 
 @pytest.mark.parametrize("package", ["litho_data", "litho_models", "litho_design"])
 def test_every_option_is_described_in_one_style(package):
-    """Help starts in lower case, has no full stop, and no brackets, which rich would drop as markup."""
+    """Check that help texts start in lower case, without full stop or brackets, which rich would drop."""
     for command in commands_in(get_command(importlib.import_module(f"{package}.cli.app").app)):
         for parameter in command.params:
             if parameter.name == "help" or getattr(parameter, "hidden", False):
@@ -49,7 +49,7 @@ def test_every_option_is_described_in_one_style(package):
             said = parameter.help
             name = f"{command.name} {parameter.name}"
             assert said, name
-            # Only an abbreviation or a metavar may start with a capital: it has two in a row.
+            # Only an abbreviation or a metavar may start with a capital, which another capital follows.
             assert not re.match(r"[A-Z][^A-Z]", said), f"{name}: {said}"
             assert not said.endswith("."), f"{name}: {said}"
             assert not re.search(r"\[[a-z]", said), f"{name}: {said}"
@@ -57,7 +57,7 @@ def test_every_option_is_described_in_one_style(package):
 
 
 def silent_about_its_result(source: str) -> list[str]:
-    """Return the commands that take ``out`` but print neither that path nor a file in it."""
+    """Return the commands that have the option ``out`` but print neither that path nor a file in it."""
     made = {one.name: one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef)}
 
     def printed(function: ast.FunctionDef) -> str:

@@ -6,7 +6,7 @@
 
 Draws the hidden effects, gives the loop only scans and layouts, and judges its answers by the rules in
 docs/blind_trials.md. An interrupted run resumes. Writes scoreboard.json and scoreboard.csv;
---publish also puts the figures into the documentation.
+--publish also writes the results into the documentation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from litho_models.boards.board import BASE, make_draws
 from litho_models.boards.figures import figure_lines, make_scoreboard, trial_table
 from litho_models.boards.records import Board
 
-# Announced before any of their trials is run; development uses other seeds.
+# These seeds are announced before any of their trials is run. Development uses other seeds.
 ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20277}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
@@ -63,7 +63,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
             "store of measured prints",
             got="none",
             wanted="--measured STORE",
-            hint="or leave them out by --only",
+            hint="give the store, or omit these trials by --only",
         )
     open_campaign(out, draws)
     options = ["--keep-data"] * arguments.keep_data
@@ -100,7 +100,7 @@ def _arguments() -> argparse.Namespace:
     add("--board", choices=get_args(Board), default="singles", help="one cause per trial, or two to four")
     add("--seed", type=int, help="seed of the draws (default: the announced seed of the board)")
     add("--base", help="base of the loop (default: physics for singles, auto for mixtures)")
-    add("--measured", type=Path, help="store of measured prints, into which four mixtures are injected")
+    add("--measured", type=Path, help="store of measured prints, into which causes are injected")
     add("--scans", type=int, default=12, help="scans per trial (default 12)")
     add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
     add("--workers", type=int, default=1, help="parallel trials, one thread each")
@@ -108,7 +108,7 @@ def _arguments() -> argparse.Namespace:
     add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
     add("--timeout-s", type=float, default=3600.0, help="time limit of a trial, seconds")
     add("--keep-data", action="store_true", help="keep raw files and stores")
-    add("--publish", action="store_true", help="write the figures into docs/")
+    add("--publish", action="store_true", help="write the results into docs/")
     add("--run-one", type=int, help=argparse.SUPPRESS)
     return parser.parse_args()
 

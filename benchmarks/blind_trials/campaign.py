@@ -1,4 +1,4 @@
-"""Run all drawn trials as parallel processes; a campaign resumes, and a failed trial stops no other."""
+"""Run all drawn trials as parallel processes. A campaign can resume, and a failed trial stops no other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 def open_campaign(out: Path, draws: Draws) -> None:
-    """Write the draws to ``out/draws.json``, before anything is run.
+    """Write the draws to ``out/draws.json`` before any trial is run.
 
     Raises:
         InputError: ``out`` contains a campaign with other settings.
@@ -33,7 +33,7 @@ def open_campaign(out: Path, draws: Draws) -> None:
             f"campaign in {out}",
             got="draws of other settings",
             wanted="the same settings",
-            hint="choose another folder",
+            hint="choose another --out",
         )
 
 
@@ -54,8 +54,8 @@ def run_campaign(
 ) -> None:
     """Run the unfinished trials among ``numbers``, and print a line when a trial ends.
 
-    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed. The process of each
-    trial receives ``options``, see `run_one`.
+    A trial is recorded as failed if its process dies or runs longer than ``timeout_s``. The command of each
+    trial also gets the words ``options``, see `run_one`.
 
     Raises:
         InputError: a number was not drawn, or the workers are not available.

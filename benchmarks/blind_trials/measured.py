@@ -1,4 +1,4 @@
-"""Inject causes into measured prints: add the virtual fab's print with the causes minus that without."""
+"""Inject causes into measured prints: add the change that the causes make in prints of the virtual fab."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def measured_jobs(store: Store) -> tuple[Job, ...]:
 
 
 def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
-    """Crop the fields to their centres, on which the sizes of effects are measured, to save time."""
+    """Crop the fields to their centres. To save time, the sizes of effects are measured only there."""
     corners = [[(side - size_px) // 2 for side in job.level.shape] for job in jobs]
     return [
         replace(job, level=job.level[max(y, 0) : size_px + max(y, 0), max(x, 0) : size_px + max(x, 0)])
@@ -44,7 +44,7 @@ def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
 
 
 def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
-    """Copy a store and add the planted effects to its heights, without any other change.
+    """Copy a store and add the planted effects to its heights, and change nothing else.
 
     Raises:
         InputError: the store is a single file.

@@ -12,10 +12,10 @@ from litho_models.boards.records import Scoreboard
 
 
 def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
-    """Replace the text between the marks of the board in the page by its figures.
+    """Replace the text between the marks of a board in the page by the results of the board.
 
     Raises:
-        InputError: some trials have not been run, or the page does not have the marks.
+        InputError: some trials have not been run, or the page lacks the marks.
     """
     if scoreboard.pending:
         raise InputError("scoreboard to publish", got=f"pending trials {scoreboard.pending}", wanted="none")
@@ -28,6 +28,6 @@ def mark_of(scoreboard: Scoreboard) -> str:
 
 
 def as_markdown(scoreboard: Scoreboard) -> str:
-    """Return the command and the table of figures in Markdown."""
+    """Return the command and the table of results in Markdown."""
     rows = [tuple(figure) for figure in figures_of(scoreboard)]
-    return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'wanted'), rows)}"
+    return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'goal'), rows)}"

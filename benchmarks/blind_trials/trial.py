@@ -1,4 +1,4 @@
-"""Run a trial: the fab writes raw files, `build` makes a store, the loop reads it, a judge has the truth."""
+"""Run one trial: the fab makes scans, `build` makes a store, and the loop's findings are judged."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def run_trial(
     keep_data: bool = False,
     report: Callable[[str], None] = lambda message: None,
 ) -> Trial:
-    """Run and judge one trial; write ``trials/NN/trial.json`` and the results of the loop beside it.
+    """Run and judge one trial; write ``trials/NN/trial.json``, and the results of the loop next to it.
 
-    The loop receives only the store. An error is recorded as the result of the trial and not raised.
+    The loop receives only the store. An error is recorded as the result of the trial; it is not raised.
 
     Args:
         draw: the effects to plant.
         draws: the board of this trial.
         out: folder of the board.
         measured: store of measured prints, for trials on measured prints.
-        keep_data: keep raw files and store; otherwise they are deleted (the draw can make them again).
-        report: called with a message at each stage.
+        keep_data: keep raw files and store; otherwise they are deleted. They can be made again from the draw.
+        report: function that is called with a message at each stage.
     """
     folder = trial_folder(out, draw)
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,1 +1,1 @@
-"""The design-to-manufacturing gap at the paper's size: six arms, three tasks, judged by the virtual fab."""
+"""Measure the design-to-manufacturing gap at the paper's size, with the virtual fab as judge."""

@@ -3,11 +3,11 @@
     python -m benchmarks.gap --out runs/gap --workers 2
     python -m benchmarks.gap --out runs/gap-small --small 128
 
-Prints fields in a fab whose effects no model knows, and trains six arms on the scans. Designs one hologram
-and two lenses through each arm with equal budgets, and lets the fab print the designs. Then designs the same
-hologram through the models of measured prints that come with the package. The run takes hours; ``--tasks``
-runs some of the tasks. A step is skipped if its result exists, and an interrupted design resumes from its
-checkpoint.
+A fab with effects that no model knows prints fields, and six arms are trained on the scans. One hologram and
+two lenses are designed through each arm with equal budgets, and the fab prints the designs. Then the same
+hologram is designed through the models of measured prints that come with the package. The run needs hours;
+with ``--tasks``, only some tasks are run. A step is skipped if its result exists. An interrupted design
+resumes from its checkpoint.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _run(given: argparse.Namespace) -> None:
     out, logs = given.out, given.out / "logs"
     workers = Workers(given.workers, given.dask)
     if given.publish and given.tasks:
-        raise InputError("--publish", got="with --tasks", wanted="all tasks: the page shows all of them")
+        raise InputError("--publish", got="with --tasks", wanted="no --tasks: the page shows all tasks")
     effort = Effort() if given.small is None else Effort.small(given.small)
     plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
     measured = {name: str(zoo.folder(name)) for name in zoo.list()}
@@ -68,9 +68,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
     parser.add_argument("--workers", type=int, default=1, help="parallel processes, one thread each")
     parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
-    parser.add_argument("--small", type=int, metavar="PX", help="tiny elements, to try the benchmark")
+    parser.add_argument("--small", type=int, metavar="PX", help="use small elements, to try the benchmark")
     parser.add_argument(
-        "--corrected", type=Path, help="model of a closed loop on the measured prints; adds an arm"
+        "--corrected", type=Path, help="model of a closed loop on the measured prints, as a further arm"
     )
     parser.add_argument("--tasks", metavar="NAMES", help="tasks to run, separated by commas; all by default")
     parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/gap.md")

@@ -25,7 +25,7 @@ RESULT_FILE, TABLE_FILE = "gap.json", "gap.csv"
 
 
 def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
-    """Write JSON, CSV and figures of a finished comparison into ``results/``; return this folder."""
+    """Write JSON, CSV and figures of a finished comparison into the folder ``results/`` and return it."""
     folder = out / "results"
     folder.mkdir(exist_ok=True)
     gaps = {task.name: GapResult.read(out / task.name) for task in tasks}
@@ -71,7 +71,7 @@ def publish_results(out: Path) -> None:
 
 
 def _models(out: Path) -> dict[str, dict[str, float]]:
-    """Return the mean absolute error of every trained model on the test prints, nm."""
+    """Return the mean absolute errors of every trained model on the test prints, nm."""
     errors = {}
     for arm in ARMS:
         file = out / "test" / arm / "evaluation.json"
@@ -83,13 +83,13 @@ def _models(out: Path) -> dict[str, dict[str, float]]:
 
 
 def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
-    """Return the scores of a continuous phase on the designs' grid, without printer; None for a lens."""
+    """Return the scores of a continuous phase on the grid of the designs, unprinted; None for a lens."""
     design = Design.read(design_folder(folder, next(iter(gap.arms)), gap.seeds[0]))
     return (design.baselines or {}).get("continuous phase")
 
 
 def _search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
-    """Return the minutes of search of each arm, summed over the judged seeds, from the designs' records."""
+    """Return the search time of each arm in minutes, summed over the judged seeds."""
 
     def minutes(arm: str) -> float:
         return sum(Design.read(design_folder(folder, arm, seed)).run.seconds for seed in gap.seeds) / 60

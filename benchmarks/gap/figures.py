@@ -16,7 +16,7 @@ _DETAIL_PX = 160
 
 
 def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """Draw a column per arm: image in design, image after printing, and the centre of the print."""
+    """Draw one column per arm: the designed image, the image after printing, and the centre of the print."""
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.4 * len(judged) + 0.4, 7.4)
     axes = figure.subplots(3, len(judged), squeeze=False)
@@ -41,7 +41,7 @@ def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, pat
 
 
 def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """Draw a column per arm: a line through the centre of the PSF, and its spectrum, designed and printed."""
+    """Draw one column per arm: a line through the PSF and its spectrum, both as designed and as printed."""
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.5 * len(judged) + 0.4, 4.8)
     axes = figure.subplots(2, len(judged), squeeze=False, sharey="row")
@@ -66,7 +66,7 @@ def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path:
 def _judged(
     folder: Path, gap: GapResult, judge: tuple[str, str] | None
 ) -> dict[str, tuple[LoadedDesign, Printer]]:
-    """Return each arm's first design and the printer that judges it: the judge, or the last other arm."""
+    """Return each arm's first design and its judge (without a judge, the last other arm)."""
     names = list(gap.arms)
     judged = {}
     for arm in names:

@@ -1,4 +1,4 @@
-"""Run commands as parallel processes with one thread each; a command whose result exists is skipped."""
+"""Run commands as parallel processes with one thread each; skip those whose result exists."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BIN = Path(sys.executable).parent
 
 @dataclass(frozen=True)
 class Job:
-    """One command, the file or folder that exists once it has finished, and its name in the log."""
+    """One command: its name in the log, its words, and the file or folder that it writes last."""
 
     name: str
     command: tuple[str, ...]
@@ -39,7 +39,7 @@ def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> No
     """
     todo = [job for job in jobs if not job.done]
     if len(todo) < len(jobs):
-        print(f"{len(jobs) - len(todo)} of {len(jobs)} done before", flush=True)
+        print(f"{len(jobs) - len(todo)} of {len(jobs)} jobs were already finished", flush=True)
     steps = [(job, _log(logs, job.name)) for job in todo]
     done = run_jobs(_run, steps, workers, name=lambda step: step[0].name, apart=True)
     for place, ((job, log), seconds) in enumerate(done, 1):

@@ -9,15 +9,15 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 
 ARMS = ("none", "affine", "affine-mtf", "physics", "fno", "pbl", "pbl-scan-axis")
-# Arms that freeze another part of a trained model, with the options of `freeze`. Only PBL separates effects
+# Arms made from the trained model of another arm by other options of `freeze`. Only PBL separates effects
 # along the scan lines and leaves them out of its printer, because scans of one orientation cannot show
 # whether printer or microscope causes them. The other models include them. In this fab the printer causes
 # them, so PBL must include them to know as much as the others.
 FROZEN_WITH = {"pbl-scan-axis": ("pbl", ("--attribute", "scan-axis=printer"))}
-# The strengths were fixed before any design was made, by one rule: each effect of the print changes the
+# The strengths were fixed before any design was made, by one rule: each effect of the printer changes the
 # training prints by 10 nm rms after offset, gain, plane and bow of each scan are removed. The physics model
-# has none of these effects; two are in no catalogue. The effects of the microscope are as large as on the
-# measured prints and do not act on designs.
+# has none of these effects, and two of them are in no catalogue. The effects of the microscope are as large
+# as in the measured prints. They do not act on designs.
 PRINT_KNOBS = {
     "write-order-memory": 0.167,
     "slope-thinning-x": 0.346,
@@ -29,7 +29,7 @@ _FULL_HOE_PX, _FULL_LENS_PX = 1024, 1200
 
 
 class Effort(Record):
-    """How much is printed, trained and designed; all arms of a task have the same number of iterations."""
+    """How much is printed, trained and designed. All arms of a task have the same number of iterations."""
 
     hoe_px: int = _FULL_HOE_PX
     lens_px: int = _FULL_LENS_PX
@@ -57,7 +57,7 @@ class Effort(Record):
 
     @classmethod
     def small(cls, size_px: int) -> Effort:
-        """Return an effort scaled down to elements of ``size_px``, to try the benchmark."""
+        """Return a small effort with elements of ``size_px``, for trying the benchmark."""
         return cls(
             hoe_px=size_px,
             lens_px=size_px,
@@ -73,7 +73,7 @@ class Effort(Record):
 
 
 class Plan(Result):
-    """``plan.json``: the settings of the only comparison in a folder."""
+    """The settings of the comparison in a folder, stored as ``plan.json``."""
 
     SCHEMA: ClassVar[str] = "litho-design/benchmark-gap-plan/1"
     FILE_NAME: ClassVar[str] = "plan.json"
@@ -85,7 +85,7 @@ class Plan(Result):
 
 
 def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
-    """Write the plan, or check that the folder holds the same one.
+    """Write the plan, or check that the plan in the folder is the same.
 
     Raises:
         InputError: the folder contains a comparison with other settings.

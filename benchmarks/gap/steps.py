@@ -1,4 +1,4 @@
-"""Make the steps before the designs: print in the fab, and train, freeze and test every arm."""
+"""Define the jobs before the designs: print in the fab, then train, freeze and test every arm."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 from benchmarks.gap.jobs import Job, command
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store, trained_as
 
-# Training and test prints come from the same machine, so its draws have a separate, fixed seed.
+# Training and test prints come from the same machine, so its random properties have a fixed seed.
 _MACHINE_SEED = 0
 
 
 def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
-    """Return the jobs that print, scan and build the training and test fields, in stages of parallel jobs."""
+    """Return the jobs that print and scan the fields and build their stores, in stages of parallel jobs."""
     prints = [("fab", effort.scans, 0), ("test-fab", max(2, effort.scans // 4), 1)]
     simulate = [
         Job(
@@ -37,7 +37,7 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 
 
 def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
-    """Return the jobs that train, freeze and test every arm, in stages; the longest training comes first."""
+    """Return the jobs that train, freeze and test every arm, in stages; the longest training is first."""
     arms = [arm for arm in reversed(ARMS) if arm != "none"]
     trained = {arm: trained_as(arm) for arm in arms}
     train = [

@@ -1,4 +1,4 @@
-"""Write the comparison as tables in Markdown, from its result file."""
+"""Make the Markdown tables of the comparison from its result file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHOWN = {
     "lens-computational": {"mae_calibrated": -1, "mae_design": -1, "strehl": +1},
 }
 LABELS = {
-    "si_psnr_db": "SI-PSNR, dB",
+    "si_psnr_db": "SI-PSNR (dB)",
     "ssim": "SSIM",
     "eff_signal": "power on the signal",
     "cbr": "centre-to-background ratio",
@@ -22,9 +22,9 @@ LABELS = {
     "mae_design": "image MAE, design PSF",
 }
 _FIGURES = {
-    "hoe": "Image in design and after printing, and the print in its middle",
-    "lens-direct": "PSF and its spectrum in design and after printing",
-    "lens-computational": "PSF and its spectrum in design and after printing",
+    "hoe": "Images before and after printing, and the centre of each print",
+    "lens-direct": "PSFs and their spectra before and after printing",
+    "lens-computational": "PSFs and their spectra before and after printing",
 }
 TITLES = {
     "hoe": "Hologram",
@@ -35,12 +35,13 @@ TITLES = {
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return all tables of the result file, with the conditions of each."""
+    """Return all tables of the result file, each with the conditions under which it was made."""
     effort = record["plan"]["effort"]
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
-        f"Effects of the fab, 10 nm rms each: {knobs}. The models were trained on {effort['scans']} scans "
-        f"of its prints, {effort['scan_px']} px wide, the networks for {effort['training_steps']:,} steps. "
+        f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
+        f"{effort['scans']} scans of its prints, each {effort['scan_px']} px wide; the networks for "
+        f"{effort['training_steps']:,} steps. "
         f"{_precision_text(effort['search_precision'])}\n\n" + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
@@ -48,8 +49,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"{designs} designs took {minutes / 60:.1f} hours of search, each in one thread on a machine "
-        "with other work. Intervals are Student's, 95 %, over seeds."
+        f"The search for {designs} designs took {minutes / 60:.1f} hours in total, each in one thread on a "
+        "machine with other work. Intervals: 95 % (Student's t) over seeds."
     )
     return "\n\n".join(parts)
 
@@ -71,12 +72,13 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
         shown = dict(list(shown.items())[:1])
     # With one judge, a table has several scores; with several judges, each has a column of one score.
-    heads = [f"{LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
-    # The ceiling of a lens is a perfect lens, whose Strehl ratio is 1. The ceiling of a hologram is a
-    # continuous phase; the gap to it is given as rms error, which follows from SI-PSNR in dB.
+    heads = [f"{LABELS[figure]}, designed → printed by {judge}" for judge in judges for figure in shown]
+    # A lens is compared with a perfect lens, whose Strehl ratio is 1. A hologram is compared with a
+    # continuous phase. The difference is given as rms error, which follows from the SI-PSNR.
     ceiling = task.get("ceiling") if independent else None
-    heads += ["Strehl ratio lost against a perfect lens"] if "strehl" in shown else []
-    heads += [f"rms error of the image above a continuous phase's, by {judge}" for judge in judges if ceiling]
+    heads += ["loss of Strehl ratio against a perfect lens"] if "strehl" in shown else []
+    above = "rms error of the image above that of a continuous phase, printed by"
+    heads += [f"{above} {judge}" for judge in judges if ceiling]
     lines = [f"| designed with | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for arm in arms:
         cells = [
@@ -95,7 +97,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     head = f"### {TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}."
     if ceiling:
         reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
-        head += f" A continuous phase on the same grid, without printer or levels: {reached}."
+        head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."
     head += "\n\n"
     verdict = ""
     # If the judges are arms themselves, each prefers the design made through it, so there is no best arm.
@@ -113,7 +115,7 @@ def figure_file(name: str) -> str:
 
 
 def figure_digits(figure: str) -> int:
-    """Return the decimals of a score: image errors are a few hundredths, and arms differ by 1 % of that."""
+    """Return the decimals shown of a score: image errors are a few hundredths and differ by 1 % of that."""
     if figure == "cbr":  # a ratio of hundreds and thousands
         return 0
     return 5 if figure.startswith("mae") else 3
@@ -144,14 +146,14 @@ def lead_text(
         interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
         against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
     return (
-        f"When {judge} prints the layouts, those designed with {best} have the best {LABELS[figure]}. "
+        f"Of the layouts printed by {judge}, those designed with {best} have the best {LABELS[figure]}. "
         f"Their lead: {'; '.join(against)}."
     )
 
 
 def _model_table(models: Mapping[str, Mapping[str, float]]) -> str:
     lines = [
-        "| model | error on unseen prints of the fab, offset removed | tilt, bow and gain removed too |",
+        "| model | error on unseen prints of the fab, offset fitted | offset, gain, tilt and bow fitted |",
         "|---|---|---|",
     ]
     lines += [

@@ -15,7 +15,7 @@ ZOO_ARMS = ("none", "physics", "fno", "pbl")
 
 @dataclass(frozen=True)
 class Task:
-    """One comparison: the command for its designs, the options, the models and the judges."""
+    """One comparison: the kind of its designs, their options, and the models and judges by name."""
 
     name: str
     kind: str
@@ -30,7 +30,7 @@ class Task:
         return int(self.options[self.options.index("--iterations") + 1])
 
     def design(self, out: Path, arm: str, seed: int) -> Job:
-        """Return the job of one design, which writes to the folder that ``compare`` reads."""
+        """Return the job that makes one design, in the folder from which ``compare`` reads it."""
         folder = out / self.name / "designs" / arm / f"seed{seed}"
         words = ["hoe"] if self.kind == "hoe" else ["lens", "--task", self.kind]
         return Job(
@@ -42,7 +42,7 @@ class Task:
         )
 
     def designs(self, out: Path) -> list[Job]:
-        """Return the jobs of all designs, seed by seed: an early stop leaves all arms of the first seeds."""
+        """Return the jobs of all designs, seed by seed, so that an early stop leaves complete seeds."""
         return [self.design(out, arm, seed) for seed in range(self.seeds) for arm in self.models]
 
     def compare(self, out: Path) -> Job:
@@ -60,16 +60,16 @@ class Task:
         )  # fmt: skip
 
 
-# Few draws: the comparison shows no yield, and computing it would take longer than most searches.
+# The comparison shows no yield, and many draws for it would take longer than most searches.
 _FEW_DRAWS = ("--yield-draws", 10)
 
 
 def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
-    """Return the three tasks on the fab, and the hologram through models of measured prints.
+    """Return the three tasks with the fab, and the hologram task with models of measured prints.
 
     Args:
         zoo: folders of the frozen models that come with the package, by name.
-        corrected: the final model of a closed loop on the measured prints; None omits this arm.
+        corrected: the final model of a closed loop on the measured prints; if None, this arm is omitted.
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
@@ -98,7 +98,7 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
     """Return the tasks with these names, separated by commas; all if None.
 
     Raises:
-        InputError: no task has one of these names.
+        InputError: one of the names is not that of a task.
     """
     if names is None:
         return list(every)

@@ -1,9 +1,10 @@
 # %% [markdown]
 # # From scans to a dataset
 #
-# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset. In it
-# every scan is aligned to its layout pixel by pixel, and the origin of every number is recorded. Here the scans
-# come from the built-in virtual fab. For [your own scans](../own_data.md) only the first step differs.
+# You have AFM scans of prints and the layouts that were printed. By the end of this page, you have one
+# dataset. In it, every scan is aligned to its layout pixel by pixel, and the origin of every number is
+# recorded. Here the scans come from the built-in virtual fab. For [your own scans](../own_data.md), only the
+# first step differs.
 
 # %%
 import litho_data
@@ -13,8 +14,8 @@ print(card)
 
 # %% [markdown]
 # `card.toml` says which files are scans, which layout belongs to each, and what the files do not state:
-# pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, with an unknown zero. Read
-# one:
+# pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, and with an unknown zero.
+# Read one:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -30,9 +31,9 @@ result = litho_data.build_dataset(card, "prints.zarr")
 print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
 
 # %% [markdown]
-# The quality table shows how well each scan fits its layout. `ncc_after` is the correlation of height and layout
-# after registration. `tre_median_nm` is the distance between matching details that the fit did not use ([good
-# values](../registration.md)).
+# The quality table shows how well each scan fits its layout. `ncc_after` is the correlation of height and
+# layout after registration. `tre_median_nm` is the median distance between matching details that the fit did
+# not use ([good values](../registration.md)).
 
 # %%
 store = litho_data.open_store("prints.zarr")
@@ -40,7 +41,7 @@ columns = ["scan", "ncc_before", "ncc_after", "tre_median_nm", "rotation_deg"]
 print(store.quality[columns].round(3).to_string(index=False))
 
 # %% [markdown]
-# Look at one scan beside its layout. Both are on the same grid, in µm; pixels that were not measured are NaN.
+# Look at one scan beside its layout. Both are in µm on the same grid; pixels that were not measured are NaN.
 
 # %%
 

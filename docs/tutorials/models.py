@@ -2,8 +2,8 @@
 # # Which model predicts best?
 #
 # You want to know which model of the printer predicts best, and by how much. On this page you compare three
-# models on scans that none of them was trained on. You get error intervals, and see how much of each error is
-# noise.
+# models on scans that none of them was trained on. You get confidence intervals, and see how much of each
+# error is noise.
 
 # %%
 import litho_data
@@ -14,8 +14,8 @@ built = litho_data.build_dataset(card, "prints.zarr")
 
 # %% [markdown]
 # `benchmark` divides the scans, except the locked ones, into folds. Each fold is predicted by models trained
-# on the other folds. The error is the mean absolute difference of measured and predicted height after the
-# unknown zero of each scan is removed ([why](../evaluation.md#two-errors)).
+# on the other folds. The error is the mean absolute difference between measured and predicted height after
+# the unknown zero of each scan is removed ([why](../evaluation.md#two-errors)).
 
 # %%
 result = litho_models.benchmark("prints.zarr", "benchmark", models=("affine", "linear", "physics"), folds=2)
@@ -34,8 +34,8 @@ for pair in result.paired:
     )
 
 # %% [markdown]
-# Scans of one print are not independent. If there are several prints, `pair.over_prints` compares print by
-# print. A part of every error is noise that no model can predict:
+# Scans of one print are not independent. If there are several prints, `pair.over_prints` compares the models
+# print by print. Part of every error is noise that no model can predict:
 
 # %%
 floor = result.noise_floor

@@ -26,8 +26,8 @@ def load_card(path: str | Path) -> Card:
     """Read and check a dataset card.
 
     Raises:
-        InputError: no such file, text that is not TOML, or a key that is unknown, missing or has an
-            impossible value. The message names the key, the value and what was expected.
+        InputError: the file does not exist or is not TOML, or a key is unknown, missing or has an impossible
+            value. The message names the key, the value and what was expected.
     """
     file = Path(path)
     content = parsed(file, tomllib.loads, f"cannot read {file} as a dataset card", "a TOML file")
@@ -46,7 +46,7 @@ def with_tip(card: Card, tip: float | str) -> Card:
     """Return the card with another ``process.tip``.
 
     Raises:
-        InputError: a tip that is neither a positive number nor ``blind``, or a card of micrographs, which
+        InputError: the tip is neither a positive number nor ``blind``, or the card is of micrographs, which
             have no tip.
     """
     if card.scan.instrument == "sem":
@@ -120,7 +120,7 @@ class LayoutFiles(Record):
 
     ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as 255 /
     (levels - 1) if white is the highest level. If ``average_px`` is set, the files are black-and-white
-    pictures. Each square of this many pixels a side becomes one pixel of the layout, whose level is the
+    pictures. Each square with this many pixels on a side becomes one pixel of the layout, whose level is the
     number of white pixels in the square.
     """
 
@@ -135,7 +135,7 @@ class LayoutFiles(Record):
     def _counted(self) -> Self:
         if self.average_px is not None and self.levels != self.average_px**2 + 1:
             raise ValueError(
-                f"wanted levels = {self.average_px**2 + 1}, for no white pixel to all pixels white "
+                f"wanted levels = {self.average_px**2 + 1}, one for each possible number of white pixels "
                 "in a square"
             )
         return self
@@ -148,8 +148,9 @@ class ScanFiles(Record):
     scanning electron microscope, are pictures of a film of the layout's full height; the build measures the
     edges of the film.
 
-    ``levelled`` says that the build takes the heights from the files without levelling them. ``missing``
-    contains numbers and words that mark pixels without a measurement; an empty list says that there are none.
+    ``levelled`` says that the build uses the heights in the files without levelling them. ``missing``
+    contains numbers and words that mark pixels without a measurement; an empty list says that there are no
+    such marks.
     """
 
     files: FilePatterns
@@ -169,7 +170,7 @@ class ScanFiles(Record):
             raise ValueError("wanted either unit or full_scale_file (in metres), not both")
         given = (self.unit, self.full_scale_file, self.channel, self.missing)
         if self.instrument == "sem" and (self.size_um is None or any(one is not None for one in given)):
-            raise ValueError("wanted size_um and nothing about heights, because a micrograph has none")
+            raise ValueError("wanted size_um and no settings of heights, because a micrograph has no heights")
         return self
 
 
@@ -193,8 +194,8 @@ class Ids(Record):
 
 
 class Standard(Record):
-    """A scan of a standard of known size. Options of reading that are not given here are those of the card's
-    scans.
+    """A scan of a standard of known size. Reading options that are not given here are taken from the card's
+    ``scan`` table.
     """
 
     file: InsidePath
@@ -212,7 +213,7 @@ class Grating(Standard):
 
 
 class Step(Standard):
-    """A step, ridge or groove; its edges run across ``axis``."""
+    """A step, ridge or groove; its edges are perpendicular to ``axis``."""
 
     height_um: Length
     axis: Literal["x", "y"] = "x"
@@ -244,7 +245,7 @@ class Write(Record):
 
 
 class KnownGrating(Record):
-    """The grating in scans whose use is ``grating``: its certified period along both axes."""
+    """The certified period, along both axes, of the grating in scans whose use is ``grating``."""
 
     period_um: Length
     uncertainty_um: Uncertainty = 0.0
@@ -264,7 +265,7 @@ class Source(Record):
 
 
 class Card(Record):
-    """A dataset card, checked."""
+    """A dataset card whose content has been checked."""
 
     name: PlainName = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     title: str = ""
@@ -284,9 +285,11 @@ class Card(Record):
     def _of_one_instrument(self) -> Self:
         heights = (self.process.level, self.process.tip, self.calibration, self.grating)
         if self.scan.instrument == "sem" and any(one is not None for one in heights):
-            raise ValueError("wanted no levelling, tip, calibration or grating: micrographs have none")
+            raise ValueError(
+                "wanted no levelling, tip, calibration or grating, because micrographs have none"
+            )
         if self.scan.instrument == "confocal" and self.process.tip is not None:
-            raise ValueError("wanted no tip: a confocal microscope has none")
+            raise ValueError("wanted no tip, because a confocal microscope has none")
         return self
 
 
@@ -306,7 +309,9 @@ def _readable(error: ValidationError, what: str) -> InputError:
         given = first["input"]
         numbers = f"[{given}, {given}]" if isinstance(given, int | float) else "[54.0, 54.0]"
         return InputError(
-            f"{what}: {key} = {_shown(given)}", got="one value", wanted=f"y and x, such as {numbers}"
+            f"{what}: {key} = {_shown(given)}",
+            got="one value",
+            wanted=f"two values, y and x, such as {numbers}",
         )
     return InputError(f"{what}: {first_error(error)}")
 

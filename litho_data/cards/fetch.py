@@ -31,7 +31,8 @@ def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
         into: folder to fill; by default the user cache.
 
     Raises:
-        InputError: unknown name, a card without source, a file that cannot be downloaded, or a wrong hash.
+        InputError: the name is unknown, the card has no source, a file cannot be downloaded, or a hash is
+            wrong.
     """
     card_path = find_card(dataset)
     name, registry = _registry(card_path)
@@ -95,7 +96,7 @@ def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read registry {path}", got=error) from error
     if not registry.registry:
-        raise InputError(f"registry {path}", got="no files", wanted="lines of file name and SHA-256")
+        raise InputError(f"registry {path}", got="no files", wanted="lines with a file name and its SHA-256")
     for file in registry.registry:
         if ".." in Path(file).parts or Path(file).is_absolute():
             raise InputError(f"registry {path}: file", got=file, wanted="a path inside the data folder")
@@ -129,7 +130,7 @@ def _download(registry: pooch.Pooch, file: str) -> None:
         ) from error
     except ValueError as error:  # pooch removes a file that does not match
         url, wanted = registry.get_url(file), registry.registry[file]
-        hint = "the source has changed or the transfer was damaged; nothing was kept"
+        hint = "the source has changed or the download was damaged; the file was not kept"
         raise InputError(f"{file} from {url}", got="another SHA-256", wanted=wanted, hint=hint) from error
     finally:
         logger.setLevel(level)

@@ -50,7 +50,7 @@ class PrintedField:
 class Listing:
     """A card with the folder of its files, the fields to build, and the files of every id.
 
-    ``unpaired`` (only one file) and ``refused`` map ids that are not fields to the reasons.
+    ``unpaired`` (ids with only one file) and ``refused`` map each id that is not a field to the reason.
     """
 
     card: Card
@@ -72,11 +72,12 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 
     Args:
         card_path: the card.
-        data_dir: folder that the card's file patterns start from; by default the card's own folder, then
-            ``$LITHO_DATA_DIR/<name>``, then the user cache, whichever has files.
+        data_dir: folder where the card's file patterns start; by default the first that has files among the
+            card's own folder, ``$LITHO_DATA_DIR/<name>`` and the user cache.
 
     Raises:
-        InputError: a bad card, no folder with files, a bad table, or no id that has both a layout and a scan.
+        InputError: the card or its table is bad, no folder has the files, or no id has both a layout and a
+            scan.
     """
     file = Path(card_path)
     card = load_card(file)
@@ -179,7 +180,7 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:
     """Return why an id that has all files cannot be used, or an empty text if it can be used."""
     if not SAFE_ID.fullmatch(scan_id):
-        return "an id may hold letters, digits, space and ._+- only"
+        return "an id may contain only letters, digits, spaces and ._+-"
     if print_id is None and use == "dataset":
         return f"id does not match [ids] print = {card.ids.print!r}"
     if scan_id not in table and any("order" in row for row in table.values()):
@@ -224,18 +225,18 @@ def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
     """Return, for each id, the text of the group ``print``; None if the expression does not match the whole
     id.
 
-    Without an expression every id counts as a print of its own. Matching nested repetitions can take forever
+    Without an expression, every id counts as a print of its own. Matching nested repetitions can take forever
     and cannot be interrupted, so an expression with any repetition runs in a separate process.
 
     Raises:
-        InputError: no result after 10 s.
+        InputError: there is no result after 10 s.
     """
     if pattern is None:
         return list(ids)
     if not set("*+{?") & set(pattern.replace("(?", "(")):
         return [found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)]
     try:
-        # The process is isolated and has no site packages, which would take ten times as long.
+        # The process is isolated and loads no site packages; loading them would take ten times as long.
         done = subprocess.run(
             [sys.executable, "-ISc", _MATCH],
             input=json.dumps([pattern, list(ids)]),

@@ -24,14 +24,14 @@ _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, Any]]:
-    """Read the rows of a card's CSV table by id: the checked value of every cell that is not empty.
+    """Read a card's CSV table; return, by id, the checked values of the cells that are not empty.
 
     The reader accepts what spreadsheets write in any language: cells separated by commas, semicolons or tabs,
-    text that may be UTF-16, and decimal commas if commas do not separate cells.
+    text that may be UTF-16, and decimal commas if cells are not separated by commas.
 
     Raises:
-        InputError: an unreadable file, an unknown column, an id that is no plain name, or a cell of the wrong
-            kind.
+        InputError: the file is unreadable, a column is unknown, an id is not a plain name, or a cell is of
+            the wrong kind.
     """
     try:
         lines = read_text(path).splitlines()
@@ -86,28 +86,30 @@ def _value(name: str, text: str) -> Any:
         whole = text.lstrip("-").isdecimal() and ORDER.holds(text)
         value, wanted = (int(text), "") if whole else (None, "a whole number")
     elif name == "unit" and not is_length(text):
-        wanted = "a length, such as nm"
+        wanted = "a unit of length, such as nm"
     elif name == "size_um":
         sides = [one.strip() for one in re.split("[x×]", text)]
         sides = sides * 2 if len(sides) == 1 else sides
         if len(sides) == 2 and all(LENGTH_UM.holds(one) for one in sides):
             value = float(sides[0]), float(sides[1])
         else:
-            wanted = "one side in µm, or y x x: 54 x 27"
+            wanted = "one side in µm, or y and x, such as 54 x 27"
     if wanted:
         raise InputError(name, got=repr(text), wanted=wanted)
     return value
 
 
 def read_full_scales(path: Path) -> dict[str, float]:
-    """Read the height of the largest grey value, as µm, per file name or id, from a JSON object in metres.
+    """Read the height of the largest grey value per file name or id from a JSON object; convert metres to µm.
 
     Raises:
-        InputError: no such file, no JSON object, or a value that is not a positive number.
+        InputError: the file does not exist or is not a JSON object, or a value is not a positive number.
     """
-    content = parsed(path, json.loads, f"cannot read {path}", "a JSON object, m per id")
+    content = parsed(path, json.loads, f"cannot read {path}", "a JSON object with metres per id")
     if not isinstance(content, dict):
-        raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")
+        raise InputError(
+            f"content of {path}", got=type(content).__name__, wanted="a JSON object with metres per id"
+        )
     for key, value in content.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
             raise InputError(f"{path}: {key}", got=repr(value), wanted="a positive number of metres")

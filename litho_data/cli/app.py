@@ -13,7 +13,7 @@ from litho_data.cli.tip import tip
 from litho_data.commands.app import DaskOption, WorkersOption, argument, new_app, option, run_app
 
 app = new_app(
-    "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
+    "Turn raw AFM scans and layouts into a dataset with provenance. Lengths in µm unless stated otherwise."
 )
 app.command()(masks)
 app.command()(simulate)
@@ -26,11 +26,13 @@ DataDir = Annotated[
     Path | None,
     option("folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"),
 ]
-Strict = Annotated[bool, option("do not build if a scan is skipped or has no partner", "--strict")]
+Strict = Annotated[
+    bool, option("do not build if a scan is skipped, or if a scan or layout has no partner", "--strict")
+]
 
 
 class Format(StrEnum):
-    """What a store can be exported as."""
+    """The formats in which a store can be exported."""
 
     zip = "zip"
     pairs = "pairs"
@@ -44,7 +46,8 @@ def fetch(
     ],
     into: Annotated[Path | None, option("folder to fill; by default the user cache")] = None,
 ) -> None:
-    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; every SHA-256 is checked.
+    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache. The SHA-256 of every file is
+    checked.
 
     Example: litho-data fetch neural-lithography
     """
@@ -69,15 +72,15 @@ def build(
         str | None,
         typer.Option(
             metavar="UM|blind",
-            help="radius of the tip, or blind to estimate it; pixels that the tip may not have "
+            help="radius of the tip, or blind to estimate the tip; pixels that the tip may not have "
             "touched become invalid",
         ),
     ] = None,
 ) -> None:
     """Read, level, register and store all scans of a card; write the store and a report beside it.
 
-    With --suggest nothing is built: levelling recipes are compared on three scans. The best is written beside
-    the card, with a card that names it.
+    With --suggest, nothing is built: levelling recipes are compared on three scans. The best recipe is
+    written beside the card, together with a card that uses it.
 
     Example: litho-data build prints/card.toml --out prints.zarr --workers 2
     """
@@ -89,8 +92,8 @@ def build(
         for name, of in found.left_nm.items():
             left = ", ".join(f"{scan} {one:.1f} nm" for scan, one in of.items())
             warned = f" ({found.warned[name]})" if name in found.warned else ""
-            typer.echo(f"{name}: not explained by the layout: {left}{warned}")
-        typer.echo(f"suggested: {found.recipe}; build {found.card}")
+            typer.echo(f"{name}: rms residual of the fit to the layout: {left}{warned}")
+        typer.echo(f"suggested recipe: {found.recipe}; to use it, build {found.card}")
         typer.echo(f"pictures {folder / 'report.html'}")
         return
     from litho_data.making.build import build_dataset
@@ -125,7 +128,8 @@ def calibrate(
     for axis, scale in scales_of(card, data_dir).items():
         percent = 100 * (scale.factor - 1)
         typer.echo(
-            f"{axis}: stated lengths times {scale.factor:.6g} ± {scale.uncertainty:.2g} ({percent:+.3g} %)"
+            f"{axis}: multiply stated lengths by {scale.factor:.6g} ± {scale.uncertainty:.2g} "
+            f"({percent:+.3g} %)"
         )
 
 
@@ -164,7 +168,7 @@ def history(
 @app.command()
 def replay(
     store: StorePath,
-    scan: Annotated[list[str] | None, argument("ids of scans; without, all")] = None,
+    scan: Annotated[list[str] | None, argument("ids of scans; by default all")] = None,
     array: Annotated[list[str] | None, option("name of an array, e.g. height_um; repeatable")] = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -221,7 +225,7 @@ def import_pairs(
     dask: DaskOption = None,
     strict: Strict = False,
 ) -> None:
-    """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field.
+    """Build a store from the authors' 8-bit pair format; four quadrants with the same name become one field.
 
     Example: litho-data import-pairs pairs --out pairs.zarr
     """

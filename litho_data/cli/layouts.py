@@ -29,15 +29,17 @@ def _list_knobs(wanted: bool) -> None:
 
 
 def masks(
-    out: Annotated[Path, option("folder to write; an older set of these settings is replaced")],
+    out: Annotated[Path, option("folder to write; an older set with the same settings is replaced")],
     pattern: Annotated[str, option("random, or a calibration pattern: see --list-patterns")] = "random",
     count: Annotated[int, option("number of random layouts", min=1)] = 12,
-    size_px: Annotated[int, option("side of a layout", min=8)] = 512,
-    levels: Annotated[int, option("number of levels, 0 … levels − 1", min=2, max=65536)] = 13,
+    size_px: Annotated[int, option("side of a layout, pixels", min=8)] = 512,
+    levels: Annotated[
+        int, option("number of levels; a layout contains the levels 0 to levels − 1", min=2, max=65536)
+    ] = 13,
     cutoff_per_um: Annotated[float, option("low-pass cut-off, cycles/µm")] = 0.25,
-    passband: Annotated[str, option("square (as the measured layouts) or round")] = "square",
+    passband: Annotated[str, option("square (as for the measured layouts) or round")] = "square",
     quantiser: Annotated[
-        str, option("round (the paper's equation) or floor (as the published layouts)")
+        str, option("round (as in the paper's equation) or floor (as in the published layouts)")
     ] = "round",
     field_px: Annotated[
         int | None, option("side of a larger field from which random layouts are cut, pixels")
@@ -52,7 +54,7 @@ def masks(
         ),
     ] = False,
 ) -> None:
-    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to which scans can be added.
+    """Write layouts (8-bit TIFFs of level numbers), their statistics, and a card to which scans can be added.
 
     Example: litho-data masks --count 24 --levels 13 --out prints
     """
@@ -78,15 +80,15 @@ def masks(
 def simulate(
     out: Annotated[
         Path,
-        option("folder to write (raw/ and truth/); an older run of these settings is replaced"),
+        option("folder to write (raw/ and truth/); an older run with the same settings is replaced"),
     ],
     preset: Annotated[
-        str, option("plain, demo, measured-like or second-printer; of films: e-beam or projection")
+        str, option("plain, demo, measured-like or second-printer; for films, e-beam or projection")
     ] = "plain",
     layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
     plan: Annotated[
         Path | None,
-        option("print and scan the plan in this folder (litho-models next-print); needs --fab"),
+        option("print and scan the plan that litho-models next-print wrote to this folder; needs --fab"),
     ] = None,
     fab: Annotated[
         Path | None,
@@ -99,12 +101,12 @@ def simulate(
     seed: Annotated[int, option("seed of every random draw", min=0)] = 0,
     knob: Annotated[
         list[str] | None,
-        option("an effect, name=strength or name=strength@seed; repeatable; --list-knobs"),
+        option("an effect, as name=strength or name=strength@seed; repeatable; see --list-knobs"),
     ] = None,
     noise: Annotated[str, option("default or off")] = "default",
     microscope: Annotated[str, option("default (scans slightly warped) or aligned (no warp)")] = "default",
     write_field_um: Annotated[
-        float | None, option("side of a write field shared by a print's fields, µm")
+        float | None, option("side of the write field that the fields of a print share, µm")
     ] = None,
     stitch_field_um: Annotated[
         float | None, option("side of the fields that the effect stitching displaces, µm")
@@ -136,19 +138,19 @@ def simulate(
         raise InputError(
             "--plan and --fab",
             got="only one of the two",
-            wanted="the plan to print, and the fab that prints it",
+            wanted="both: the plan to print and the fab that prints it",
         )
     shaped = any(value is not None for value in (count, size_px, write_field_um))
     if plan is not None and fab is not None:
         if layouts is not None or knob or shaped:
-            wanted = "only --out and --seed: plan and fab set the rest"
-            raise InputError("options beside --plan", wanted=wanted)
+            wanted = "only --out and --seed, because the plan and the fab set all others"
+            raise InputError("options given with --plan", wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
         return
     if layouts is not None and shaped:
-        wanted = "no --count, --size-px or --write-field-um: the card's layouts set them"
-        raise InputError("options beside --layouts", wanted=wanted)
+        wanted = "no --count, --size-px or --write-field-um, because the card's layouts set them"
+        raise InputError("options given with --layouts", wanted=wanted)
     if preset in FILM_PRINTERS:
         knobs = film_knobs(knob or ())
         card = simulate_films(out, preset, count=count or 12, size_px=size_px or 256, seed=seed, knobs=knobs)
@@ -160,7 +162,7 @@ def simulate(
     printer = settings["printer"]
     if stitch_field_um is not None:
         if not printer.pitch_um <= stitch_field_um <= LENGTH_UM.high:
-            wanted = f"the pitch, {printer.pitch_um:g} µm, or more, and at most {LENGTH_UM.high:g} µm"
+            wanted = f"a length from the pitch, {printer.pitch_um:g} µm, to {LENGTH_UM.high:g} µm"
             raise InputError("--stitch-field-um", got=stitch_field_um, wanted=wanted)
         printer = settings["printer"] = replace(printer, stitch_field_um=stitch_field_um)
     card = simulate(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 ScanPath = Annotated[Path, argument("a scan in any supported format")]
 _READING: dict[str, Any] = {
-    "format": Annotated[str, option(f"auto (by the content of the file), {', '.join(formats())}")],
+    "format": Annotated[str, option(f"auto (recognised by the content of the file), {', '.join(formats())}")],
     "unit": Annotated[str | None, option("unit of the heights if the file states none, e.g. m, nm")],
     "size_um": Annotated[
         YX | None,
@@ -40,7 +40,7 @@ _READING: dict[str, Any] = {
 
 
 def reads_scans(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options that say how to read a scan; the command receives them as ``how``, for
+    """Give a command the options for reading a scan; the command receives them as ``how`` and passes them to
     ``read_scan``.
     """
 
@@ -87,10 +87,10 @@ def inspect(
     picture: Annotated[Path | None, option("PNG to write")] = None,
     header: Annotated[bool, option("print the full header of the file", "--header")] = False,
 ) -> None:
-    """List the channels of a file with sizes, units and pitch, and show the heights.
+    """List the channels of a file with their sizes, units and pitches, and print the range of the heights.
 
-    A picture needs one height channel: choose it with --channel if there are several, and give --unit
-    (or --full-scale-um) if the file states none.
+    A picture needs one height channel: choose it with --channel if there are several, and give --unit (or
+    --full-scale-um) if the file states no unit.
 
     Example: litho-data inspect P11.gwy --picture P11.png
     """
@@ -108,7 +108,7 @@ def inspect(
         # If no picture was asked for, the list of channels is enough.
         if picture is not None or any(value for name, value in how.items() if name != "format"):
             raise
-        typer.echo(f"no picture: {error}")
+        typer.echo(f"heights not shown: {error}")
         return
     _print_scan(scan, picture)
 

@@ -1,4 +1,4 @@
-"""The command ``litho-data tip``: estimate the tip of the microscope from its own scans."""
+"""The command ``litho-data tip``: estimate the tip of the microscope from its scans."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ def tip(
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,
-        option("folder for NAME.certain.npy (true where the tip touched) and NAME.surface.gsf"),
+        option("folder for NAME.certain.npy (true where the tip certainly touched) and NAME.surface.gsf"),
     ] = None,
 ) -> None:
-    """Estimate the radius of the tip, or its upper limit, and the pixels that it may not have touched.
+    """Estimate the radius of the tip, or an upper limit on it, and find the pixels that the tip may not have
+    touched.
 
     The surface in --maps is the highest surface that explains the image.
 
@@ -40,7 +41,7 @@ def tip(
     if maps is None:
         return
     if found.radius_um is None:
-        raise InputError("maps of the tip", got=found.reason, wanted="scans that set a bound on the tip")
+        raise InputError("maps of the tip", got=found.reason, wanted="scans that limit the radius of the tip")
     import numpy as np
 
     from litho_data.foundation.files import atomic_file
@@ -51,7 +52,7 @@ def tip(
         raise InputError(
             "--maps",
             got="scans with the same name",
-            wanted="different names, as the maps are named after them",
+            wanted="different names, because the maps are named after the scans",
         )
     maps.mkdir(parents=True, exist_ok=True)
     for scan in read:
@@ -67,20 +68,19 @@ def tip(
 
 def _text(found: TipEstimate) -> str:
     if found.radius_um is None:
-        return f"radius: no bound, {found.reason}"
+        return f"radius of the tip: no limit found, {found.reason}"
     value = f"{found.radius_um:.3g}"
     if found.kind == "estimate":
         lines = [f"radius {value} ± {found.radius_sd_um:.2g} µm (standard uncertainty)"]
     else:
         lines = [f"radius at most {value} µm: {found.reason}"]
     lines += [
-        f"heights over {found.depth_um:.3g} µm, noise {found.pixel_noise_nm:.2g} nm per pixel and "
+        f"heights span {found.depth_um:.3g} µm, noise {found.pixel_noise_nm:.2g} nm per pixel and "
         f"{found.line_noise_nm:.2g} nm per line",
     ]
     for scan in found.scans:
-        limit = f"{scan.resolution_um:.3g} µm" if scan.resolution_um else "no length"
+        limit = f"details below {scan.resolution_um:.3g} µm" if scan.resolution_um else "no details"
         lines.append(
-            f"{scan.name}: {scan.certain_fraction:.1%} certainly touched; details below {limit} "
-            "may be the tip"
+            f"{scan.name}: {scan.certain_fraction:.1%} certainly touched; {limit} may come from the tip"
         )
     return "\n".join(lines)

@@ -1,1 +1,1 @@
-"""What the three command lines share: settings as options, progress, and errors of one line."""
+"""What the three command lines share: settings as options, progress, and one-line errors."""

@@ -1,4 +1,4 @@
-"""What the three command lines share: settings, exit codes, and errors of one line."""
+"""What the three command lines share: settings, exit codes, and one-line errors."""
 
 import errno
 import functools
@@ -22,8 +22,8 @@ UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """Make an option of a command from its help, its names if they are not the default ones, and further
-    arguments of typer.
+    """Make an option of a command. Give names only if they differ from the default; ``more`` is passed to
+    typer.
     """
     return typer.Option(*names, help=help, **more)
 
@@ -36,7 +36,7 @@ def argument(help: str) -> Any:
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=1, help="local processes; the result does not depend on it")
+    int, typer.Option("--workers", min=1, help="number of local processes; the result does not depend on it")
 ]
 DaskOption = Annotated[
     str | None,
@@ -52,7 +52,7 @@ _WAYS_OUT = {
     errno.ENOSPC: f"make room; {_AGAIN}",
     errno.EDQUOT: f"make room; {_AGAIN}",
     errno.EROFS: "choose another --out",
-    errno.EACCES: "choose another place, or get the permission to write there",
+    errno.EACCES: "choose another path, or get permission to write there",
     errno.EMFILE: f"allow more open files (ulimit -n), or fewer workers; {_AGAIN}",
     errno.ENFILE: f"close other programs; {_AGAIN}",
 }
@@ -68,13 +68,16 @@ def _show_all(context: typer.Context, asked: bool) -> None:
 
 
 HelpAll = Annotated[
-    bool, typer.Option("--help-all", help="show the other options too", is_eager=True, callback=_show_all)
+    bool,
+    typer.Option(
+        "--help-all", help="show all options, including the hidden ones", is_eager=True, callback=_show_all
+    ),
 ]
 
 
 def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
     """Give a function that takes ``**values`` the signature that typer should see."""
-    # Typer reads signature and annotations.
+    # Typer reads the signature and the annotations.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run
@@ -98,8 +101,8 @@ def takes_more(
 
 
 def with_further_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the option ``--help-all`` to a command that hides some of its options; it shows the hidden ones
-    too.
+    """Add the option ``--help-all``, which also shows hidden options, to a command that hides some of its
+    options.
     """
 
     @functools.wraps(command)
@@ -147,7 +150,8 @@ def new_app(help_text: str) -> typer.Typer:
 
 
 def run_app(app: typer.Typer, name: str) -> None:
-    """Run a typer application; an error of the input or of the system prints one line and exits with code 2.
+    """Run a typer application. For an error of the input or of the system, print one line and exit with code
+    2.
 
     Any other exception is a defect of this project and shows its traceback.
     """
@@ -179,7 +183,9 @@ def run_app(app: typer.Typer, name: str) -> None:
 
 
 def _not_allowed(error: Exception) -> InputError | None:
-    """Say in words what the system or the input did not allow; return None for a defect of this project."""
+    """Return the error to print if the system or the input is to blame; return None for a defect of this
+    project.
+    """
     # PyTorch and safetensors raise their own errors for a full disk.
     text = str(error)
     if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
@@ -187,7 +193,7 @@ def _not_allowed(error: Exception) -> InputError | None:
         return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
     if isinstance(error, OSError):
         what = f"cannot use {error.filename}" if error.filename else "the system refuses"
-        # NumPy does not say why it wrote only a part.
+        # NumPy does not say why it wrote only part of a file; the usual cause is a full disk.
         code = errno.ENOSPC if text.endswith(" written") else error.errno or 0
         return InputError(what, got=error, hint=_WAYS_OUT.get(code, _AGAIN))
     if "Symlink loop" in text:
@@ -202,7 +208,7 @@ def _not_allowed(error: Exception) -> InputError | None:
 
 
 def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
-    """Express Typer's complaint about a command line that it cannot parse in this project's words.
+    """Return, in this project's words, Typer's complaint about a command line that it cannot parse.
 
     Args:
         error: a ``UsageError``.
@@ -211,7 +217,7 @@ def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
     """
     command = error.ctx.command_path if error.ctx else " ".join([name, *words[:1]])
     parameter = getattr(error, "param", None)
-    help_line = f"`{command} --help` shows what it takes"
+    help_line = f"`{command} --help` shows its arguments and options"
     if parameter is None:
         near = getattr(error, "possibilities", None)
         text = re.sub(r"\.? Did you mean (.*)\?$", r"; did you mean \1?", error.message.rstrip("."))

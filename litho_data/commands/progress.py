@@ -12,7 +12,7 @@ from typing import TypeVar
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-# Shortest time from which to estimate, and shortest remaining time that is reported.
+# Shortest elapsed time that allows an estimate, and shortest remaining time that is reported.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
 # Together with the time that a command takes to start, this is five seconds.
 _SILENT_S = 3.0
@@ -52,8 +52,9 @@ def progress(
 ) -> Iterator[T]:
     """Iterate with a progress bar on stderr, or without one if stderr is not a terminal.
 
-    If the rest will take more than a minute, one line states the time as soon as it can be estimated. The
-    first items include start-up, so they do not count for the estimate unless they take a minute themselves.
+    If the remaining items will take more than a minute, one line states how long, as soon as this can be
+    estimated. The first items include start-up, so they do not count towards the estimate unless they take a
+    minute themselves.
 
     Args:
         items: what is iterated over; ``what``: what is done with them.
@@ -106,7 +107,7 @@ def never_silent(name: str) -> Iterator[None]:
 
 
 def say_estimate(what: str, seconds: float) -> None:
-    """Print one line on stderr before anything that takes more than a minute."""
+    """Print one line on stderr with the expected time if it is more than a minute."""
     if told := estimate(what, seconds):
         say(told)
 
@@ -116,4 +117,4 @@ def estimate(what: str, seconds: float) -> str:
     if seconds <= _MINUTE_S:
         return ""
     span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
-    return f"estimate: {what} takes about {span} more"
+    return f"estimate: {what} will take about {span} more"

@@ -27,13 +27,13 @@ def setting(
     """Make a field of a settings record.
 
     Args:
-        default: its value if none is given; ``...`` if it must be given.
-        help: what it is, in a few words without a full stop.
+        default: its value if none is given; ``...`` makes the setting required.
+        help: what the setting is, in a few words without a full stop.
         unit: unit of the value, such as µm.
-        option: name or names on the command line, such as ``--pitch-um``; none for settings that are
-            reached by their dotted path only.
-        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); a length in µm is at most the
-            largest length.
+        option: name or names on the command line, such as ``--pitch-um``; none for settings that can be
+            changed only by their dotted path.
+        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``); a setting in µm is at most
+            ``LENGTH_UM.high`` by default.
     """
     if unit == "µm":
         limits = {"le": LENGTH_UM.high} | limits
@@ -50,7 +50,7 @@ class Leaf:
     Attributes:
         path: dotted, as in ``layout.pitch_um``.
         kind: annotation of the field, without limits.
-        value: what the record holds.
+        value: the value in the record.
         options: names on the command line.
         group: description of the part that the setting belongs to; empty at the root.
     """
@@ -75,7 +75,7 @@ def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[L
 
 
 def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> Leaf:
-    """Return the setting that a field states, with this path and value."""
+    """Return the setting that a field defines, with this path and value."""
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     return Leaf(
         path=path,
@@ -89,7 +89,7 @@ def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> 
 
 
 def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dict[str, Any]:
-    """Flatten nested or dotted keys to values by dotted path.
+    """Return the values of nested or dotted keys, each under its dotted path.
 
     Args:
         settings: a record; every key must be one of its names.
@@ -97,7 +97,7 @@ def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dic
         what: what messages call a setting.
 
     Raises:
-        InputError: a name that the record does not have; the message lists those that it has.
+        InputError: the record has no such name; the message lists the names that it has.
     """
     flat: dict[str, Any] = {}
     for key, value in content.items():
@@ -108,7 +108,7 @@ def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dic
             flat |= flattened(settings, {f"{key}.{name}": inner for name, inner in value.items()}, what)
         else:
             raise InputError(
-                f"{what} {key}", got=repr(value), wanted=f"one of {', '.join(_names(part, key))}"
+                f"{what} {key}", got=repr(value), wanted=f"a value for one of {', '.join(_names(part, key))}"
             )
     return flat
 
@@ -120,7 +120,9 @@ def _find(settings: BaseModel, path: str, what: str) -> Any:
         above = ".".join(done)
         if not isinstance(part, BaseModel):
             raise InputError(
-                f"{what} {path}", got=f"a name below {above}", wanted=f"{above}, which is a value"
+                f"{what} {path}",
+                got=f"a name below {above}",
+                wanted=f"{above} itself, which is a single value",
             )
         if name not in type(part).model_fields:
             raise unknown_name(what, path, _names(part, above))
@@ -166,10 +168,11 @@ def refused(error: ValidationError) -> InputError:
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
-    """Parse words ``path=value`` to values by dotted path; a value is JSON if it parses, otherwise a string.
+    """Return the values of words of the form ``path=value`` by dotted path. A value that is not JSON is a
+    string.
 
     Raises:
-        InputError: a word without ``=``, or a repeated path.
+        InputError: a word has no ``=``, or a path is repeated.
     """
     values: dict[str, Any] = {}
     for word in words:
@@ -186,10 +189,10 @@ def assigned(words: Iterable[str]) -> dict[str, Any]:
 
 
 def read_settings(path: str | Path) -> dict[str, Any]:
-    """Read a settings file, TOML or JSON by its suffix.
+    """Read a settings file as TOML or JSON, as its suffix says.
 
     Raises:
-        InputError: no such file, another suffix, or text that is not what the suffix says.
+        InputError: the file does not exist, has another suffix, or is not valid TOML or JSON.
     """
     file = Path(path)
     read = {".toml": tomllib.loads, ".json": json.loads}.get(file.suffix.lower())

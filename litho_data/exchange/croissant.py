@@ -15,11 +15,11 @@ _TYPES = {"i": "sc:Integer", "f": "sc:Float", "b": "sc:Boolean"}
 
 
 def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any]:
-    """Return the description as JSON-LD.
+    """Return the Croissant description of a release as JSON-LD.
 
     Args:
         root: the crate's entry for the dataset; ``files``: its entries for the files.
-        table: CSV with one row per scan; the description covers each column.
+        table: CSV file with one row per scan; the description lists its columns.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}
     said |= {"license": root["license"]["@id"]} if "license" in root else {}

@@ -1,7 +1,7 @@
-"""Import and export the authors' pair format; ``litho_data.readers.pairs`` states its limits.
+"""Import and export the authors' pair format, whose limits ``litho_data.readers.pairs`` states.
 
 ``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` heights, and ``src_max_dict.txt`` the full scales in
-metres. q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
+metres. The quadrant q is 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
 """
 
 import json
@@ -46,28 +46,30 @@ def import_pairs(
     dask: str | None = None,
     strict: bool = False,
 ) -> BuildResult:
-    """Build a store from a folder in the pair format; four quadrants of one name become one field.
+    """Build a store from a folder in the pair format; the four quadrants of a name become one field.
 
     A height is value / 255 · full scale. In the authors' own files, heights are truncated to the grey value
-    below, so they are half a grey value (about 2 nm) too low on average.
+    below, so on average they are too low by half a grey value (about 2 nm).
 
     Args:
-        folder: with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
-        out: the store.
-        pitch_um, level_height_um, levels: not in the files; by default those of the paper.
-        name: name of the dataset, by default that of the folder.
+        folder: folder with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
+        out: path of the store.
+        pitch_um, level_height_um, levels: the files do not state them; by default, they are the paper's.
+        name: name of the dataset; by default that of the folder.
         workers, dask: as for ``build_dataset``.
-        strict: refuse to build if any field has to be skipped.
+        strict: whether to refuse the build if a field must be skipped.
 
     Raises:
-        InputError: not such a folder, no complete pair, or pitch and heights that are not positive.
+        InputError: the folder has no scales or no complete pair, or pitch or heights are not positive.
     """
     root = Path(folder).resolve()
     scales = read_full_scales(root / SCALES_FILE)
     fields, unpaired = _fields(root, scales)
     if not fields:
         raise InputError(
-            f"pairs in {folder}", got="none", wanted=f"mask/*.tif, afm/*.tif and their names in {SCALES_FILE}"
+            f"complete pairs in {folder}",
+            got="none",
+            wanted=f"files of one name in mask/ and afm/, with this name in {SCALES_FILE}",
         )
     card = _card(
         name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
@@ -93,8 +95,9 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """Stitch one field; ``quadrants`` maps a quadrant (0 for a field in one piece) to the name of its
-    files.
+    """The job of stitching one field; ``quadrants`` maps each quadrant to the name of its files.
+
+    A field in one piece has the quadrant 0.
     """
 
     id: str
@@ -107,12 +110,12 @@ class PairsJob:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Return the layouts, then the heights, in the order of the quadrants."""
+        """Return the layout files and then the height files, each in the order of the quadrants."""
         names = [f"{kind}/{name}" for kind in ("mask", "afm") for name in self.quadrants.values()]
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
-        """Return the hash of everything that determines the piece."""
+        """Return the hash of everything that determines the finished field."""
         operation = OPERATIONS["stitch-pairs"]
         card = self.card.model_dump(mode="json")
         plan = [self.print_id, self.order, card, operation.version, operation.code_sha256, self._params]
@@ -143,7 +146,7 @@ class PairsJob:
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Return files by field and quadrant, and the files without a partner, each with the reason."""
+    """Return the file names by field and quadrant, and the unpaired files, each with the reason."""
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
     unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
@@ -177,13 +180,12 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; return a note for each loss of negative heights or gaps.
+    """Write a store in the pair format; return a note for each scan whose negative heights or gaps are lost.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 
     Raises:
-        InputError: a store whose fields cannot be cut into quadrants, or a folder that contains files of
-            another kind.
+        InputError: a field cannot be cut into quadrants, or the folder contains files of another kind.
     """
     store = open_store(store_path)
     notes: list[str] = []
@@ -195,18 +197,18 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
             scan = store.scan(scan_id)
             if scan.shape[0] % 2 or scan.shape[1] % 2:
                 raise InputError(
-                    f"size of field {scan_id}", got=scan.shape, wanted="even numbers of pixels, for quadrants"
+                    f"size of field {scan_id}", got=scan.shape, wanted="even numbers of rows and columns"
                 )
             lift_um = -float(np.nanmin(scan.height_um, initial=0))
             height_um = scan.height_um + lift_um
             if lift_um:
                 notes.append(
-                    f"{scan_id}: raised by {lift_um * 1e3:.1f} nm: the format has no negative heights"
+                    f"{scan_id}: heights were raised by {lift_um * 1e3:.1f} nm, because the format has no "
+                    "negative heights"
                 )
             if unmeasured := int(np.isnan(height_um).sum()):
                 notes.append(
-                    f"{scan_id}: {unmeasured} pixels without measurement became 0, because the "
-                    "format cannot mark them"
+                    f"{scan_id}: {unmeasured} unmeasured pixels became 0, because the format cannot mark them"
                 )
             full_scale_um = max(float(np.nanmax(height_um, initial=0)), 1e-6)
             grey = np.rint(np.nan_to_num(height_um) / full_scale_um * GREY_MAX).astype(np.uint8)

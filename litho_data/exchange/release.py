@@ -1,4 +1,4 @@
-"""Release a store as one file, or as a folder that describes itself in RO-Crate and in Croissant."""
+"""Release a store as one file, or as a folder with descriptions in RO-Crate and Croissant."""
 
 import json
 import zipfile
@@ -11,7 +11,7 @@ from litho_data.foundation import InputError, atomic_file, file_sha256
 from litho_data.foundation.begun import whole_folder
 from litho_data.store.read import Store, open_store
 
-# Zip needs a time for every file; a fixed time makes the same store give the same archive.
+# Zip needs a time for every file. With a fixed time, the same store always gives the same archive.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
@@ -21,14 +21,14 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
     """Pack a store into one ``.zarr.zip`` file, which ``open_store`` and zarr can read directly.
 
     Raises:
-        InputError: no store, or one that is packed already.
+        InputError: there is no store, it is packed already, or ``out`` is not a zip file.
     """
     store = open_store(store_path)
     folder = Path(store_path)
     if not folder.is_dir():
         raise InputError("store to export", got=f"{folder}, which is packed already", wanted="a .zarr folder")
     if Path(out).suffix != ".zip":
-        raise InputError("output", got=str(out), wanted=f"a file {store.name}.zarr.zip")
+        raise InputError("output file", got=str(out), wanted=f"a zip file, such as {store.name}.zarr.zip")
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     with atomic_file(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for path in progress(files, "packing"):
@@ -40,11 +40,11 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
 def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
     """Write a release folder: the packed store, its quality table, and their descriptions.
 
-    ``ro-crate-metadata.json`` names every raw file with its SHA-256, the software of the build, licence and
-    citation. ``croissant.json`` describes the files and the columns of the table.
+    ``ro-crate-metadata.json`` lists every raw file with its SHA-256, the software of the build, the licence
+    and the citation. ``croissant.json`` describes the files and the columns of the table.
 
     Raises:
-        InputError: no store, a packed store, a store without manifest, or a folder that contains files of
+        InputError: there is no store, it is packed or has no manifest, or the folder contains files of
             another kind.
     """
     store = open_store(store_path)
@@ -56,11 +56,11 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
         store.quality.to_csv(table, index=False)
         files = [
             _file(packed, "application/zip", "Dataset store, Zarr v3 in one file"),
-            _file(table, "text/csv", "Registration, levelling and noise figures per scan"),
+            _file(table, "text/csv", "Quality of each scan: registration, levelling and noise"),
         ]
         root = _root(store)
         _write(folder / _CROISSANT_FILE, croissant(root, files, table))
-        files.append(_file(folder / _CROISSANT_FILE, "application/ld+json", "The same in Croissant"))
+        files.append(_file(folder / _CROISSANT_FILE, "application/ld+json", "Description in Croissant"))
         content = {"@context": f"{_CRATE_VERSION}/context", "@graph": _graph(store, root, files)}
         _write(folder / _CRATE_FILE, content)
     return Path(out)

@@ -1,17 +1,18 @@
-"""How every command that writes a folder states, begins, continues and finishes its result.
+"""How every command that writes a folder declares, begins, continues and finishes its result.
 
-A command first states what its result will be: the name of its record, which is written last, and the fields
-of the record that determine the result. A folder is then one of these:
+A command first declares its result: the name of its record file, which is written last, and the fields of
+this record that determine the result. The folder is then in one of four states:
 
-=========  =======================================  =========================================================
-free       not there, or empty                      it is begun
-begun      ``begun.json``, written before all else  continued, if of the same record and fields
-finished   the record                               made again or continued, if of the same record and fields
-other      anything else                            refused, and nothing is changed
-=========  =======================================  =========================================================
+=========  =======================================  ==========================================================
+state      content of the folder                    what the command does
+=========  =======================================  ==========================================================
+free       missing or empty                         begins the result
+begun      ``begun.json``, written before all else  continues it, if record and fields are the same
+finished   the record                               makes it again or continues it, if both are the same
+other      anything else                            refuses, and changes nothing
+=========  =======================================  ==========================================================
 
-This law holds: if a command is stopped after any of its writes and run again, it ends with the same
-result.
+A command that is stopped after any of its writes and then run again ends with the same result.
 """
 
 import json
@@ -52,15 +53,15 @@ def growing_folder(
     folder.
 
     Args:
-        out: the folder; made if need be.
-        record: the file that a finished result holds, such as ``run.json``. The block writes it last.
+        out: the folder; it is created if it is missing.
+        record: name of the record file of a finished result, such as ``run.json``. The block writes it last.
         facts: fields of the record that determine the result; a folder with other values is refused.
         holds: names of files that the folder may contain before the result is begun, such as designs made one
             by one.
 
     Raises:
-        InputError: ``out`` is a file, holds something else or other facts, is being written by another
-            process, or cannot be written; raised before the block begins.
+        InputError: ``out`` is a file, contains something else or a result with other facts, is being written
+            by another process, or cannot be written. It is raised before the block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)
@@ -91,12 +92,12 @@ def growing_folder(
 def whole_folder(
     out: str | Path, *holds: str, record: str = "", facts: Facts | None = None
 ) -> Iterator[Path]:
-    """Yield a folder that replaces ``out`` as a whole; a run does not resume what a stopped run left.
+    """Yield a folder that will replace ``out`` as a whole; a stopped run cannot be resumed.
 
     Args:
-        out: what will be replaced.
-        holds: names, or patterns of names, of everything that such a result holds.
-        record, facts: as for ``growing_folder``; without a record any older result is replaced.
+        out: the folder that will be replaced.
+        holds: names, or patterns of names, of everything that such a result may contain.
+        record, facts: as for ``growing_folder``; without a record, any older result is replaced.
 
     Raises:
         InputError: as for ``growing_folder``, or the folder contains anything besides an older result.
@@ -109,7 +110,7 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
-    """Return whether the folder contains an unfinished start of the same result."""
+    """Return whether the folder contains the same result, begun but not finished."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # If a process was stopped before it wrote the content of ``begun.json``, the folder counts as empty.

@@ -1,20 +1,20 @@
-"""The one exception that users are meant to read."""
+"""The one exception whose message is written for users."""
 
 import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _MANY = 12
-# The value found can have any length.
+# The given value can have any length, so messages show only its beginning.
 _LONGEST = 240
 
 
 class InputError(ValueError):
-    """Bad input: the message is one line that says what is wrong, what was found and wanted, and gives a
-    hint.
+    """An error for bad input. Its one-line message says what is wrong, what was given and what is wanted, and
+    may give a hint.
 
     The command lines print the message without a traceback and exit with code 2; every other exception is a
-    defect of this project. ``got`` may be an exception: the message says why in words.
+    defect of this project. If ``got`` is an exception, the message states its cause in plain words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
@@ -39,11 +39,11 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Guard a block that reads a file that a program wrote and that somebody may have changed.
+    """Guard a block that reads a file that a program wrote but that somebody may have edited since.
 
     Raises:
-        InputError: in place of any error about the content, such as a missing key, a text in place of a
-            number, or no JSON.
+        InputError: replaces any error about the content, such as a missing key, text instead of a number, or
+            invalid JSON.
     """
     try:
         yield
@@ -56,7 +56,7 @@ def damaged(what: str) -> Iterator[None]:
 def said(error: Exception) -> str:
     """Say in plain words, instead of Python's, why something could not be read."""
     if isinstance(error, UnicodeDecodeError):
-        return "bytes that are no text"
+        return "bytes that are not text"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return str(error).partition("\n")[0] or type(error).__name__
@@ -80,7 +80,7 @@ def unknown_name(
     Args:
         what: what the name stands for.
         got: the name; ``known``: the known names.
-        hint: used if no known name is near.
+        hint: what to suggest if no known name is similar.
         also: what could have been given instead of a name, such as "an image file".
     """
     names = list(known)

@@ -21,8 +21,8 @@ def let_waiting_threads_sleep() -> None:
     """Let waiting threads of torch sleep; call this before torch is loaded. Otherwise threads spin while they
     wait for one another.
 
-    Next to one busy process, a spinning pair of threads takes ten times as long. Environment variables that
-    are already set are not changed.
+    Next to one busy process, two spinning threads take ten times as long. Environment variables that are
+    already set are not changed.
     """
     for variable, value in _SLEEP.items():
         os.environ.setdefault(variable, value)
@@ -42,7 +42,7 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
     Args:
         package: ``__name__`` of the package. No public name may equal the name of one of its subpackages or
             modules, because importing a subpackage or module binds that name.
-        file: its ``__init__``; every import with ``as`` in it is a public name.
+        file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
     ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.
     """
@@ -86,7 +86,9 @@ def require_extra(command: str, extra: str) -> None:
 
 
 def _missing(extra: str) -> str:
-    return f"needs {_OF_EXTRAS}, got none; install it with pip install '{_DISTRIBUTION}[{extra}]'"
+    return (
+        f"needs {_OF_EXTRAS}, which is not installed; install it with pip install '{_DISTRIBUTION}[{extra}]'"
+    )
 
 
 def _version() -> str:

@@ -47,10 +47,10 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
     """Yield an empty folder; it replaces ``path`` only on success, and an older folder stays until then.
 
-    If a user chose the path, use ``litho_data.foundation.begun.whole_folder``.
+    For a path that a user chose, use ``litho_data.foundation.begun.whole_folder`` instead.
 
     Args:
-        wait: whether to wait for another process that is writing it; otherwise refuse.
+        wait: if true, wait for another process that is writing the folder; otherwise refuse.
 
     Raises:
         InputError: ``path`` cannot be written, or another process is writing it.
@@ -73,12 +73,12 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
     there.
 
     Raises:
-        InputError: the place cannot be written, or another process is writing it.
+        InputError: ``path`` cannot be written, or another process is writing it already.
     """
     target = Path(path)
     if target.is_symlink() and not target.exists():
         raise InputError(
-            f"cannot write {target}", got="a link that leads nowhere", wanted="the path of a folder"
+            f"cannot write {target}", got="a broken symbolic link", wanted="the path of a folder"
         )
     work = _work(target)
     while True:
@@ -129,7 +129,7 @@ def _work(target: Path) -> Path:
 
 
 def _put_back(work: Path, target: Path) -> None:
-    """Put back an older folder that was moved aside for a new folder that never came."""
+    """Put an older folder back if it was moved aside and no new folder took its place."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.replace(target)
@@ -151,7 +151,7 @@ def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
 
 
 def _lock(stream: IO[str], wait: bool = False) -> bool:
-    """Take the lock and return whether that worked; return True also on a system without such locks."""
+    """Take the lock and return whether that succeeded. On a system without such locks, return True."""
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -177,7 +177,7 @@ def read_text(path: Path) -> str:
         UnicodeDecodeError: the bytes are not UTF-8.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise OSError(errno.EINVAL, "a pipe or a device, no file", str(path))
+        raise OSError(errno.EINVAL, "a pipe or a device, not a file", str(path))
     return path.read_text(encoding="utf-8")
 
 
@@ -185,7 +185,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
     """Read a text file and parse it as TOML or JSON.
 
     Raises:
-        InputError: no such file, or text that does not parse; the message begins with ``what``.
+        InputError: the file does not exist or does not parse; the message begins with ``what``.
     """
     try:
         return parse(read_text(file))
@@ -200,11 +200,11 @@ def table_beside(module: str, name: str) -> dict[str, Any]:
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Turn an error of the file system into an InputError while the first files of an output are written."""
+    """Turn file-system errors into InputErrors while the first files of an output are written."""
     try:
         yield
     except OSError as error:
-        raise InputError(f"cannot write {target}", got=error, wanted="a place that can be written") from error
+        raise InputError(f"cannot write {target}", got=error, wanted="a path that can be written") from error
 
 
 def _umask() -> int:

@@ -13,7 +13,7 @@ from litho_data.foundation.quantities import PITCH_UM
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """A rectangular grid of square or rectangular pixels, row 0 on top.
+    """A rectangular grid of square or rectangular pixels, with row 0 at the top.
 
     Args:
         shape: (ny, nx) in pixels.

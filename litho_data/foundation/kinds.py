@@ -9,6 +9,6 @@ Array = np.ndarray
 Shape = tuple[int, ...]
 """(ny, nx), pixels."""
 YX = tuple[float, float]
-"""Along y and along x: a pitch, a size, a place."""
+"""(along y, along x): a pitch, a size or a position."""
 Facts = Mapping[str, Any]
 """Plain data by name, such as parameters, attributes or a record."""

@@ -1,4 +1,4 @@
-"""Check names: a name from a received file that may become part of a path must be plain."""
+"""Check that names from received files are plain before they become part of a path."""
 
 import re
 from typing import Annotated
@@ -7,14 +7,14 @@ from pydantic import AfterValidator
 
 from litho_data.foundation.errors import InputError
 
-# A file system allows 255 bytes, of which suffixes need some.
+# File systems allow 255 bytes; the remaining bytes are left for suffixes.
 _LONGEST_BYTES = 200
 _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
 
 def is_plain_name(name: object) -> bool:
-    """Return whether the text is a file name on every system, and never a path, a hidden file or an
-    option.
+    """Return whether the text is a valid file name on every system, and not a path, a hidden file or a
+    command-line option.
     """
     return (
         isinstance(name, str)
@@ -31,16 +31,16 @@ def require_plain_name(what: str, name: str) -> str:
     """Return the name if it is plain.
 
     Raises:
-        InputError: the name is not plain, so that a path with it could lead to another folder.
+        InputError: the name is not plain; a path that contains it could lead to another folder.
     """
     if not is_plain_name(name):
-        raise InputError(what, got=repr(name)[:80], wanted="a plain name, without path")
+        raise InputError(what, got=repr(name)[:80], wanted="a plain name, without a path")
     return name
 
 
 def _plain(name: str) -> str:
     if not is_plain_name(name):
-        raise ValueError("wanted a plain name, without path")
+        raise ValueError("wanted a plain name, without a path")
     return name
 
 

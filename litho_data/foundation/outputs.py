@@ -20,16 +20,18 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
     Args:
         path: where the result will be.
-        holds: names, or patterns of names, of everything that such a result holds.
+        holds: names, or patterns of names, of everything that such a result may contain.
 
     Raises:
-        InputError: the current folder, a file, or a folder with anything else in it, which the message
-            names.
+        InputError: the path is the current folder, a file, or a folder that contains anything else; the
+            message names it.
     """
     folder = Path(path)
     if folder.exists() and folder.samefile(Path.cwd()):
         raise InputError(
-            "output", got=f"{folder}, which is the current folder", wanted="a folder below it, or elsewhere"
+            "output",
+            got=f"{folder}, which is the current folder",
+            wanted="another folder, such as one inside it",
         )
     _refuse_a_file(folder)
     names = sorted(child.name for child in folder.iterdir()) if folder.exists() else []
@@ -38,17 +40,17 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         raise InputError(
             "output",
             got=f"{folder}, which holds {strangers[0]}",
-            wanted="a new folder, or one that contains only an older result, which is replaced",
+            wanted="a new folder, or one that contains only an older result, which will be replaced",
         )
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose record, finished or begun, contains other facts than these."""
+    """Refuse a folder whose record, finished or begun, has facts that differ from these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
             "output",
-            got=f"{folder}, which holds a result with other settings, {other.removeprefix('settings.')}",
+            got=f"{folder}, which holds a result with other settings ({other.removeprefix('settings.')})",
             wanted="the same settings, or another folder",
             hint="choose another --out, or delete the folder",
         )
@@ -64,28 +66,28 @@ def first_difference(then: Facts, now: Facts, path: str = "") -> str:
                 return deeper
         elif name not in then or then[name] != after:
             short = name in then and not isinstance(after, list)
-            return f"{path}{name}" + (f" = {then[name]!r}, but now {after!r} is asked for" if short else "")
+            return f"{path}{name}" + (f" = {then[name]!r}, but now {after!r} is requested" if short else "")
     return ""
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
-    """Accept a folder for the result with the record file ``record``: a free path, an empty folder, or a
-    folder with the same kind of result.
+    """Accept a free path, an empty folder, or a folder with the same kind of result, whose record file is
+    ``record``.
 
     A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
     with schema ``litho-models/close-loop/1``.
 
     Args:
         path: where the result will be; other files in a folder that holds this result are left alone.
-        record: the file that a finished result holds.
+        record: name of the record file of a finished result.
         begun: names, or patterns of names, of files that an interrupted run of the same kind leaves.
 
     Raises:
-        InputError: a file, or a folder with another result or with something else in it.
+        InputError: the path is a file, or a folder that contains another result or anything else.
     """
     folder = Path(path)
     _refuse_a_file(folder)
-    # Files of desktops and version control do not count as content.
+    # Hidden files, such as those of desktops and version control, do not count as content.
     names = sorted(one.name for one in folder.glob("*") if not one.name.startswith("."))
     strangers = [name for name in names if name != record and _is_record(folder / name)]
     if not strangers and not any(fnmatch(name, mark) for name in names for mark in (record, *begun)):
@@ -95,7 +97,7 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
         raise InputError(
             "output",
             got=f"{folder}, which {'is a dataset store' if store else f'holds {strangers[0]}'}",
-            wanted="a new folder, or one that only this command writes",
+            wanted="a new folder, or one to which only this command has written",
             hint="" if store else f"for example {folder / Path(record).stem}",
         )
 
@@ -112,7 +114,7 @@ def _is_record(file: Path) -> bool:
 
 
 def read_record(file: Path) -> Any:
-    """Return the content of a JSON file; None if there is no file."""
+    """Return the content of a JSON file; return None if it cannot be read."""
     try:
         return json.loads(read_text(file))
     except (OSError, ValueError, RecursionError):

@@ -1,7 +1,7 @@
 """Plug-ins: modules that register your own reader, effect or model when they are imported.
 
-A plug-in is found by its entry point in the group ``litholoop.plugins``, or named as a file. Every command
-and every worker loads all plug-ins before its work begins.
+A plug-in is found through its entry point in the group ``litholoop.plugins``, or given as a file. Every
+command and every worker loads all plug-ins before its work begins.
 """
 
 import importlib.util
@@ -22,7 +22,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
     """Import all installed plug-ins and these files, each once per process.
 
     Raises:
-        InputError: a file that is not Python, or a plug-in that fails.
+        InputError: a file is not Python, or a plug-in fails to load.
     """
     for point in metadata.entry_points(group=GROUP):
         version = point.dist.version if point.dist else ""
@@ -35,7 +35,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
 
 
 def plugin_files() -> list[str]:
-    """Return the files that were loaded, so that other processes can load them."""
+    """Return the plug-in files that were loaded, so that other processes can load them too."""
     return [name for name in _LOADED if Path(name).is_absolute()]
 
 
@@ -45,10 +45,10 @@ def plugin_versions() -> dict[str, str]:
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split a command line into its words without ``--plugin FILE``, and the files.
+    """Return the words of a command line without any ``--plugin FILE``, and the list of those files.
 
     Raises:
-        InputError: the option without a file.
+        InputError: the option is given without a file.
     """
     kept, files, left = [], [], iter(words)
     for word in left:
@@ -58,7 +58,9 @@ def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
             continue
         file = file if equals else next(left, "")
         if not file:
-            raise InputError(OPTION, got="none", wanted="a Python file that registers something")
+            raise InputError(
+                OPTION, got="none", wanted="a Python file that registers a reader, an effect or a model"
+            )
         files.append(file)
     return kept, files
 
@@ -76,12 +78,12 @@ def _load(name: str, version: str, load: Callable[[], object]) -> None:
 
 
 def _import(path: Path) -> None:
-    """Run a file as the module of its own name, so that other processes can import its classes by this
+    """Run a file as a module with the file's name, so that other processes can import its classes by this
     name.
     """
     known = sys.modules.get(path.stem)
     if known is not None:
-        got = f"{path.name}, whose name belongs to {getattr(known, '__file__', None) or 'a part of Python'}"
+        got = f"{path.name}, whose name is used by {getattr(known, '__file__', None) or 'a part of Python'}"
         raise InputError("plug-in", got=got, wanted="a file with an unused name")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None

@@ -1,4 +1,4 @@
-"""Allowed ranges of physical numbers: a type for records, and a check for everything else."""
+"""Allowed ranges of physical quantities: types for records, and checks for everything else."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,7 +11,7 @@ from litho_data.foundation.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """The lowest and highest value of a quantity; everything in between is finite."""
+    """The lowest and highest allowed values of a quantity; both are finite."""
 
     low: float
     high: float
@@ -34,7 +34,7 @@ class Range:
         """Refuse values that are not numbers or are out of range.
 
         Raises:
-            InputError: the message shows the first such value.
+            InputError: some value is refused; the message shows the first one.
         """
         wrong = [one for one in np.ravel(np.asarray(values, dtype=object)) if not self.holds(one)]
         if wrong:

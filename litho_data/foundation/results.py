@@ -18,7 +18,7 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """A frozen part of a result; an unknown key is an error, except those in ``FORMER``, which older files
+    """A frozen part of a result. Unknown keys are errors, except those in ``FORMER``, which older files
     contain.
     """
 
@@ -87,16 +87,16 @@ class Result(Record):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read one result; a folder stands for the file inside it.
+        """Read one result from its file, or from the folder that contains this file.
 
         Raises:
-            InputError: no such file, not JSON, another schema, or unexpected fields.
+            InputError: the file does not exist, is not JSON, or has another schema or unexpected fields.
         """
         file = Path(path)
         file = file / cls.FILE_NAME if file.is_dir() else file
         kind = "/".join(cls.SCHEMA.split("/")[:2])
         parse = partial(json.loads, parse_constant=_refuse)
-        content = parsed(file, parse, f"cannot read {file}", f"a result {kind}")
+        content = parsed(file, parse, f"cannot read {file}", f"a result file of kind {kind}")
         schema = content.get("schema") if isinstance(content, dict) else None
         if schema != cls.SCHEMA:
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))

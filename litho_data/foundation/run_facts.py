@@ -23,7 +23,7 @@ _COMMAND: ContextVar[str] = ContextVar("command", default="")
 
 
 class RunFacts(Record):
-    """Command line and code of a result.
+    """The command line and the code that made a result.
 
     ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
     commit. ``dirty`` is None without a checkout, and in older result files.
@@ -36,8 +36,8 @@ class RunFacts(Record):
 
 
 class RunInfo(RunFacts):
-    """Command line, code and scans of a result; ``dropped`` lists the scans that were left out, with the
-    reason.
+    """The command line, code and scans of a result; ``dropped`` lists the scans that were left out, each with
+    the reason.
     """
 
     seeds: list[int]
@@ -88,8 +88,8 @@ def _software() -> dict[str, Any]:
 
 
 def checkout_state(folder: Path) -> dict[str, Any]:
-    """Return the ``commit`` of a checkout, and whether it is ``dirty``: a file of the packages is changed or
-    not in git.
+    """Return the ``commit`` of a checkout and whether it is ``dirty``, that is, whether any file of the
+    packages is changed or untracked.
 
     Both values are None without a checkout, as for an installed wheel.
     """

@@ -1,4 +1,4 @@
-"""Convert known units of length in files, and refuse all others."""
+"""Convert the known units of length that files use, and refuse all others."""
 
 import re
 

@@ -1,6 +1,4 @@
-"""Write a set of layouts to disk: one TIFF per layout, a table, and a dataset card to which scans can be
-added.
-"""
+"""Write a set of layouts to disk: one TIFF per layout, a table, and a dataset card for the later scans."""
 
 import csv
 import json
@@ -28,19 +26,20 @@ def write_card(
     levelled: bool = False,
     **tables: Facts,
 ) -> Path:
-    """Write a card for the layouts in the folder ``layouts``, and for their scans, which are or will be in
-    the folder ``scans``.
+    """Write a card for the layouts in the folder ``layouts`` and their scans in the folder ``scans``.
+
+    The scans may be added later.
 
     Args:
-        folder: where the card goes.
-        name: name of the dataset; ``title``: one line for people.
+        folder: folder in which the card is written.
+        name: name of the dataset; ``title``: one line for readers.
         pitch_um: pitch of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
         scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: format of the microscope's files.
-        levelled: whether a build takes the heights from the files without levelling them.
-        tables: further tables of the card, such as ``ids`` and ``write``; a table that is None is left out.
+        levelled: whether a build uses the heights of the files without levelling them.
+        tables: further tables of the card, such as ``ids`` and ``write``; values that are None are omitted.
 
     Raises:
-        InputError: a value that a card may not have.
+        InputError: a value is not allowed in a card.
     """
     plain = scan_format == "text-matrix"  # files of other formats state unit and size
     scan = {

@@ -1,4 +1,4 @@
-"""Make sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
+"""Make sets of random layouts or calibration patterns for the printer, with card, table and report."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -25,13 +25,14 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# This width leaves an even strip of 1 µm between two edges, as the printer blurs each edge over 1 µm.
+# With this width, an even strip of 1 µm remains between two edges, because the printer blurs each edge over
+# 1 µm.
 _TREAD_UM = 3.0
 
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, relative dose, and the purpose of its scan."""
+    """One layout with its id, its relative dose, and the purpose of its scan."""
 
     id: str
     level: Array
@@ -81,20 +82,20 @@ def write_layout_set(
 
     Args:
         pattern: a key of `PATTERNS`.
-        count: number of random layouts, or of doses of a dose matrix.
+        count: number of random layouts, or number of doses of a dose matrix.
         size_px: side of a layout, or (ny, nx), pixels.
         levels: number of levels.
         cutoff_per_um: cut-off of random layouts, cycles/µm.
         passband: ``square`` or ``round``.
         pitch_um: pixel pitch, µm.
         level_height_um: nominal height of a level, µm.
-        seed: decides every random draw.
-        quantiser: ``round`` or ``floor``; ``field_px``: side of a larger field that random layouts are cut
-            from, see ``random_layout``.
+        seed: seed of every random draw.
+        quantiser: ``round`` or ``floor``; ``field_px``: side of a larger field from which random layouts are
+            cut; for both, see ``random_layout``.
 
     Raises:
-        InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
-            folder that holds a set with other settings or something else, such as scans.
+        InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
+            folder contains a set with other settings or something else, such as scans.
     """
     require_known("pattern", pattern, PATTERNS)
     LEVELS.require("levels of a layout", levels)
@@ -182,7 +183,7 @@ def _features(settings: SetSettings, feature: int, ground: int) -> Array:
 
 
 def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
-    # The cut-off is twice the default: a finer frame determines the scale better.
+    # The cut-off is twice that of the settings, because a finer frame determines the scale better.
     frame = random_layout(
         settings.shape,
         levels=settings.levels,

@@ -1,6 +1,6 @@
-"""Calibration patterns: prints that measure one thing at a time.
+"""Draw calibration patterns, whose prints measure one property at a time.
 
-All functions return levels (ny, nx) in the smallest unsigned type; lengths are rounded to whole pixels.
+All pattern functions return levels (ny, nx) in the smallest unsigned type; lengths are in whole pixels.
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,12 @@ from litho_data.foundation import Array, InputError, Shape, require_known
 
 
 def flat(shape: Shape, *, level: int) -> Array:
-    """Draw one level everywhere, to measure roughness, vignetting and flatness."""
+    """Draw the same level everywhere, to measure roughness, vignetting and flatness."""
     return np.full(shape, level, np.min_scalar_type(level))
 
 
 def step_ladder(shape: Shape, *, highest: int) -> Array:
-    """Draw stairs along x from level 0 to ``highest``, with steps of equal width, to measure height against
-    level.
-    """
+    """Draw stairs of equal width along x, from level 0 to ``highest``, to measure height against level."""
     _positive(highest, "highest level of a step ladder")
     steps = highest + 1
     if shape[1] < steps:
@@ -28,16 +26,16 @@ def step_ladder(shape: Shape, *, highest: int) -> Array:
 
 
 def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0) -> Array:
-    """Draw stairs along x inside a frame that shows their position, to measure height and roughness against
-    level.
+    """Draw stairs along x inside a registration frame, to measure height and roughness against level.
 
-    A ladder alone looks the same wherever it is shifted along its steps, so a scan of it cannot be
-    registered. The frame, whose width is a fifth of the side, makes that possible. The stairs rise evenly
-    from ``lowest`` to ``highest``, over every level if there is room.
+    A ladder alone looks the same after a shift along its edges, so a scan of it cannot be registered. The
+    frame, whose width is a fifth of the side, makes registration possible. The stairs rise evenly from
+    ``lowest`` to ``highest``, with a step for every level if there is room.
 
     Args:
-        frame: layout without repeats, (ny, nx).
-        tread_px: smallest width of a step; at least 3 steps have to fit.
+        frame: layout (ny, nx) that does not repeat.
+        highest, lowest: levels of the last and the first step.
+        tread_px: smallest width of a step; at least 3 steps must fit.
     """
     inset_y, inset_x = (size // 5 for size in frame.shape)
     width = frame.shape[1] - 2 * inset_x
@@ -46,7 +44,7 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
         raise InputError(
             "size of a framed ladder",
             got=f"{frame.shape[1]} px and {highest - lowest + 1} levels",
-            wanted=f"at least {5 * tread_px} px and 3 levels: three steps of {tread_px} px",
+            wanted=f"at least {5 * tread_px} px and 3 levels, for three steps of {tread_px} px",
         )
     levels = np.rint(np.linspace(lowest, highest, steps))
     layout = frame.astype(np.min_scalar_type(highest))
@@ -55,7 +53,10 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
 
 
 def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Array:
-    """Draw squares of ``cell_px``, the top left one high, to measure lateral scale, shear and corners."""
+    """Draw squares of ``cell_px`` pixels, to measure lateral scale, shear and corners.
+
+    The square at the top left has the level ``high``.
+    """
     _positive(cell_px, "cell_px of a checkerboard")
     y, x = np.indices(shape) // cell_px
     return np.where((y + x) % 2 == 0, high, low).astype(np.min_scalar_type(high))
@@ -64,11 +65,13 @@ def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Arra
 def line_space_sweep(
     shape: Shape, *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
 ) -> Array:
-    """Draw lines and spaces of equal width, each pair one pixel wider, to measure resolution against pitch.
+    """Draw lines, each followed by a space of the same width, to measure resolution against line width.
+
+    Each line is one pixel wider than the line before.
 
     Args:
         narrowest_px: width of the first line.
-        along: axis of the lines: ``y`` (their order is along x) or ``x``.
+        along: axis to which the lines are parallel: ``y`` (they follow each other along x) or ``x``.
     """
     _positive(narrowest_px, "narrowest_px of a line/space sweep")
     require_known("direction of the lines", along, ("x", "y"))
@@ -82,22 +85,23 @@ def line_space_sweep(
 
 
 def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
-    """Draw ``spokes`` wedges around the centre, as wide as the gaps, to measure resolution against
-    direction.
+    """Draw a Siemens star of ``spokes`` wedges around the centre, to measure resolution against direction.
+
+    The wedges are as wide as the gaps between them.
     """
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
-    # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
+    # After a rotation by half a wedge, no edge of a wedge lies on an axis of the grid.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
     return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.min_scalar_type(high))
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
-    """Draw isolated squares of growing width, to measure spot, shrinkage and collapse of single features.
+    """Draw isolated squares of these widths, to measure the spot, shrinkage and collapse of single features.
 
-    If ``feature`` is above ``ground`` the squares are pillars, otherwise pits. Each cell of the square array
-    contains one width, in reading order. The space between two features is at least twice the larger width.
+    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. Each cell of a square array
+    contains one square, in reading order. The space between two squares is at least twice the larger width.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)

@@ -1,5 +1,6 @@
-"""Make random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized …
-layout".
+"""Make random layouts by the paper's equation.
+
+The equation is in arXiv:2309.17343, supplement, "Generate randomized … layout".
 """
 
 import numpy as np
@@ -26,28 +27,29 @@ def random_layout(
 
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the nearest of
     ``levels`` values. The result is periodic in both directions. The paper does not define the low-pass
-    filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) and ±0.5
-    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated, not
+    filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) or ±0.5
+    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated instead of
     rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.
-        levels: number of levels L; the result holds integers 0…L−1.
-        cutoff_per_um: highest spatial frequency that passes, cycles per µm.
+        levels: number of levels L; the result contains integers 0…L−1.
+        cutoff_per_um: highest spatial frequency that the filter passes, cycles/µm.
         pitch_um: pixel pitch, µm.
         seed: anything that `numpy.random.default_rng` accepts.
-        passband: ``square`` limits each axis, ``round`` the length of the frequency vector.
-        quantiser: ``round``, as in the paper's equation, or ``floor``, with which only the largest value has
+        passband: ``square`` limits the frequency along each axis, ``round`` the length of the frequency
+            vector.
+        quantiser: ``round``, as in the paper's equation, or ``floor``, with which only the largest value gets
             the highest level.
-        field_px: side of a larger field, pixels, from whose middle the layout is cut. Such a layout is not
-            periodic and may lack the lowest or the highest level. None: the layout is the whole field.
+        field_px: side, in pixels, of a larger field from whose middle the layout is cut. Such a layout is not
+            periodic and may lack the lowest or the highest level. If None, the layout is the whole field.
 
     Returns:
         uint8 (beyond 256 levels uint16), shape (ny, nx).
 
     Raises:
-        InputError: fewer than 2 or more than 65536 levels, a cut-off that lets only the mean pass, or a field
-            smaller than the layout.
+        InputError: there are fewer than 2 or more than 65536 levels, the cut-off is too high for the pitch or
+            passes only the mean, or the field is smaller than the layout.
     """
     LEVELS.require("levels of a layout", levels)
     whole = shape if field_px is None else (field_px, field_px)
@@ -57,7 +59,7 @@ def random_layout(
         raise InputError(
             "cutoff_per_um of a random layout",
             got=cutoff_per_um,
-            wanted=f"at most {0.5 / pitch_um:g} cycles/µm, the finest that pixels of {pitch_um:g} µm hold",
+            wanted=f"at most {0.5 / pitch_um:g} cycles/µm, the limit for pixels of {pitch_um:g} µm",
         )
     field = low_pass(
         np.random.default_rng(seed).random(whole),
@@ -66,7 +68,7 @@ def random_layout(
         passband=passband,
     )
     lowest, highest = field.min(), field.max()
-    # If only the mean passes, the rounding of the transform still leaves variations of about 1e-17.
+    # If only the mean passes, rounding errors of the transform still cause variations of about 1e-17.
     if highest - lowest < 1e-12:
         raise InputError(
             "cutoff_per_um of a random layout",
@@ -96,7 +98,7 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Round values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the integer below."""
+    """Map values in [0, 1] to ``levels`` integers by rounding half up, or by rounding down (``floor``)."""
     require_known("quantiser", quantiser, QUANTISERS)
     whole = np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round"))
     return whole.astype(np.min_scalar_type(levels - 1))

@@ -19,11 +19,11 @@ class LayoutStatistics(Result):
     """Pooled statistics of a set of layouts.
 
     Args:
-        level_share: share of pixels at each level, sums to 1.
+        level_share: share of the pixels at each level; the shares sum to 1.
         jump_share: share of neighbouring pixel pairs (along x and y) that differ by 0, 1, 2 … levels.
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
-        power_share: share of the power (mean level excluded) in each bin, sums to 1.
-        settings: settings of a set that ``write_layout_set`` made, otherwise None.
+        power_share: share of the power (without the mean level) in each bin; the shares sum to 1.
+        settings: settings of the set if ``write_layout_set`` made it, otherwise None.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/layouts/2"
@@ -40,7 +40,7 @@ class LayoutStatistics(Result):
 
 
 def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um: float) -> LayoutStatistics:
-    """Collect the statistics of layouts, one at a time.
+    """Compute the pooled statistics of layouts, reading one layout at a time.
 
     Args:
         layouts: levels (ny, nx), or paths of layout files.
@@ -48,7 +48,7 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
         pitch_um: pixel pitch, µm.
 
     Raises:
-        InputError: no layout, a level of L or more, or a layout below 64 x 64 px.
+        InputError: there is no layout, a level is L or more, or a layout is smaller than 64 x 64 px.
     """
     levels_count = np.zeros(levels, np.int64)
     jumps_count = np.zeros(levels, np.int64)
@@ -82,13 +82,16 @@ def _checked(layout: Array | Path, levels: int) -> Array:
     if layout.max() >= levels:
         raise InputError("level in a layout", got=int(layout.max()), wanted=f"0 to {levels - 1}")
     if min(layout.shape) < _FEWEST_PX:
-        raise InputError("layout", got=f"{layout.shape} px", wanted=f"at least {_FEWEST_PX} px each way")
+        raise InputError(
+            "size of a layout", got=f"{layout.shape} px", wanted=f"at least {_FEWEST_PX} x {_FEWEST_PX} px"
+        )
     return layout
 
 
 def _radial_power(level: Array, pitch_um: float) -> Array:
-    """Return the power about the mean in radial bins up to the Nyquist frequency of the axes, normalised per
-    layout.
+    """Return the power about the mean in radial frequency bins, normalised for each layout.
+
+    The bins extend to the Nyquist frequency of the axes; the last bin includes all higher frequencies.
     """
     window = np.outer(np.hanning(level.shape[0]), np.hanning(level.shape[1]))
     weighted = (level - (level * window).sum() / window.sum()) * window

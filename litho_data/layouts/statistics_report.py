@@ -1,4 +1,4 @@
-"""Write the report of a set of layouts for people."""
+"""Write a report with the statistics of a set of layouts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 4
-# Lower limit of the logarithmic axes: smaller shares are rounding.
+# Lower limit of the logarithmic axes. Smaller shares are only rounding errors.
 _LEAST_SHARE = 1e-6
 
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
-    """Make a page with pictures of the first layouts, level and jump shares, and the spectrum."""
+    """Make a page with pictures of the first layouts, the shares of levels and jumps, and the spectrum."""
     from litho_data.readers import read_layout
 
     page = Page(
@@ -30,7 +30,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     )
     page.verdict(_verdict(statistics))
     first = {file.stem: read_layout(file) for file in files[:_SHOWN]}
-    page.figure(layouts_figure(first, (0, statistics.levels - 1)), "The first layouts, level by colour.")
+    page.figure(layouts_figure(first, (0, statistics.levels - 1)), "The first layouts, coloured by level.")
 
     graphs = new_figure(11, 3)
     levels = np.arange(statistics.levels)
@@ -42,19 +42,19 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     of_jumps.set(xlabel="jump between neighbours, levels", ylabel="share of pairs", **shares)
     of_power.step(statistics.frequency_per_um, statistics.power_share, where="mid")
     of_power.set(xlabel="spatial frequency, cycles/µm", ylabel="share of power", **shares)
-    page.figure(graphs, "Pooled statistics of the set.")
+    page.figure(graphs, "Statistics of all layouts together.")
     page.heading("In numbers", folded=True)
     numbers = {
         "level or jump": levels,
         "share of pixels": statistics.level_share,
         "share of pairs": statistics.jump_share,
     }
-    page.table(numbers, "Level and jump shares.", "levels.csv", digits=4)
+    page.table(numbers, "Shares of levels and of jumps.", "levels.csv", digits=4)
     return page
 
 
 def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
-    """Draw layouts (ny, nx) side by side, by title, with their levels on one scale."""
+    """Draw layouts (ny, nx), given by title, side by side, with one colour scale for their levels."""
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):
         axes = figure.add_subplot(1, len(levels), place)
@@ -70,6 +70,6 @@ def _verdict(statistics: LayoutStatistics) -> str:
     flat = 100 * float(statistics.jump_share[0])
     levels = "Every level is" if used == statistics.levels else f"{used} of {statistics.levels} levels are"
     return (
-        f"{levels} used. Neighbouring pixels differ by {jump} level{'' if jump == 1 else 's'} at most; "
-        f"{flat:.0f} % of the pairs have the same level."
+        f"{levels} used. Neighbouring pixels differ by at most {jump} level{'' if jump == 1 else 's'}; "
+        f"{flat:.0f} % of neighbouring pairs have the same level."
     )

@@ -22,7 +22,7 @@ Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
 Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
-# If a smaller share of the pixels remains, the background is unreliable.
+# If less than this share of the pixels remains, the background is unreliable.
 _LEAST_BACKGROUND = 0.02
 
 
@@ -35,21 +35,21 @@ def mark_features(
     side: Side = "both",
     grow_px: Grown = 0,
 ) -> Array:
-    """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
+    """Mark the pixels whose distance from the main surface exceeds ``threshold`` times the noise sigma.
 
-    Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so features must be a
-    minority. Measured pixels that were not selected are marked as well, so the result is everything that
-    later steps should exclude.
+    The main surface is the median of the selected pixels, and the noise sigma is 1.4826 · MAD, so features
+    must be a minority. Measured pixels that were not selected are marked too. The result is therefore
+    everything that later steps should exclude.
 
     Args:
-        z: (ny, nx), any unit, already level.
+        z: (ny, nx), any unit, already levelled.
         grow_px: the marked area is widened by this many pixels, to cover blurred edges.
 
     Returns:
         bool (ny, nx).
 
     Raises:
-        InputError: a threshold that is not positive, an unknown side, a negative ``grow_px``.
+        InputError: the threshold is not positive, the side is unknown, or ``grow_px`` is negative.
     """
     centre = float(np.median(z[chosen]))
     limit = threshold * noise_sigma(z[chosen] - centre)
@@ -70,23 +70,27 @@ def mask_and_relevel(
 ) -> MaskedLevelling:
     """Level, mark the features, and level again without them, until the marks no longer change.
 
-    The first background is robust (Tukey); the following ones are least-squares fits to the unmarked pixels.
-    The background is subtracted with its constant, so that the main surface lies at zero. The returned mask
-    is that of ``mark_features``.
+    The first background is a robust fit (Tukey); the later ones are least-squares fits to the unmarked
+    pixels. The background is subtracted with its constant, so that the main surface lies at zero. The
+    returned mask marks the same pixels as ``mark_features``.
 
     Raises:
-        InputError: parameters outside their range, or features that leave no background.
+        InputError: a parameter is outside its range, or the features leave too few background pixels.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     surface = robust_surface(z, chosen, terms)
-    # The noise is estimated only once, because over the remaining pixels it would shrink in every round.
+    # The noise is estimated only once. Estimated over the unmarked pixels, it would shrink in every round.
     limit = threshold * noise_sigma((z - surface)[chosen])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):
         features = _off_surface(z - surface, chosen, limit, side, grow_px)
         background = chosen & ~features
         if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(chosen):
-            raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
+            raise InputError(
+                "mask-and-relevel finds no main surface",
+                got="nearly all pixels marked as features",
+                wanted="a higher threshold or a mask",
+            )
         surface = evaluate(fit_terms(z, background, terms), z.shape)
         key = np.packbits(features).tobytes()
         if key in seen:

@@ -1,6 +1,4 @@
-"""Level a scan with knowledge of its layout, so that the printed structure's own slope and bow are not
-removed.
-"""
+"""Level a scan using its layout, so that the slope and bow of the printed structure itself are kept."""
 
 from __future__ import annotations
 
@@ -20,7 +18,8 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# Below this value, background and structure cannot be separated in double precision with noise.
+# If the ratio of the smallest to the largest eigenvalue is below this, noise and rounding in double precision
+# prevent the separation of background and structure.
 _SINGULAR = 1e-9
 _ROWS_AT_ONCE = 64
 _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
@@ -41,33 +40,35 @@ def level_layout_aware(
     """Fit the background and the printed structure together, and subtract only the background.
 
     The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
-    response with one knot per level. A plain fit would count the structure's own slope as background. Only
-    the polynomial without its constant is subtracted, with mean zero over the fitted pixels, because the
-    datum is part of the response.
+    response with one knot per level. A plain fit would count the structure's own slope as background. The
+    datum is part of the response, so the subtracted polynomial has no constant of its own: its mean over the
+    fitted pixels is zero.
 
     Args:
         z: (ny, nx), any unit.
-        layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
+        layout_level: (ny, nx) level of each pixel in the scan's frame, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the best fitting of a few
-            values. Pixels within two sigma of the edge of the layout are not fitted, because their height
+        blur_px: sigma of a Gaussian for the lateral spread of printing; by default, the value out of a few
+            that fits best. Pixels within two sigma of the layout's edge are not fitted, because their height
             depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
-        InputError: a layout of another shape or without overlap, or a layout that looks like the
-            background itself, such as a ramp, so that the two cannot be separated.
+        InputError: the layout has another shape, does not overlap with the scan, or cannot be separated from
+            the background because it looks like one, as a ramp does.
     """
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
     if not terms:
-        raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
+        raise InputError("degree of the layout-aware background", got=0, wanted="1 or more")
     blurs = _BLURS_PX if blur_px is None else (blur_px,)
     known = np.isfinite(layout_level)
     fitted = chosen & _inside(known, 2 * blurs[-1])
     if not fitted.any():
-        raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
+        raise InputError(
+            "the layout covers no measured pixel of the scan", wanted="a layout in the scan's frame"
+        )
     level = np.asarray(layout_level, dtype=float)
     fits = [
         _joint_fit(z, np.where(known, smooth_measured(level, blur), np.nan), fitted, terms) for blur in blurs
@@ -77,9 +78,7 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the known pixels farther than a border from unknown ones, or all known pixels if few are
-    left.
-    """
+    """Select the known pixels beyond a border around unknown ones, or all known pixels if few remain."""
     if known.all():
         return known
     inner = ndimage.distance_transform_edt(known) > border_px
@@ -98,11 +97,11 @@ def layout_in_scan_frame(
 
     Args:
         layout_level: (ny, nx) levels.
-        scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan's frame to the layout's.
+        scan_to_layout: 3 x 3 matrix that maps (x_um, y_um, 1) of the scan's frame to the layout's.
         bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
 
     Returns:
-        float64 of ``scan_shape``, from the nearest layout pixel. Levels are labels and must not be
+        float64 of ``scan_shape``, from the nearest layout pixel, because levels are labels and must not be
             interpolated.
     """
     points_um = lattice(
@@ -118,9 +117,7 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Return the background's Legendre coefficients for ``evaluate``, and minus the explained sum of
-    squares.
-    """
+    """Return the background's Legendre coefficients, and the explained sum of squares with a minus sign."""
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]
@@ -140,7 +137,7 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
 
 
 def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, Array]:
-    """Sum the normal equations over strips of rows, so that the design matrix never exists as a whole."""
+    """Sum the normal equations over strips of rows, so that the whole design matrix is never in memory."""
     x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))
     basis_y = np.polynomial.legendre.legvander(y, max(q for _, q in terms))

@@ -1,4 +1,4 @@
-"""Define an operation of a recipe as a function whose signature states parameters, defaults and limits."""
+"""Define the operations of recipes: functions whose signatures state the parameters, defaults and limits."""
 
 import inspect
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
-"""The steps that a recipe can contain, by operation."""
-# Arguments that are not settings, because they come with the scan, and their names in messages.
+"""The steps that a recipe can contain, by the name of the operation."""
+# Arguments that come with the scan and are therefore not settings, with their names in messages.
 _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
 
 
@@ -30,23 +30,23 @@ class State:
 
 
 class Step(BaseModel):
-    """Base of all steps: its fields are the arguments of an operation.
+    """Base class of all steps; the fields of a step are the arguments of its operation.
 
     ``masking`` says how the current mask is used. The current mask is the scan's mask until a step marks
-    pixels, and then the mask of the latest such step.
+    pixels; then it is the mask of the last step that marked pixels.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # Names the arguments that come with the scan, and whether they are optional.
+    # The arguments that come with the scan, and whether each is optional.
     of_scan: ClassVar[dict[str, bool]]
 
     op: str
     masking: Masking = "exclude"
 
     def run(self, state: State) -> State:
-        """Return the state with the levelled map, with the marked pixels as its mask, or with both."""
+        """Return the state after the step, with the levelled map, the new mask, or both."""
         arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
         for name, optional in self.of_scan.items():
             arguments[name] = getattr(state, name)
@@ -60,12 +60,12 @@ class Step(BaseModel):
 
 
 def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Register a function of heights and usable pixels as the operation named ``op``.
+    """Return a decorator that registers a function of heights and usable pixels as the operation ``op``.
 
     The function receives heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of
-    any type, a ``mask`` and ``masking``; see ``select``. The function's keyword arguments become fields of
-    the step, which are checked at every call, except those that come with the scan. The function returns a
-    ``Levelled``, a ``MaskedLevelling``, or pixels to mark as a bool array.
+    any type, a ``mask`` and ``masking``; see ``select``. Keyword arguments of the function become fields of
+    the step and are checked at every call, except for those that come with the scan. The function returns a
+    ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

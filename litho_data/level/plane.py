@@ -1,4 +1,4 @@
-"""Remove tilt and set the zero as Gwyddion does: planes by fit or by the prevailing facet."""
+"""Remove tilt, by a plane fit or by the prevailing facet, and set the zero, as Gwyddion does."""
 
 from collections.abc import Callable
 
@@ -14,13 +14,13 @@ _FEWEST_CELLS = 4
 
 @operation("plane")
 def level_plane(z: Array, chosen: Array) -> Levelled:
-    """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
+    """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) does not change.
 
-    As Gwyddion defines it, the fitted constant is replaced by -(bx nx + by ny) / 2, with slopes in height per
-    pixel, so that the mean changes by (bx + by) / 2.
+    As in Gwyddion, the fitted constant is replaced by -(bx nx + by ny) / 2, where the slopes bx and by are in
+    height per pixel. The mean therefore changes by (bx + by) / 2.
 
     Raises:
-        InputError: the selected pixels do not determine a plane. (Gwyddion then removes nothing.)
+        InputError: the selected pixels do not determine a plane. (Gwyddion removes nothing in this case.)
     """
     coefficients = fit_terms(z, chosen, polynomial_terms(1, 1, 1))
     # The plane is fitted in coordinates from -1 to 1.
@@ -30,18 +30,18 @@ def level_plane(z: Array, chosen: Array) -> Levelled:
 
 @operation("facet")
 def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
-    """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) stays.
+    """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) does not change.
 
-    ``prevailing_slope`` is applied to the slopes of all 2 x 2 cells whose pixels are selected, with s² = mean
-    |v|² / 20, until the change falls below sqrt(1e-9), the limit of Gwyddion 2.62. (The limit of version
-    2.45, 1e-8, changes the result by 2e-3 of the range.)
+    ``prevailing_slope`` is applied to the slopes of all 2 x 2 cells whose four pixels are selected, with s² =
+    mean |v|² / 20. It ends when the change is below sqrt(1e-9), the limit of Gwyddion 2.62. (With the limit
+    of version 2.45, 1e-8, the result differs by 2e-3 of the range.)
 
     Args:
-        z: (ny, nx), µm: slopes are physical, so height and pitch must share a unit.
+        z: (ny, nx), µm; the slopes are physical, so height and pitch must share a unit.
         pitch_um: (y, x) sampling, µm.
 
     Raises:
-        InputError: fewer than 4 usable cells. (Gwyddion then removes nothing.)
+        InputError: fewer than 4 cells are usable. (Gwyddion removes nothing in this case.)
     """
     diagonal, other = z[1:, 1:] - z[:-1, :-1], z[:-1, 1:] - z[1:, :-1]
     whole = chosen[1:, 1:] & chosen[:-1, :-1] & chosen[:-1, 1:] & chosen[1:, :-1]
@@ -55,10 +55,10 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
 
 
 def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: float) -> Array:
-    """Return the slope (d,) of the prevailing facet among slopes v (d, n).
+    """Return the slope (d,) of the prevailing facet, given slopes v (d, n).
 
-    The mean with the weights exp(-|v|² / s²), s² = sharpness · mean |v|², is subtracted up to ``passes``
-    times, until its square is below ``settled2``.
+    The mean of v with the weights exp(-|v|² / s²), s² = sharpness · mean |v|², is subtracted from v until the
+    square of this mean is below ``settled2``, but at most ``passes`` times.
     """
     total = np.zeros(len(slopes))
     for _ in range(passes):
@@ -76,28 +76,29 @@ def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: 
 
 
 def _without_tilt(z: Array, slope_x: float, slope_y: float) -> Levelled:
-    """Subtract the plane that has these slopes per pixel and is zero at column nx/2, row ny/2."""
+    """Subtract the plane that has these slopes per pixel and is zero at column nx/2 and row ny/2."""
     y, x = (np.arange(n) - n / 2 for n in z.shape)
     return subtract(z, np.add.outer(slope_y * y, slope_x * x))
 
 
 @operation("fix-zero")
 def fix_zero(z: Array, chosen: Array) -> Levelled:
-    """Move the lowest selected pixel to zero. The zero is then the height of one pixel, not a physical
-    datum.
+    """Shift the heights so that the lowest selected pixel is zero.
+
+    The zero is then the height of a single pixel, not a physical datum.
     """
     return _shift(z, np.min, chosen)
 
 
 @operation("zero-mean")
 def zero_mean(z: Array, chosen: Array) -> Levelled:
-    """Move the mean of the selected pixels to zero."""
+    """Shift the heights so that the mean of the selected pixels is zero."""
     return _shift(z, np.mean, chosen)
 
 
 @operation("zero-max")
 def zero_max(z: Array, chosen: Array) -> Levelled:
-    """Move the highest selected pixel to zero."""
+    """Shift the heights so that the highest selected pixel is zero."""
     return _shift(z, np.max, chosen)
 
 

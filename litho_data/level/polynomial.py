@@ -1,6 +1,4 @@
-"""Remove polynomial backgrounds: by least squares, as in Gwyddion, or fitted to the majority of the
-pixels.
-"""
+"""Remove polynomial backgrounds, fitted by least squares as in Gwyddion, or by a robust fit."""
 
 from functools import lru_cache
 from typing import Annotated
@@ -17,15 +15,15 @@ Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
 # If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this, the smallest
-# eigenvalue is only rounding noise.
+# eigenvalue is only rounding error.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
-# Widths in units of the noise. With these, 95 % of the efficiency of least squares is kept under Gaussian
-# noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
+# Widths in units of the noise. With these widths, the fits have 95 % of the efficiency of least squares under
+# Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
 _HUBER, _TUKEY = 1.345, 4.685
 _MAD_TO_SIGMA = 1.4826
 _MAX_ROUNDS = 200
-# A change of the surface that is too small to matter, in units of the noise.
+# A change of the surface below this, in units of the noise, is too small to matter.
 _SETTLED = 1e-7
 
 
@@ -40,15 +38,15 @@ def level_polynomial(
 ) -> Levelled:
     """Subtract the least-squares polynomial, including its constant.
 
-    The mean of the fitted pixels becomes zero. Without ``total_degree`` the terms are x^p y^q with p <=
-    x_degree and q <= y_degree (Gwyddion's independent degrees, column and row degree). With it they are those
-    with p + q <= total_degree (limited total degree), and the other two degrees do not count.
+    The mean of the fitted pixels becomes zero. Without ``total_degree``, the terms are x^p y^q with p <=
+    x_degree and q <= y_degree (Gwyddion's independent degrees). With ``total_degree``, the terms are those
+    with p + q <= total_degree (Gwyddion's limited total degree), and the other two degrees are ignored.
 
     Args:
         z: (ny, nx), any unit.
 
     Raises:
-        InputError: a degree outside 0..11, or selected pixels that do not determine all terms.
+        InputError: a degree is outside 0..11, or the selected pixels do not determine all terms.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     return subtract(z, evaluate(fit_terms(z, chosen, terms), z.shape))
@@ -63,23 +61,23 @@ def level_robust(
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
 ) -> Levelled:
-    """Subtract the robust polynomial with its constant, which places the main surface at zero.
+    """Subtract a robustly fitted polynomial, including its constant, so that the main surface lies at zero.
 
-    The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
-    weight to distant features. The biweight starts from Huber's solution, which has a single minimum.
+    The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives
+    features far from the surface no weight. It starts from Huber's solution, which has a single minimum.
 
     Args:
         z: (ny, nx), any unit.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
-        InputError: pixels that do not determine the polynomial.
+        InputError: the selected pixels do not determine the polynomial.
     """
     return subtract(z, robust_surface(z, chosen, polynomial_terms(x_degree, y_degree, total_degree)))
 
 
 def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
-    """Fit the robust polynomial to the chosen pixels and return it on all pixels."""
+    """Fit a polynomial robustly to the chosen pixels and return its values on all pixels."""
     surface = evaluate(fit_terms(z, chosen, terms), z.shape)
     for weights_of in (_huber, _tukey):
         for _ in range(_MAX_ROUNDS):
@@ -95,9 +93,7 @@ def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
 
 
 def noise_sigma(residual: Array) -> float:
-    """Return 1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare
-    outliers.
-    """
+    """Return 1.4826 times the median absolute value: the sigma of Gaussian noise, even with rare outliers."""
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
@@ -121,12 +117,11 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
 
 
 def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
-    """Return weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), where P are the Legendre
-    polynomials.
+    """Return weighted least-squares coefficients c[q, p] of the Legendre products P_q(y) P_p(x).
 
-    x = 2 j / (nx - 1) - 1, and likewise for y. Any set of terms that contains all lower ones spans the same
-    polynomials in the Legendre basis as in powers, but far better conditioned. The moments are separable, so
-    the fit costs only a few thin matrix products.
+    x = 2 j / (nx - 1) - 1, and likewise for y. A set of terms that contains all lower terms spans the same
+    polynomials in the Legendre basis as in powers, and is far better conditioned. The moments are separable,
+    so the fit costs only a few thin matrix products.
 
     Args:
         z: (ny, nx); NaN only where the weight is zero.
@@ -149,7 +144,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
         )
     residual = np.where(weights > 0, z, 0.0)
     coefficients = np.zeros((basis_y.shape[1], basis_x.shape[1]))
-    # Under a badly conditioned mask, a second round removes the rounding error of the first.
+    # If the mask makes the fit badly conditioned, a second round removes the rounding error of the first.
     for _ in range(1 if scales[-1] <= _WELL_CONDITIONED * scales[0] else 2):
         right = (basis_y.T @ (weights * residual) @ basis_x)[q, p]
         step = np.zeros_like(coefficients)
@@ -160,7 +155,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
 
 
 def evaluate(coefficients: Array, shape: Shape) -> Array:
-    """Return the surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
+    """Return the surface (ny, nx) that belongs to coefficients from ``fit_terms``."""
     basis_y, basis_x = (_basis(n, k - 1) for n, k in zip(shape, coefficients.shape, strict=True))
     return basis_y @ coefficients @ basis_x.T
 

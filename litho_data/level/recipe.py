@@ -30,8 +30,8 @@ else:
 class Recipe(BaseModel):
     """Levelling steps in the order in which they are applied; an unknown key is an error.
 
-    In TOML each step is a table ``[[step]]`` with its operation as ``op``; in Python it is one of
-    ``STEPS``.
+    In TOML, each step is a table ``[[step]]`` whose key ``op`` names the operation. In Python, each step is
+    an instance of one of ``STEPS``.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/recipe/1"
@@ -43,10 +43,11 @@ class Recipe(BaseModel):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a recipe.
+        """Read a recipe from a TOML file.
 
         Raises:
-            InputError: no such file, no TOML, no step, an unknown operation or key, a value out of range.
+            InputError: the file does not exist, is not TOML, contains no step, has an unknown operation or
+                key, or has a value out of range.
         """
         content = parsed(Path(path), tomllib.loads, f"cannot read recipe {path}", "a TOML file")
         recipe = cls.from_dict(content, source=str(path))
@@ -56,9 +57,7 @@ class Recipe(BaseModel):
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:
-        """Make a recipe from plain tables: those of TOML, or ``canonical()``; raise InputError if one is
-        wrong.
-        """
+        """Make a recipe from plain tables, as TOML or ``canonical()`` gives them; refuse wrong ones."""
         tables = dict(content)
         if tables.pop("schema", cls.SCHEMA) != cls.SCHEMA:
             raise InputError(f"recipe {source}: schema", got=repr(content["schema"]), wanted=repr(cls.SCHEMA))
@@ -68,7 +67,7 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Return everything that determines the result, with all defaults; ``from_dict`` reads it."""
+        """Return everything that determines the result, including all defaults, for ``from_dict``."""
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
     def apply(
@@ -79,17 +78,17 @@ class Recipe(BaseModel):
         mask: Array | None = None,
         layout_level: Array | None = None,
     ) -> Levelled:
-        """Level a scan. ``height + removed`` is the input, and both are NaN where nothing was measured.
+        """Level a scan, so that ``height + removed`` is the input; both are NaN where nothing was measured.
 
         Args:
             scan: a ``Scan``, whose pitch and mask are used, or heights (ny, nx) in µm.
-            pitch_um: (y, x), only for plain heights.
-            mask: bool (ny, nx), takes the place of the scan's mask.
-            layout_level: (ny, nx) levels in the scan's frame, NaN outside the layout; needed by
-                ``layout-aware`` steps only.
+            pitch_um: (y, x) pitch, used only if ``scan`` is an array of heights.
+            mask: bool (ny, nx), used instead of the scan's mask.
+            layout_level: (ny, nx) levels in the scan's frame, NaN outside the layout; needed only by
+                ``layout-aware`` steps.
 
         Raises:
-            InputError: a step that lacks what it needs, or data that it cannot be applied to.
+            InputError: a step lacks something that it needs, or cannot be applied to the data.
         """
         if isinstance(scan, Scan):
             heights, mask, pitch_um = scan.height_um, scan.mask if mask is None else mask, scan.pitch_um
@@ -103,9 +102,7 @@ class Recipe(BaseModel):
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
-        """Return the result of ``apply``, with the warnings of its steps as texts instead of Python
-        warnings.
-        """
+        """Return the result of ``apply``, and the warnings of its steps as a list of texts."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)
             levelled = self.apply(scan, **arguments)

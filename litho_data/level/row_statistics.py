@@ -1,4 +1,4 @@
-"""Compute one number per row: trimmed mean or modus of the selected values."""
+"""Compute the trimmed mean or the modus of the selected values of each row."""
 
 import numpy as np
 
@@ -6,22 +6,21 @@ from litho_data.foundation import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Heights in metres are rounded to this many digits. Files state fewer digits, and rounding errors of unit
-# conversions affect only later digits.
+# Heights in metres are rounded to this many significant digits. Files state fewer, and the rounding errors of
+# unit conversions affect only later ones.
 _DECIMAL_DIGITS = 12
-# Powers of ten up to here are exact in a double.
+# Powers of ten up to this exponent are exact in double precision.
 _LARGEST_EXACT_POWER = 22
 
 
 def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
-    """Return the mean of sorted[t : n - t], t = floor(trim n + 0.5), for each row; if nothing is left,
-    sorted[n // 2].
+    """Return the mean of sorted[t : n - t], with t = floor(trim n + 0.5), for each row.
 
-    For even n this upper median differs from the mean of the two middle values. A row without selected values
-    gives 0.
+    If this range is empty, the result is the upper median sorted[n // 2], which for even n differs from the
+    mean of the two middle values. A row without selected values gives 0.
     """
     counts = chosen.sum(axis=1)
-    # Unselected values are sorted behind all others.
+    # Sorting places unselected values after all others.
     ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
     cut = np.floor(trim * counts + 0.5).astype(int)
     first = np.where(2 * cut >= counts, counts // 2, cut)
@@ -32,12 +31,12 @@ def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
 
 
 def row_modus(values: Array, chosen: Array) -> Array:
-    """Return the mean of the middle third of the shortest window that contains round(sqrt n) sorted values.
+    """Return the modus of each row: the mean of the middle third of the row's shortest window.
 
-    Below 9 values the result is the upper median, and for a row without selected values it is 0. Windows of
-    heights with few digits often have equal length. Gwyddion takes the one that is shortest in metres. Values
-    (µm) are therefore compared in metres, rounded to 12 digits, so that the unit of the file does not change
-    the choice.
+    A window contains round(sqrt n) sorted values. With fewer than 9 values, the result is the upper median;
+    without selected values, it is 0. If heights have few digits, windows often have equal lengths. Gwyddion
+    chooses the window that is shortest in metres. Values (µm) are therefore compared in metres, rounded to 12
+    digits, so that the unit of the file does not affect the choice.
     """
     return np.array([_modus(np.sort(row[use])) for row, use in zip(values, chosen, strict=True)])
 
@@ -52,7 +51,7 @@ def _modus(ordered: Array) -> float:
 
 
 def _decimal_metres(height_um: Array) -> Array:
-    """Return the doubles that would have been read from a file in metres with up to 12 digits."""
+    """Return the doubles that a file in metres with up to 12 significant digits would have given."""
     metres = height_um * METRE_PER_UM
     with np.errstate(divide="ignore"):
         exponent = np.nan_to_num(np.floor(np.log10(np.abs(metres))), neginf=0.0)

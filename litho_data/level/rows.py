@@ -1,4 +1,4 @@
-"""Align rows with the definitions of Gwyddion's Align Rows."""
+"""Align the rows of a scan by the methods of Gwyddion's Align Rows."""
 
 import warnings
 from typing import Annotated, Literal
@@ -28,7 +28,7 @@ _SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
 class LevellingWarning(UserWarning):
-    """Warns that a step may have removed part of the print."""
+    """Warning that a levelling step may have removed part of the print."""
 
 
 @operation("align-rows")
@@ -43,23 +43,24 @@ def align_rows(
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Align the rows of a scan, and warn if lines were shifted because of the print.
+    """Align the rows of a scan, and warn if the print seems to have caused some of the shifts.
 
     Args:
         z: (ny, nx), µm. ``"matching"`` and ``"modus"`` require this unit, because both convert to metres as
-            Gwyddion does: the weights of ``"matching"`` compare a squared height with a height, and
+            Gwyddion does. The weights of ``"matching"`` compare a squared height with a height, and
             ``"modus"`` chooses between equally short windows.
-        method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
-            the two ``-of-differences`` and ``matching`` add up steps between neighbouring rows, which
-            keeps large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
-            the prevailing slope of each row, found in up to 30 passes.
+        method: ``median``, ``trimmed-mean`` and ``modus`` make this statistic equal for all rows. The two
+            ``-of-differences`` methods and ``matching`` add up the steps between neighbouring rows, which
+            preserves large features. ``polynomial`` fits each row separately. ``facet-tilt`` removes the
+            prevailing slope of each row, found in up to 30 passes.
         direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
         degree: degree of the polynomial, 0 to 5.
-        trim: fraction cut at each end by the trimmed means, 0 to 0.5; 0.5 is the median.
-        pitch_um: (y, x), needed by ``facet-tilt`` only.
+        trim: fraction that the trimmed means cut at each end, 0 to 0.5; 0.5 is the median.
+        pitch_um: (y, x) pitch, needed only by ``facet-tilt``.
 
     Raises:
-        InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
+        InputError: the method or direction is unknown, the degree or trim is outside its range, or the pitch
+            is missing.
     """
     upright = direction == "horizontal"
     lines, usable = (z, chosen) if upright else map(np.ascontiguousarray, (z.T, chosen.T))
@@ -69,7 +70,7 @@ def align_rows(
     match method:
         case "facet-tilt":
             if pitch_um is None:
-                raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
+                raise InputError("align-rows by facet-tilt needs the pixel pitch", wanted="pitch_um")
             tilts = _facet_tilts(lines, usable, pitch_um[1 if upright else 0])
             removed = np.multiply.outer(tilts, _centred(lines.shape[1]))
         case "polynomial" if degree > 0:
@@ -90,15 +91,15 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """Return a warning if an alignment shifted lines although many of their pixels have the height of the
-    neighbouring line; otherwise an empty text.
+    """Return a warning if an alignment shifted lines that seem to have no offset, else an empty text.
 
-    A real offset moves all pixels of a line. The alignment is suspect if it shifted a line relative to its
-    neighbour by far more than the noise although many pixels of the two lines agree. In that case, a
-    structure caused the difference in the other pixels.
+    A real offset shifts all pixels of a line. The alignment is suspect if it shifted a line relative to its
+    neighbour by far more than the noise, although many pixels of the two lines had about the same height. The
+    difference in the other pixels is then part of a structure.
 
     Args:
-        z: (ny, nx) before alignment; ``removed``: what was subtracted from it; lines are rows in both.
+        z: (ny, nx) before alignment; its rows are the lines.
+        removed: (ny, nx) surface that the alignment subtracted.
     """
     steps, shifts = np.diff(z, axis=0), np.diff(removed, axis=0)
     noise = _SIGMA_PER_MAD * float(np.nanmedian(np.abs(steps - np.nanmedian(steps, axis=1, keepdims=True))))
@@ -108,14 +109,12 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
     if stayed[worst] < _STAYED:
         return ""
     size = float(np.nanmax(np.abs(shifts[stayed >= _STAYED])))
-    shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
-    return f"{shifted} did not move, so part of the print may be removed"
+    shifted = f"lines were shifted by up to {size:.3g} µm, although {stayed[worst]:.0%} of a line's pixels"
+    return f"{shifted} had no offset from the next line, so part of the print may be removed"
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """Return the statistics of the rows with mean zero; rows with too few pixels take the median of the whole
-    map.
-    """
+    """Return the shifts of the rows, with mean zero; a row with too few pixels gets the median of the map."""
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
     return shifts - shifts.mean()
@@ -131,10 +130,10 @@ def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
 
 
 def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
-    """Return the weighted mean steps between rows.
+    """Return the shifts of the rows, summed from weighted mean steps between neighbouring rows.
 
     Args:
-        last_column_counts: use the last column whatever the mask says, as in Gwyddion's include mode.
+        last_column_counts: use the last column regardless of the mask, as in Gwyddion's include mode.
     """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
     usable = chosen[1:] & chosen[:-1]
@@ -151,8 +150,9 @@ def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array
 
 
 def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
-    """Return the fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds
-    back.
+    """Return the polynomial fit of each row, minus the mean of all measured pixels, masked or not.
+
+    Gwyddion also adds this mean back.
     """
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
     fitted = np.zeros(z.shape)
@@ -163,9 +163,7 @@ def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
 
 
 def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
-    """Return the slope per pixel of the prevailing facet of each row, from neighbours that are both
-    selected.
-    """
+    """Return the slope per pixel of each row's prevailing facet, from pairs of selected neighbours."""
     slopes, both = np.diff(z, axis=1) / pitch_um, chosen[:, 1:] & chosen[:, :-1]
     tilts = np.zeros(len(z))
     for i in np.flatnonzero(both.sum(axis=1) >= _FEWEST_SLOPES):
@@ -175,7 +173,7 @@ def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
 
 
 def _fewest(lines: Array) -> int:
-    """Return the smallest number of selected values from which a row is estimated by itself."""
+    """Return the smallest number of selected values from which a row's shift is estimated."""
     return int(np.log(lines.shape[1]) + 1.5)
 
 

@@ -1,6 +1,4 @@
-"""Level one scan: return levelled heights and removed surface in memory, or write them as files with a
-record.
-"""
+"""Level one scan, and return the levelled heights and the removed surface or write them to files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,7 @@ _DIMS = ("y", "x")
 
 
 class LevelRecord(RunFacts, Result):
-    """What was levelled and how, and the result; stored beside the levelled file as ``<file>.json``."""
+    """Source, recipe and results of a levelling, stored beside the levelled file as ``<file>.json``."""
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
     FILE_NAME: ClassVar[str] = "level.json"
@@ -37,13 +35,13 @@ class LevelRecord(RunFacts, Result):
 
 
 def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
-    """Level a scan by a recipe, or by the recipe in a TOML file.
+    """Level a scan by a recipe, given as an object or as a TOML file.
 
     Returns:
         The scan with levelled heights, and the removed surface, (ny, nx) µm; their sum is the input.
 
     Raises:
-        InputError: a bad recipe, or a step that cannot be applied.
+        InputError: the recipe is invalid, or a step cannot be applied.
     """
     steps = recipe if isinstance(recipe, Recipe) else Recipe.from_toml(recipe)
     levelled, removed = steps.apply(scan)
@@ -59,7 +57,7 @@ def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
         out: a ``.gsf`` or ``.npy`` file.
 
     Raises:
-        InputError: a step that cannot be applied, or another suffix.
+        InputError: a step cannot be applied, or ``out`` has another suffix.
     """
     levelled, removed = recipe.apply(scan)
     target = Path(out)
@@ -90,13 +88,13 @@ def write_heights(
     pitch_um: YX | None,
     title: str = "",
 ) -> Path:
-    """Write a height map in the format of its suffix.
+    """Write a height map in the format that the file's suffix names.
 
-    ``.gsf`` holds float32 metres with size and title, and opens in Gwyddion; ``.npy`` holds
-    float64 µm and nothing else. Missing pixels are NaN in both.
+    A ``.gsf`` file contains float32 metres with size and title, and opens in Gwyddion. A ``.npy`` file
+    contains only float64 µm. Missing pixels are NaN in both.
 
     Raises:
-        InputError: another suffix.
+        InputError: the file has another suffix.
     """
     file = Path(path)
     if file.suffix not in SUFFIXES:

@@ -1,4 +1,4 @@
-"""Find and remove scars: short strokes along the fast axis where the feedback lost the surface."""
+"""Find and remove scars, which are short streaks along the fast axis where the feedback lost the surface."""
 
 from functools import wraps
 from typing import Annotated, Any, Literal
@@ -27,22 +27,23 @@ def mark_scars(
     max_width_px: Count = 4,
     sign: ScarSign = "both",
 ) -> Array:
-    """Mark strokes along the rows that stand out from the rows above and below.
+    """Mark scars: streaks along the rows that stand out from the rows above and below.
 
-    A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel and the
-    higher of the two pixels that bound it above and below; for negative strokes the mirror image applies. The
-    unit is rms = sqrt(sum of squared differences between rows / number of pixels). A run along a row counts
-    if it reaches ``high`` somewhere, stays above ``low`` and is at least ``min_length_px`` long.
+    A streak may be up to ``max_width_px`` rows wide. In each column, it stands out by the height of its
+    lowest pixel above the higher of the two pixels that bound it above and below. Negative streaks are found
+    in the same way in the negative map. The unit is rms = sqrt(sum of squared differences between rows /
+    number of pixels). A run along a row counts if it reaches ``high`` somewhere, never falls below ``low``
+    and is at least ``min_length_px`` long.
 
     Returns:
         bool (ny, nx); only selected pixels are marked.
 
     Raises:
-        InputError: thresholds or sizes outside their range, or an unknown sign.
+        InputError: a threshold or size is outside its range, or the sign is unknown.
     """
     if low > high:
         raise InputError(
-            "scar parameters", got=f"low {low}, high {high}", wanted="low that does not exceed high"
+            "scar parameters", got=f"low {low} and high {high}", wanted="a low that does not exceed high"
         )
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
@@ -59,11 +60,11 @@ def mark_scars(
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
-    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All other pixels
-    keep exactly their values, and ``removed`` is zero there.
+    Laplace's equation is solved inside the marked areas; the border of the image counts as insulated. All
+    other pixels keep exactly their values, and ``removed`` is zero there.
 
     Raises:
-        InputError: marks of another shape, or a marked area without any measured neighbour.
+        InputError: the marks have another shape, or a marked area has no measured neighbour.
     """
     z = as_height(height)
     if scars.shape != z.shape or scars.dtype != np.bool_:
@@ -82,7 +83,7 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
-    """Return by how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
+    """Return how far each pixel stands out as part of a ridge that is at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
     for width in range(1, min(max_width_px, ny - 2) + 1):
@@ -107,8 +108,9 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Return the values of the unknown pixels, in the order of ``z[unknown]``. The equation is solved over
-    the unmeasured pixels as well.
+    """Return harmonic values for the unknown pixels, in the order of ``z[unknown]``.
+
+    Laplace's equation is solved over the unmeasured pixels as well.
     """
     from SurfaceTopography import Topography
 

@@ -10,10 +10,11 @@ Masking = Literal["ignore", "exclude", "include"]
 
 
 class Levelled(NamedTuple):
-    """A levelled map and the surface removed; ``height + removed`` is the input.
+    """A levelled map and the removed surface; ``height + removed`` is the input.
 
-    Both maps are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``.
-    ``removed`` is a number everywhere, and may be a read-only view if it is constant along an axis.
+    Both maps are float64 (ny, nx) in the unit of the input. Pixels that are NaN in the input are NaN in
+    ``height``. ``removed`` is a number everywhere, and may be a read-only view if it is constant along an
+    axis.
     """
 
     height: Array
@@ -21,7 +22,7 @@ class Levelled(NamedTuple):
 
 
 class MaskedLevelling(NamedTuple):
-    """A levelled map, and the features that were left out."""
+    """A levelled map, and the mask of the features that were excluded."""
 
     levelled: Levelled
     mask: Array
@@ -31,7 +32,7 @@ def as_height(height: Array) -> Array:
     """Return the map as a contiguous float64 array (ny, nx).
 
     Raises:
-        InputError: not two-dimensional or below 2 x 2 pixels.
+        InputError: the map is not two-dimensional, or is smaller than 2 x 2 pixels.
     """
     z = np.ascontiguousarray(height, dtype=float)
     if z.ndim != 2 or min(z.shape) < 2:
@@ -40,10 +41,10 @@ def as_height(height: Array) -> Array:
 
 
 def select(z: Array, mask: Array | None, masking: Masking) -> Array:
-    """Select the pixels that an operation may use, bool (ny, nx); unmeasured pixels (NaN) are never selected.
+    """Return the pixels that an operation may use, bool (ny, nx), which never include unmeasured (NaN) ones.
 
     Raises:
-        InputError: a mask that is not boolean or has another shape, or a selection without any pixel.
+        InputError: the mask is not boolean or has another shape, or no pixel is left.
     """
     chosen = np.isfinite(z)
     if mask is not None and masking != "ignore":
@@ -51,7 +52,7 @@ def select(z: Array, mask: Array | None, masking: Masking) -> Array:
             raise InputError("mask", got=f"{mask.dtype} {mask.shape}", wanted=f"bool {z.shape}")
         chosen &= ~mask if masking == "exclude" else mask
     if not chosen.any():
-        raise InputError("no pixel is left to level with", wanted="a mask that leaves measured pixels")
+        raise InputError("no pixel is left for levelling", wanted="a mask that leaves measured pixels")
     return chosen
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import zarr
 
-# The group that lists the scans for tools of OME-Zarr.
+# The group that lists the scans for OME-Zarr tools.
 IMAGES = "o"
 
 
@@ -56,7 +56,7 @@ def assemble(
     """Write everything except the groups ``scans/<id>``, which already exist; return the dataset's hash.
 
     Args:
-        root: the growing group.
+        root: the group of the store that is being written.
         records: records of the finished scans, sorted by id, including references (``use`` other than
             dataset).
         load: the arrays of an id on the layout grid.
@@ -123,9 +123,7 @@ def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> d
 
 
 def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.DataFrame) -> dict[str, Any]:
-    """Return the manifest without its table of files: the card as it was understood, and hashes of the
-    tables.
-    """
+    """Return the manifest without its table of files: the card as it was parsed, and hashes of the tables."""
     content = {
         "card": source.card.model_dump(mode="json", exclude_none=True),
         "recipe": dict(source.recipe),
@@ -138,7 +136,7 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return one row per scan of the dataset; a figure that could not be computed is NaN."""
+    """Return one row per scan of the dataset; a value that could not be computed is NaN."""
     import pandas as pd
 
     rows = []
@@ -206,7 +204,7 @@ def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[s
     """Return one row per raw file, sorted by id.
 
     Args:
-        source: the files by id and recorded name, and which have no partner.
+        source: the files by id and recorded name, and the ids without a partner.
         records: records of the finished scans, by id.
         skipped: per id, why it is not in the store.
 
@@ -250,7 +248,7 @@ def _used_sha256(record: Facts, name: str) -> str:
 
 
 def _facts(record: Facts | None, name: str) -> dict[str, Any]:
-    """Return what the reader says about a scan file; nothing for a layout."""
+    """Return what the reader says about a scan file; return an empty dict for a layout."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

@@ -29,8 +29,8 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# If a scan's aspect ratio of pixels differs by more than this from that of other scans, rows or columns are
-# missing.
+# If the aspect ratio of a scan's pixels differs by more than this from that of most scans, rows or columns
+# are missing.
 _ASPECT_TOLERANCE = 1e-3
 _MOST_SEARCHES = 2000
 
@@ -57,16 +57,16 @@ def build_dataset(
         card_path: the dataset card.
         out: folder of the store; an older store there is replaced.
         data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
-            user cache, whichever has them.
+            user cache, whichever has the files.
         workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
-        strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
+        strict: refuse to build if any scan has to be skipped, or if a scan or layout has no partner.
         seed: seed of the robust registration.
-        tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans; it replaces the
-            card's. Pixels that the tip may not have touched become invalid.
+        tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans; it replaces the
+            card's value. Pixels that the tip may not have touched become invalid.
 
     Raises:
-        InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, a tip that is no
-            radius, or something at ``out`` that is no store.
+        InputError: the card is bad, no scan is usable, an id is skipped or unpaired under ``strict``, ``tip``
+            is not a radius, or ``out`` is something other than a store.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:
@@ -105,7 +105,7 @@ def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> 
 
 
 def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
-    """Run the jobs of a source and put the store and its report in their places; see ``build_dataset``."""
+    """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
         root = partial.open()
@@ -191,15 +191,15 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """Find which other layout of the set the unregistered scans show, and add it to the reasons in
+    """Find which other layout of the set each unregistered scan shows, and add it to the reasons in
     ``skipped``.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    # Several ids may share a layout, if it was printed or its print was scanned more than once. The layout
-    # gets the name of its first id.
+    # Several ids may share a layout, namely if it was printed or its print was scanned more than once. The
+    # layout gets the name of its first id.
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
     # One search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
@@ -217,8 +217,8 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
-    """Find scans whose aspect ratio of pixels differs from that of most scans, if the card states the size,
-    not the file.
+    """If the card states the size of the scans, find scans whose pixels have another aspect ratio than those
+    of most scans.
 
     A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
     """
@@ -232,7 +232,7 @@ def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
     odd = {key: value for key, value in aspects.items() if abs(value / most - 1) > _ASPECT_TOLERANCE}
     if 2 * len(odd) >= len(aspects):
         return {}
-    reason = "pixel sides y/x {:.4g} where most scans have {:.4g}: rows or columns are missing"
+    reason = "aspect ratio y/x of the pixels {:.4g}, but {:.4g} in most scans: rows or columns are missing"
     return {key: reason.format(value, most) for key, value in odd.items()}
 
 
@@ -257,7 +257,9 @@ def _require_enough(
         raise InputError(
             f"{out} was not built: {len(left_out)} ids cannot be used",
             got=shown,
-            wanted="all ids usable, because of --strict",
+            wanted="all ids to be usable, because of --strict",
         )
     if not records_of_use(list(records.values())):
-        raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")
+        raise InputError(
+            f"{out} was not built: no scan can be used", got=shown, wanted="at least one good scan"
+        )

@@ -21,16 +21,18 @@ _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """Return the scales that a build of the card would apply: those of ``y``, ``x`` and ``z`` that it
-    calibrates.
+    """Return the scales that a build of the card would apply, for those of ``y``, ``x`` and ``z`` that the
+    card calibrates.
 
     Raises:
-        InputError: a card without ``[calibration]``, a missing file, or a scan that shows no grating or step.
+        InputError: the card has no ``[calibration]``, a file is missing, or a scan shows no grating or step.
     """
     listing = list_fields(card_path, data_dir)
     standards = standards_of(listing)
     if not standards.described:
-        raise InputError(f"card {card_path}", got="no [calibration]", wanted="x, y or z in that table")
+        raise InputError(
+            f"card {card_path}", got="no [calibration]", wanted="a table [calibration] with x, y or z"
+        )
     found = measure_scales(standards.described, list(standards.files.values()))
     named = {axis: Scale(factor=row[0], uncertainty=row[1]) for axis, row in zip(SCALES, found, strict=True)}
     return {axis: scale for axis, scale in named.items() if axis in standards.scales}
@@ -63,7 +65,7 @@ def standards_of(listing: Listing) -> Standards:
     """Return the standards of a card.
 
     Raises:
-        InputError: a file that is missing, or a link that leads out of the data folder.
+        InputError: a file is missing, or is a link that leads out of the data folder.
     """
     card = listing.card
     standards: list[dict[str, Any]] = []
@@ -76,7 +78,11 @@ def standards_of(listing: Listing) -> Standards:
         outside = leads_out((path,), listing.data_dir)
         if outside or not path.is_file():
             got = outside or f"no file {one.file}"
-            raise InputError(f"card {listing.card_path}: calibration.{scale}.file", got=got, wanted="a scan")
+            raise InputError(
+                f"card {listing.card_path}: calibration.{scale}.file",
+                got=got,
+                wanted="a scan in the data folder",
+            )
         files.setdefault(listing.relative(path), path)
         size = one.size_um or card.scan.size_um
         standards.append(
@@ -98,11 +104,11 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
-    """Measure factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 without a
-    standard.
+    """Return the factor and standard uncertainty of each scale, (3, 2) in the order of ``SCALES``; without a
+    standard, they are 1 and 0.
 
     Raises:
-        InputError: a scan that shows no grating or step of about the known size.
+        InputError: a scan shows no grating or step of about the known size.
     """
     # The result is cached, because every scan of a build asks for it.
     times = tuple(file.stat().st_mtime_ns for file in files)

@@ -27,7 +27,7 @@ _LOST = 0.1
 
 class Edges(NamedTuple):
     """``distance_px`` (ny, nx) is the distance from the nearest edge, positive on the film; ``sigma_px`` is
-    its sd at a pixel.
+    its standard deviation at a pixel.
 
     ``specks``, bool (ny, nx), marks dots and pinholes of at most 40 px, which are ignored.
     """
@@ -41,7 +41,7 @@ def find_edges(grey: Array) -> Edges:
     """Find the edges of the film in a micrograph (ny, nx), to a fraction of a pixel.
 
     Raises:
-        InputError: a picture without edges.
+        InputError: the picture has no edges.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
     from scipy.spatial import cKDTree
@@ -50,7 +50,7 @@ def find_edges(grey: Array) -> Edges:
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
-    # The threshold is on logarithms, so that bright rims and charging count for less.
+    # The threshold is applied to logarithms, so that bright rims and charging count for less.
     logarithm = np.log(smooth + _DARKEST)
     first = logarithm > threshold_otsu(logarithm)
     film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)
@@ -87,8 +87,8 @@ def _dense(line: Array) -> Array:
 
 
 def coverage(distance_um: Array, pitch_um: float) -> Array:
-    """Return the share of each pixel that film covers, 0 to 1, from the signed distance of its centre from an
-    edge.
+    """Return the share of each pixel (0 to 1) that film covers, given the signed distance of the pixel's
+    centre from an edge.
     """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 

@@ -11,8 +11,8 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs with the radius in place of ``blind``, or without a tip if the scans set no bound on
-    it.
+    """Return the jobs with the radius in place of ``blind``, or without a tip if the scans do not limit its
+    radius.
 
     The result is also printed on stderr. Scans that cannot be read are left out; their jobs report why.
     """
@@ -23,7 +23,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
     tip = of_one_tip(found) if found else None
     radius_um = None if tip is None else tip.radius_um
     if tip is None or radius_um is None:
-        print("tip: no scan sets a bound on its radius, so no pixel is left out", file=sys.stderr)
+        print("tip: no scan limits its radius, so no pixel is left out", file=sys.stderr)
     elif tip.reason:
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:
@@ -37,8 +37,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """Estimate the tip from one scan, in calibrated lengths if there are standards; return None if
-    unreadable.
+    """Estimate the tip from one scan, in calibrated lengths if there are standards; return None if the scan
+    cannot be read.
     """
     try:
         chain = job.begin()

@@ -13,7 +13,7 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """One scan of a grating; figures that the scan does not show are None, and ``problem`` says why.
+    """One scan of a grating. Values that the scan does not show are None, and ``problem`` says why.
 
     Args:
         scale_x, scale_y: factors for stated lengths; ``_sd``: their standard uncertainties.
@@ -37,7 +37,9 @@ class GratingScan(Record):
 
 
 def grating_scans(store: Store) -> list[GratingScan]:
-    """Measure the gratings among a store's references with fast axis x, in the scans as they were read."""
+    """Measure the gratings among a store's references in the scans as they were read, with x as the fast
+    axis.
+    """
     known = store.manifest.get("card", {}).get("grating")
     if known is None:
         return []

@@ -25,11 +25,12 @@ def height_sigma(
     fast_axis: Axis = "x",
     z_uncertainty: float = 0.0,
 ) -> tuple[Array, Mapping[str, float]]:
-    """Return the standard uncertainty of registered heights, apart from the offset of the scan.
+    """Return the standard uncertainty of registered heights, not including that of the scan's offset.
 
-    The variance is a sum of six parts: white noise of pixels, and of lines, after resampling; the error of
-    the resampling itself; the slope times the uncertainty of the warp; the surface that levelling left or
-    wrongly removed; and the uncertainty of the z scale times the height relative to the scan's mean.
+    The variance is a sum of six parts: the white noise of pixels and that of lines, both after resampling;
+    the error of the resampling itself; the slope times the uncertainty of the warp; the surface that
+    levelling left or wrongly removed; and the uncertainty of the z scale times the height relative to the
+    scan's mean.
 
     Args:
         levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
@@ -86,7 +87,7 @@ def _resampling_nm2(
         spectrum = psd_along(filled, pitch_um, axis)
         white_nm2 = pixel_nm**2 + (line_nm**2 if axis != fast_axis else 0.0)
         error = np.interp(spectrum.frequency_per_um, *transfer_error(pitch_um, layout_pitch_um))
-        # The density is one-sided, so that of white noise of variance s² is 2 s² times the pitch.
+        # The density is one-sided, so the density of white noise with variance s² is 2 s² times the pitch.
         lost += float(((spectrum.density - 2 * pitch_um * white_nm2) * error).sum()) * float(
             spectrum.frequency_per_um[0]
         )

@@ -1,5 +1,5 @@
-"""One unit of work of a build: from a field's files to a finished part of the store, or a reason for skipping
-the field.
+"""One unit of work of a build, which turns a field's files into a finished part of the store or into a reason
+for skipping the field.
 
 Jobs are sent to other processes and machines, so they contain only paths and plain parameters.
 """
@@ -19,8 +19,8 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Width of the rim of level 0 around a field that is alone on the substrate. Models extend the outermost
-# levels of a layout, so that the rim makes them extend level 0.
+# Width, in pixels, of the rim of level 0 around a field that is alone on the substrate. Models extend the
+# outermost levels of a layout, so the rim makes them extend level 0.
 _BARE_PX = 2
 # Film in a gap of the layout is dirt if it is farther than this (px) from the layout's edges. Bare ground
 # that far inside the layout's film is a pit.
@@ -84,7 +84,7 @@ class FieldJob:
         return record_sha256([*plan, files, code])
 
     def layout(self) -> Array | None:
-        """Return the levels of the layout; None if the field has no layout that can be read."""
+        """Return the levels of the layout; return None if the field has no readable layout."""
         chain = Chain()
         try:
             self._read_layout(chain)
@@ -109,7 +109,7 @@ class FieldJob:
     def register_params(self, chain: Chain) -> dict[str, Any]:
         """Return the parameters for the registration of the scan that was read."""
         pitches = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
-        # If the fast axis is unknown, the lines are taken as rows.
+        # If the fast axis is unknown, the lines are assumed to be rows.
         lines = {"fast_axis": "y"} if chain.read["fast_axis"] == "y" else {}
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 

@@ -1,6 +1,6 @@
 """The operations that turn raw files into a dataset: pure functions of recorded parameters and inputs.
 
-A build runs these operations, and ``replay`` repeats them from the record. Only they make stored arrays.
+A build runs these operations, and ``replay`` repeats them from the record. No other code makes stored arrays.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# If the aspect ratio of the pixels exceeds this, the message of a failed registration asks whether rows are
-# missing.
+# If the aspect ratio of the pixels differs from 1 by more than this, the message of a failed registration
+# asks whether rows are missing.
 _OBLONG = 0.01
 
 
@@ -67,7 +67,7 @@ def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     stated = {name: params[name] for name in ("grey_per_level", "average_px") if name in params}
     level = read_layout(files[0], levels=params["levels"], **stated)
     if level.max() >= params["levels"]:
-        wanted = f"at most {params['levels'] - 1}, since the card says levels = {params['levels']}"
+        wanted = f"at most {params['levels'] - 1}, because the card says levels = {params['levels']}"
         raise InputError(f"layout {files[0]}: highest level", got=int(level.max()), wanted=wanted)
     return {"mask_level": np.pad(level, params.get("bare_px", 0))}, {}
 
@@ -107,7 +107,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, as the height map that will be registered."""
+    """Find the edges of the film, and make from them the height map that will be registered."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -211,7 +211,7 @@ def _require_found(found: Registration, params: Params, when: str = "") -> None:
     if not found.quality.passed:
         pitch_y_um, pitch_x_um = params["scan_pitch_um"]
         oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
-        pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
+        pixels = f"the pixels are {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
         raise InputError(f"{UNREGISTERED}{when}: {found.quality.reason}", hint=pixels if oblong else "")
 
 

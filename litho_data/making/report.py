@@ -38,7 +38,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
     store = open_store(store_path)
     page = Page(
         f"Dataset {store.name}",
-        "Raw scans read, levelled, registered onto their layouts and stored.",
+        "Raw scans were read, levelled, registered onto their layouts and stored.",
         facts={"dataset": store.sha256},
         words={key: words for table in _COLUMNS.values() for key, words in table.items()},
     )
@@ -66,8 +66,8 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
     page.tiles(tiles)
     page.paragraph(
         f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
-        "The hash of the dataset, below, covers layouts, heights, validity and transforms of all scans; "
-        "building again gives the same."
+        "The hash of the dataset (below) covers layouts, heights, validity and transforms of all scans; "
+        "building the dataset again gives the same hash."
     )
     assumed = store.manifest["assumptions"]
     page.note(*(f"Assumed, because the card does not say: {assumption}." for assumption in assumed))
@@ -86,7 +86,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     ]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and why. With --strict nothing is built if there are any"
+        caption = "Ids that are not in the store, and why. With --strict, nothing is built if there are any"
         page.table(rows, caption, "left_out.csv")
 
 
@@ -104,13 +104,14 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
         return
     page.heading("Quality of every scan, in numbers", folded=True)
     page.table(
-        shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
+        shown, "Registration and noise of every scan; quality.csv has all values", "summary.csv", digits=3
     )
     if "sigma_nm" in quality:
         page.table(
             quality[list(_COLUMNS["uncertainty"])],
-            "Parts of the uncertainty of the heights: root mean square over a scan, except for its "
-            "offset. z calibration is 0 if the card has none; the error of the z scale is then missing",
+            "Parts of the uncertainty of the heights, each as root mean square over a scan, without the "
+            "scan's offset. If the card has no z calibration, that part is 0, and the total lacks the "
+            "error of the z scale",
             "uncertainty.csv",
             digits=2,
         )
@@ -121,8 +122,8 @@ def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
         page.heading("Properties of the microscope from the grating")
         page.table(
             [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
-            "Scales, bow of a line and tip, from the known period of the grating; no other scan is "
-            "corrected by them",
+            "Scales, bow of a line and tip, measured with the known period of the grating; they are not "
+            "used to correct other scans",
             "gratings.csv",
             digits=4,
         )
@@ -132,7 +133,7 @@ def _pictures(page: Page, store: Store) -> None:
     page.heading("Every scan")
     ids = _shown_ids(store)
     if len(ids) < len(store):
-        page.note(f"The {len(ids)} scans with the lowest correlation with their layout, of {len(store)}.")
+        page.note(f"Of {len(store)} scans, the {len(ids)} that correlate least with their layouts are shown.")
     stages = [_stages(store, scan_id) for scan_id in ids]
     columns, pictures = [], []
     unit = "grey" if store.instrument == "sem" else "nm"
@@ -142,7 +143,7 @@ def _pictures(page: Page, store: Store) -> None:
         pictures.append([coloured_png(image, colours, low, high) for image in images])
     caption = (
         "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
-        "Residual: registered height minus the blurred layout, with the best gain and offset. "
+        "Residual: registered height minus the blurred layout, whose gain and offset are fitted. "
         "One colour scale per column."
     )
     page.gallery(columns, list(zip(ids, zip(*pictures, strict=True), strict=True)), caption)

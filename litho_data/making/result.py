@@ -9,7 +9,7 @@ from litho_data.store.schema import DatasetId
 
 
 class BuildResult(Result):
-    """The scans that a build made or left out; an earlier build finished the ``reused`` scans.
+    """The scans that a build made or left out; ``reused`` counts those that an earlier build had finished.
 
     ``skipped`` and ``unpaired`` map ids that are not in the store to the reasons. ``findings`` lists what to
     fix, worst first.

@@ -58,7 +58,7 @@ def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array
 
     Args:
         records: records of the scans of a dataset.
-        load: gives the arrays ``mask_level`` and ``height_um`` of an id.
+        load: returns the arrays ``mask_level`` and ``height_um`` of an id.
     """
     return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
 
@@ -118,7 +118,7 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans that another layout of the set explains better, under the warp onto their own
+    """Yield the scans that another layout of the set explains better, even with the warp onto their own
     layout.
     """
     for shape in {one.topography.shape for one in prints}:
@@ -131,13 +131,13 @@ def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
             own = found[next(k for k, other in enumerate(distinct) if other.layout == one.layout)]
             if found.max() > own + _BETTER:
                 best = distinct[int(found.argmax())].id
-                better = f"correlation {found.max():.3f}, own {own:.3f}"
+                better = f"correlation {found.max():.3f}, with its own layout {own:.3f}"
                 yield one.id, f"its heights fit the layout of {best} better: {better}"
 
 
 def _correlations(height: Array, layouts: Array) -> Array:
-    """Return the correlations of heights (pixels,), NaN where not measured, with layouts (n, pixels); 0 if
-    flat.
+    """Return the correlations of heights (pixels,) with layouts (n, pixels). NaN heights are ignored; flat
+    arrays have the correlation 0.
     """
     seen = np.isfinite(height)
     own, others = (one - one.mean(axis=-1, keepdims=True) for one in (height[seen], layouts[:, seen]))
@@ -147,14 +147,14 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield scans that are mirrored or rotated relative to their layout, unlike the other scans or unlike the
-    card says.
+    """Yield scans that are mirrored or rotated relative to their layout, unlike the other scans or contrary
+    to the card.
     """
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
     for one in (one for one in prints if not one.turned):
         if one.dihedral != usual and 2 * count > len(prints):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
-            what = "a mirror image of its layout" if mirrored else f"turned ({one.dihedral})"
+            what = "a mirror image of its layout" if mirrored else f"rotated ({one.dihedral})"
             yield one.id, f"{what}, unlike the other scans: is its layout file the right one?"
         elif one.dihedral in MIRRORED:
             yield one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"
@@ -180,8 +180,8 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
         nearest = min(middle, key=lambda group: abs(logs[k] - middle[group]))
         if off > _CLEAR_SIGMA * scatter and nearest != one.group:
             percent = 100 * np.expm1(logs[k] - middle[one.group])
-            text = f"height per level {percent:+.0f} % off that of the others of {one.group}, as in {nearest}"
-            yield one.id, f"{text}: is its id or dose the right one?"
+            text = f"height per level differs by {percent:+.0f} % from that of the others of {one.group}"
+            yield one.id, f"{text}, but agrees with {nearest}: is its id or dose the right one?"
     growth = np.array([one.response[1] for one in prints])
     rising = {
         group: (middle[group], int(members.sum()))
@@ -199,7 +199,7 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     the dose.
 
     Exposure is level times dose, so the curve g of the heights over the blurred levels T also shows what a
-    larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola
+    larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola,
     this is one plus the share of its square term in the slope; in a saturated print it is negative.
     """
     seen = np.isfinite(height)

@@ -68,7 +68,7 @@ class Operation:
 
     Args:
         name: as in the records.
-        version: changed whenever the function may give other results.
+        version: changed whenever the function may give different results.
         function: ``function(params, files, arrays) -> (arrays, facts)``.
         takes: names of the input arrays, in the order in which they are recorded; those that a scan lacks are
             left out.
@@ -94,10 +94,10 @@ class Operation:
         Args:
             params: explicit parameters, plain data.
             files: raw files by their recorded name, in the order that the operation expects.
-            arrays: by their name in the store; those that the operation takes are its inputs.
+            arrays: arrays by their name in the store; the operation uses only those that it takes.
 
         Raises:
-            InputError: anything wrong with the input, including a missing or unreadable file.
+            InputError: something is wrong with the input, for example a file is missing or unreadable.
         """
         arrays = {name: arrays[name] for name in self.takes if name in arrays}
         try:

@@ -1,4 +1,4 @@
-"""Find the levelling recipe after which the layout explains the heights of three scans of a card best."""
+"""Find the levelling recipe after which the layout best explains the heights of three scans of a card."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Suggestion:
 def suggest_recipe(
     card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None
 ) -> Suggestion:
-    """Compare recipes on three scans of a card; write the best recipe, a card that names it, and a page.
+    """Compare recipes on three scans of a card; write the best recipe, a card that uses it, and a page.
 
     A free response to the blurred layout is fitted to the levelled heights in half of the blocks of 16 px.
     The residual in the other half decides, because it contains both the tilt that a recipe leaves and the
@@ -90,7 +90,7 @@ def suggest_recipe(
         data_dir: folder of the raw files, as for ``build_dataset``.
 
     Raises:
-        InputError: a bad card, one of micrographs, or no scan that can be read and registered.
+        InputError: the card is bad or describes micrographs, or no scan can be read and registered.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
@@ -118,7 +118,7 @@ def suggest_recipe(
             pictures[job.id].append(height_um)
             warned |= {name: note} if note else {}
     if not pictures:
-        raise InputError("scans to compare recipes on", got=refusal, wanted="a scan that registers")
+        raise InputError("scans for comparing recipes", got=refusal, wanted="a scan that registers")
     usual = {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
     if not usual:
         raise InputError(
@@ -147,7 +147,7 @@ def _located(job: FieldJob) -> tuple[Array, Array]:
 
 
 def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
-    """Return the heights, and objections to the recipe; if the recipe cannot be applied, the heights are
+    """Return the heights and any warnings about the recipe; if the recipe cannot be applied, the heights are
     unchanged.
     """
     try:
@@ -197,10 +197,10 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
     from litho_data.reports.page import Page
 
     page = Page(
-        "Which levelling",
+        "Which levelling recipe",
         "Recipes compared on scans of the card, by the part of the heights that the layout does not explain.",
     )
-    page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
+    page.verdict(f"Level by the recipe \u201c{found.recipe}\u201d: build {found.card.name}.")
     rows = [
         {"recipe": name, **of} | ({"warning": found.warned.get(name, "")} if found.warned else {})
         for name, of in found.left_nm.items()

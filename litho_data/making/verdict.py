@@ -17,8 +17,8 @@ _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # If the scales of the scans agree with each other but not with 1, the pitch of the card is wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
-# Limit of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints have 2 with a rim
-# of substrate around the field, and 6 to 8 without a rim.
+# Largest accepted value of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints
+# have 2 with a rim of substrate around the field, and 6 to 8 without a rim.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # Largest residual of levelling, as a share of the print's own standard deviation.
@@ -57,7 +57,7 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
     usual = float(np.median(list(gains.values())))
     times = {name: gain / usual for name, gain in gains.items() if usual > 0}
     return {
-        name: f"height per level {_shown(one)} that of the others: is its unit the right one?"
+        name: f"its height per level is {_shown(one)} that of the others: is its unit right?"
         for name, one in times.items()
         if not 1 / _ODD_SCAN < one < _ODD_SCAN
     }
@@ -67,14 +67,14 @@ def require_heights(prints: Sequence[Print], card: Card) -> None:
     """Refuse a level height that has nothing to do with the prints, such as a wavelength in nm.
 
     Raises:
-        InputError: prints a hundred times higher or lower than their layouts say.
+        InputError: the prints are a hundred times higher or lower than their layouts say.
     """
     times = _height_times(prints, card)
     if times and not 1 / _IMPOSSIBLE < times < _IMPOSSIBLE:
         height_um = card.layout.level_height_um
         raise InputError(
             "layout.level_height_um",
-            got=f"{height_um:g} µm, where the prints rise by {times * height_um:.3g} µm per level",
+            got=f"{height_um:g} µm, but the prints rise by {times * height_um:.3g} µm per level",
             wanted="the height of one level in µm",
             hint="or is scan.unit wrong?",
         )
@@ -139,7 +139,7 @@ def _of_the_card(
     if times and not 1 / _TIMES < times < _TIMES:
         text = (
             f"the prints rise by {times * layout.level_height_um:.3g} µm per level, {_shown(times)} "
-            f"layout.level_height_um = {layout.level_height_um:g}: is that, or scan.unit, the right one?"
+            f"layout.level_height_um = {layout.level_height_um:g}: is this value or scan.unit wrong?"
         )
         yield ALL, text, Weight.HEIGHT
     scales = np.array([scale for one in records if (scale := _scale(one))])
@@ -147,25 +147,26 @@ def _of_the_card(
     for one in records:
         if (scale := _scale(one)) and abs(scale / usual - 1) > _ODD_SCALE:
             percent = 100 * (scale / usual - 1)
-            text = f"its scale is {percent:+.1f} % off that of the others: is its size the right one?"
+            text = f"its scale differs by {percent:+.1f} % from that of the others: is its size right?"
             yield one["id"], text, Weight.PITCH
     if abs(usual - 1) > _OFF and float(np.median(np.abs(scales - usual))) < _ALIKE:
         text = (
-            f"the scans are {100 * (usual - 1):+.1f} % off in scale: layout.pitch_um = {layout.pitch_um:g} "
-            f"fits as {layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
+            f"the scale of the scans is {100 * (usual - 1):+.1f} % off: "
+            f"layout.pitch_um = {layout.pitch_um:g} should be {layout.pitch_um / usual:.4g}, "
+            "or the sizes of the scans are wrong"
         )
         yield ALL, text, Weight.PITCH
     edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
     if edge_times > _EDGE_TIMES:
         text = (
             f"their outermost pixels deviate {edge_times:.0f} times as much from their layouts as the rest: "
-            "set write.surround to substrate if level 0 continues around a field, else to unknown, which "
-            "leaves these pixels out"
+            "set write.surround to substrate if level 0 continues around a field, otherwise to unknown, "
+            "which excludes these pixels"
         )
         yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
     if 2 * highest < layout.levels - 1:
-        text = f"the layouts use no level above {highest:g}, layout.levels = {layout.levels}"
+        text = f"the layouts use no level above {highest:g}, but layout.levels = {layout.levels}"
         yield ALL, text, Weight.HEIGHT
 
 

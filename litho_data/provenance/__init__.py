@@ -1,1 +1,1 @@
-"""Find where every array comes from: history, verification, replay."""
+"""Trace the origin of every array of a store: list its history, verify it, and replay it."""

@@ -1,6 +1,4 @@
-"""Find where the arrays of a scan come from: ``history`` lists the recorded steps, ``replay`` runs them
-again.
-"""
+"""Trace the origin of a scan's arrays: ``history`` lists the recorded steps, and ``replay`` reruns them."""
 
 from __future__ import annotations
 
@@ -26,13 +24,13 @@ Recorded = dict[str, list[tuple[str, Step]]]
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
-    """Return the chain of one scan as text, from the raw files to the arrays, with all parameters and hashes.
+    """Return the steps of one scan as text, from the raw files to the arrays, with parameters and hashes.
 
-    Without a scan, the text has one line per scan, from its raw files through the operations to its
-    registered height.
+    If no scan is given, the text has one line per scan. Each line leads from the raw files through the
+    operations to the scan's last array.
 
     Raises:
-        InputError: no such store or scan.
+        InputError: there is no such store or scan.
     """
     store = open_store(store_path)
     recorded = read_steps(store)
@@ -71,7 +69,7 @@ def read_steps(store: Store) -> Recorded:
     """Return the recorded steps of every scan in order, each with its recorded id.
 
     Raises:
-        InputError: a store without provenance, or a record that is no JSON.
+        InputError: the store has no provenance, or a record is invalid.
     """
     steps: Recorded = {}
     for row in read_table(group_of(store.root, "provenance"), "scan").to_dict("records"):
@@ -91,10 +89,10 @@ def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
 
 
 def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
-    """Find the folder of the raw files of a store; return None if they cannot be found.
+    """Find the folder of a store's raw files; return None if it cannot be found.
 
     Raises:
-        InputError: ``data_dir`` is given but is no folder.
+        InputError: ``data_dir`` is given but is not a folder.
     """
     if data_dir is not None:
         return require_folder(data_dir)
@@ -119,7 +117,7 @@ def stored_array(store: Store, scan_id: str, name: str) -> Array | None:
     Return None for the layout of a reference scan, which is not stored.
 
     Raises:
-        InputError: no such array, or a stored chunk that does not decode.
+        InputError: there is no such array, or a stored chunk cannot be decoded.
     """
     if name in {variable.name for variable in SCAN_VARIABLES}:
         return store.scan_frame(scan_id, name)
@@ -137,20 +135,20 @@ def replay(
     arrays: Sequence[str] | None = None,
     data_dir: str | Path | None = None,
 ) -> pd.DataFrame:
-    """Compute arrays again from the raw files with the recorded parameters, and compare.
+    """Recompute arrays from the raw files with the recorded parameters, and compare them with the store.
 
     Args:
-        store_path: the store.
-        scan_ids: which scans, by default all.
-        arrays: which arrays, by default all; the steps they need run in any case.
+        store_path: path of the store.
+        scan_ids: scans to recompute; by default all.
+        arrays: arrays to compare; by default all. All steps of the scans are run in any case.
         data_dir: folder of the raw files, as in ``verify``.
 
     Returns:
-        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if only one of the two has a
-        number at some pixel), ``unit``, ``same_hash``.
+        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if the shapes differ or only one
+        of the arrays has a number at some pixel), ``unit``, ``same_hash``.
 
     Raises:
-        InputError: no such store, scan or array, or raw files that are missing or have changed.
+        InputError: there is no such store, scan or array, or raw files are missing or have changed.
     """
     import pandas as pd
 
@@ -158,9 +156,7 @@ def replay(
     recorded = read_steps(store)
     folder = raw_folder(store, data_dir)
     if folder is None:
-        raise InputError(
-            "raw files of the store", got="none found", wanted="data_dir", hint="say where they are"
-        )
+        raise InputError("raw files of the store", got="none found", wanted="their folder, given as data_dir")
     for name in arrays or ():
         require_known("array", name, VARIABLES)
     rows = []
@@ -184,7 +180,7 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
-    """Yield arrays in the order in which they are made, each computed from the outputs of earlier steps."""
+    """Yield arrays in the order in which they are made, each step using the outputs of earlier steps."""
     made: dict[str, Array] = {}
     for step in steps:
         if step.op not in OPERATIONS:
@@ -200,10 +196,12 @@ def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Arra
 
 def _require_same(path: Path, sha256: str) -> None:
     if not path.is_file():
-        raise InputError(f"raw file {path}", got="none", wanted="the file that the store was built from")
+        raise InputError(
+            f"raw file {path}", got="no such file", wanted="the file from which the store was built"
+        )
     if file_sha256(path) != sha256:
         raise InputError(
-            f"raw file {path}", got="another SHA-256", wanted="the file that the store was built from"
+            f"raw file {path}", got="another SHA-256", wanted="the file from which the store was built"
         )
 
 

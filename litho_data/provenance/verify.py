@@ -1,4 +1,4 @@
-"""Verify that a store is unchanged since its build, and that its raw files are unchanged."""
+"""Verify that a store and its raw files have not changed since the store was built."""
 
 import json
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that has changed since the build: where it is, and what is wrong with it."""
+    """A change since the build: where it was found, and what is wrong."""
 
     where: str
     problem: str
@@ -35,7 +35,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of ``verify``. ``notes`` do not report damage."""
+    """The result of ``verify``; ``notes`` are remarks that do not report damage."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -45,15 +45,16 @@ class Verification:
 
 
 def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verification:
-    """Hash everything again and compare it with what the build recorded.
+    """Recompute all hashes of a store and compare them with those that the build recorded.
 
     Args:
         store_path: a ``.zarr`` folder or ``.zarr.zip`` file.
-        data_dir: folder of the raw files; by default the one recorded by the build, relative to the store,
-            then ``$LITHO_DATA_DIR/<name>`` and the user cache. If they are in none of these, a note says so.
+        data_dir: folder of the raw files. By default, the folder that the build recorded (relative to the
+            store), ``$LITHO_DATA_DIR/<name>`` and the user cache are tried. If none of them contains the
+            files, a note says so.
 
     Raises:
-        InputError: no store at the path, or ``data_dir`` does not exist.
+        InputError: there is no store at the path, or ``data_dir`` does not exist.
     """
     path = Path(store_path)
     if open_root(path).attrs.get("schema") != STORE_SCHEMA:
@@ -101,7 +102,7 @@ def _documents(path: Path) -> Iterator[Finding]:
         try:
             documents[name] = json.loads(content)
         except ValueError as error:
-            yield Finding(f"metadata {name}", f"no JSON ({error})")
+            yield Finding(f"metadata {name}", f"is not JSON ({error})")
     root = documents.get("zarr.json", {})
     copies = (root.get("consolidated_metadata") or {}).get("metadata", {})
     for name in sorted({f"{key}/zarr.json" for key in copies} | set(documents) - {"zarr.json"}):
@@ -116,9 +117,9 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """Yield what a check yields, and a finding if the check cannot read its data."""
+    """Yield the findings of a check, and one more finding if the check cannot read its data."""
     try:
-        with damaged("what a check needs"):
+        with damaged("data that a check needs"):
             yield from check
     except InputError as error:
         yield Finding("store", str(error))
@@ -152,7 +153,7 @@ def _tables(store: Store) -> Iterator[Finding]:
 
 
 def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
-    """Compare each step's id with its content, and its inputs with the outputs before it."""
+    """Compare each step's id with its content, and its inputs with the outputs of earlier steps."""
     raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
     for scan_id, steps in history.items():
         made: dict[str, str] = {}
@@ -164,7 +165,7 @@ def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
                 known = made.get(one["name"], raw.get(one["name"]))
                 if one["sha256"] != known:
                     yield Finding(
-                        where, f"input {one['name']} is not the output of the step before, nor a raw file"
+                        where, f"input {one['name']} is neither the output of an earlier step nor a raw file"
                     )
             made |= {one["name"]: one["sha256"] for one in step.outputs}
     for scan_id in store.ids:
@@ -173,7 +174,7 @@ def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
 
 
 def _arrays(store: Store, history: Recorded) -> Iterator[Finding | None]:
-    """Yield one entry per stored array of every scan: None if the array still has its hash."""
+    """Yield a finding for each array of every scan whose hash has changed, and None for every other array."""
     for scan_id, steps in history.items():
         for name, wanted in ((one["name"], one["sha256"]) for _, step in steps for one in step.outputs):
             yield _array(store, scan_id, name, wanted)
@@ -210,7 +211,8 @@ def _other_code(history: Recorded) -> Iterator[str]:
     used = {(step.op, step.code_sha256) for recorded in history.values() for _, step in recorded}
     other = {op for op, code in used if op not in OPERATIONS or code != OPERATIONS[op].code_sha256}
     if other:
-        yield f"made by code other than the installed: {', '.join(sorted(other))}; replay tells if it matters"
+        operations = ", ".join(sorted(other))
+        yield f"operations that ran other code than the installed: {operations}; replay shows if this matters"
 
 
 def _raw_file(folder: Path, row: Facts) -> Iterator[Finding]:

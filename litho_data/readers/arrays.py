@@ -50,7 +50,7 @@ class Coordinate:
     """The positions along one dimension in the unit that the file states. If the file states only a length,
     there are no positions.
 
-    ``axis`` is x or y if the file states the axis apart from the dimension's name.
+    ``axis`` is x or y if the file states the axis separately from the dimension's name.
     """
 
     values: Array | None
@@ -62,7 +62,7 @@ class Coordinate:
         """Return the length from edge to edge; None if unknown.
 
         Raises:
-            InputError: uneven steps.
+            InputError: the steps are uneven.
         """
         if self.length is not None:
             return self.length
@@ -217,7 +217,7 @@ def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
-    """Read one channel per two-dimensional dataset of an open HDF5 file; MATLAB's are stored column by
+    """Read one channel per two-dimensional dataset of an open HDF5 file; MATLAB stores datasets column by
     column.
     """
     datasets: list[Any] = []
@@ -307,8 +307,8 @@ def _coordinate(values: Array, attributes: Facts) -> Coordinate:
 
 
 def read_netcdf(path: Path) -> list[Channel]:
-    """Read one channel per two-dimensional variable of a NetCDF 3 file; CF's names give scale, unit and
-    missing pixels.
+    """Read one channel per two-dimensional variable of a NetCDF 3 file; attributes with CF names give scale,
+    unit and missing pixels.
     """
     from scipy.io import netcdf_file
 

@@ -2,7 +2,7 @@
 
 A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
 that reads files starts one child with its first file and keeps it. A new child is needed only after a parser
-broke a limit.
+has exceeded a limit.
 """
 
 import atexit
@@ -25,10 +25,10 @@ from litho_data.readers.reader import DAMAGED, foreign_parser
 T = TypeVar("T")
 
 _MIB = 1 << 20
-# Intact files take a hundredth of this time and a tenth of this memory.
+# Intact files need a hundredth of this time and a tenth of this memory.
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
-# Ratio of waiting time to computing time: a busy machine stays below it, but a parser that waits for
+# Largest ratio of waiting time to computing time. A busy machine stays below it; a parser that waits for
 # something does not.
 _WAITING_PER_COMPUTING = 20
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
@@ -62,8 +62,7 @@ class _Child:
         """Return the function's result.
 
         Raises:
-            InputError: raised by the function, or because it took too long, needed too much memory or
-                crashed.
+            InputError: the function raised it, took too long, needed too much memory or crashed.
         """
         size = path.stat().st_size
         computing_s = _COMPUTING_S + _COMPUTING_S_PER_MIB * size / _MIB
@@ -140,7 +139,7 @@ def serve(descriptor: int) -> None:
 
 @contextmanager
 def _limits(computing_s: float, memory: int) -> Iterator[None]:
-    """End the process after this computing time; raise MemoryError if it takes this many more bytes."""
+    """End the process after this computing time; raise MemoryError if it needs this many more bytes."""
     import resource
 
     unlimited = resource.getrlimit(resource.RLIMIT_AS)

@@ -33,7 +33,11 @@ def export_of(file: Path) -> dict[str, Any]:
     if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):
         return {}
     if says.get("file_sha256") != file_sha256(file):
-        raise InputError(f"layout {file}", got="a file that its sidecar does not describe", wanted=str(path))
+        raise InputError(
+            f"layout {file}",
+            got="a file that its sidecar does not describe",
+            wanted=f"the file that {path} describes",
+        )
     return says
 
 
@@ -55,7 +59,7 @@ def exported_rows(path: Path, says: Facts) -> Any:
     are read.
 
     Raises:
-        InputError: as ``exported_levels``.
+        InputError: as for ``exported_levels``.
     """
     with damaged(f"{path}.json"):
         shape, pitch_um, step_um = tuple(says["shape_px"]), says["pitch_um"], says["level_height_um"]
@@ -97,14 +101,16 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
     """Return levels uint8 (ny, nx) from an exported PNG or BMP.
 
     Raises:
-        InputError: no image, or a grey value between two levels.
+        InputError: the file is not an image, or a grey value lies between two levels.
     """
     import cv2
 
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     level = np.searchsorted(greys, grey if grey is not None else [[-1]]).clip(max=len(greys) - 1)
     if grey is None or (np.array(greys)[level] != grey).any():
-        raise InputError(f"image {path}", got="grey values between levels", wanted=f"one of {list(greys)}")
+        raise InputError(
+            f"image {path}", got="grey values between levels", wanted=f"only the grey values {list(greys)}"
+        )
     return level.astype(np.uint8)
 
 
@@ -128,7 +134,7 @@ def _gwl_levels(
     """Read levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
 
     Raises:
-        InputError: columns of resist that are not a whole number of levels high.
+        InputError: the height of a column of resist is not a whole number of levels.
     """
     steps = np.zeros((shape[0], shape[1] + 1), np.int32)
     stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
@@ -160,7 +166,7 @@ def read_stl_triangles(path: Path) -> Array:
     """Return the corners float32 (n, 3, 3) of a binary STL, µm.
 
     Raises:
-        InputError: a file whose length does not fit its triangle count.
+        InputError: the length of the file does not match its triangle count.
     """
     data = path.read_bytes()
     count = (
@@ -174,8 +180,8 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Read levels per cell uint8 (ny, nx), row 0 on top, from the upper faces of the solid, each of which
-    lies in one cell.
+    """Read the levels of the cells, uint8 (ny, nx) with row 0 at the top, from the upper faces of the solid,
+    each of which lies in one cell.
 
     Raises:
         InputError: a cell has no upper face.

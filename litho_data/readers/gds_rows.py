@@ -73,7 +73,7 @@ class GdsRows:
         """Find the position of every cell's shapes in the file, and the cells that it refers to."""
         at, cell, name = 0, "", ""
         while True:
-            # Only records of shapes are longer.
+            # Only the records of shapes are longer than this.
             part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
             length, kind = struct.unpack(">HH", part[:4])
             body = part[4:length]

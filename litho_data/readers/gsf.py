@@ -17,11 +17,12 @@ def read_channels(path: Path) -> list[Channel]:
     """Read the one field of a GSF file; it has a unit and a size only if the header states them.
 
     Raises:
-        InputError: another format, a header without XRes and YRes or with a scale, or data of another length.
+        InputError: the file is of another format, its header lacks XRes or YRes or has a scale, or the data
+            have another length.
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
-        raise InputError("no Gwyddion Simple Field", got=repr(raw[:25]), wanted=repr(_MAGIC))
+        raise InputError("not a Gwyddion Simple Field", got=repr(raw[:25]), wanted=repr(_MAGIC))
     header_end = raw.find(b"\0")
     header = _parse_header(raw[len(_MAGIC) : header_end if header_end >= 0 else None])
     refuse_scales(header)

@@ -1,4 +1,4 @@
-"""Read Gwyddion's own files: every data field becomes a channel, and a mask stays a mask."""
+"""Read Gwyddion's own files: every data field becomes a channel, and masks are kept."""
 
 import re
 import struct
@@ -20,18 +20,18 @@ _FIELD_KEY = re.compile(r"/(\d+)/data")
 def read_channels(path: Path) -> list[Channel]:
     """Read one channel per data field; heights under a mask are kept, together with the mask.
 
-    A pixel counts as masked where the mask is above zero. The metadata that Gwyddion keeps for a
-    channel is its header.
+    A pixel counts as masked where the mask is above zero. The metadata that Gwyddion keeps for a channel
+    becomes the channel's header.
 
     Raises:
         InputError: the file is of another format.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
-        raise InputError("no Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
+        raise InputError("not a Gwyddion file", got=repr(data[:4]), wanted=repr(_MAGIC))
     content, end = _object(data, len(_MAGIC), len(data))
     if end != len(data):
-        raise EOFError(f"{len(data)} bytes where {end} are wanted")
+        raise EOFError(f"{len(data)} bytes instead of {end}")
     numbers = sorted(
         (found[1] for key in content if (found := _FIELD_KEY.fullmatch(key))), key=lambda one: (len(one), one)
     )

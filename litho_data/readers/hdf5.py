@@ -16,7 +16,7 @@ _JPK = b"JPK SCAN"
 _UM_PER_M = 1e6
 _UM_PER_NM = 1e-3
 _NANOSURF = "nsf_file_version_major"
-# Names of one attribute in versions 2 and 1 of Nanosurf's files.
+# Names of each attribute in versions 2 and 1 of Nanosurf's files.
 _NAMES, _LOW, _HIGH, _UNIT = (
     ("signal_name", "name"),
     ("signal_calibration_min", "base_calibration_min"),
@@ -33,7 +33,7 @@ def read_channels(path: Path) -> list[Channel]:
     Thumbnails, traces of grains and other tables are skipped.
 
     Raises:
-        InputError: a damaged file, or one without a map.
+        InputError: the file is damaged, or contains no map.
     """
     import h5py
 
@@ -125,7 +125,9 @@ def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) ->
     read = partial(dataset, path, item.name)
     if item.dtype.kind not in "iu" or low is None or high is None or unit is None:
         raise InputError(
-            f"{item.name}: calibration", got=f"{item.dtype}, {low} to {high} {unit}", wanted="counts"
+            f"{item.name}: calibration",
+            got=f"{item.dtype}, {low} to {high} {unit}",
+            wanted="integer counts with a range",
         )
     return Channel(
         name=name,

@@ -1,6 +1,4 @@
-"""Read layouts, which are what was sent to the printer, as integer levels, from files of levels or grey
-pictures.
-"""
+"""Read layouts (what was sent to the printer) as integer levels, from files of levels or grey pictures."""
 
 from pathlib import Path
 
@@ -21,24 +19,24 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Read the levels of a layout, uint8 (beyond 256 levels uint16) (ny, nx), row 0 on top.
+    """Read the levels of a layout (ny, nx), row 0 on top, as uint8, or as uint16 for more than 256 levels.
 
-    The file may be TIFF (any compression of tifffile and imagecodecs), PNG, BMP or NPY; a colour image counts
-    as grey if its colours are identical. A file that the design package exported, in any format, is read with
-    the help of the sidecar beside it.
+    The file may be TIFF (with any compression that tifffile and imagecodecs support), PNG, BMP or NPY; a
+    colour image counts as grey if its colours are identical. A file that the design package exported, in any
+    format, is read with the help of the sidecar beside it.
 
     Args:
         path: the file.
         grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
         levels: number of levels, by default at most 256. In a picture with larger values, white is taken as
             the highest level if all values are whole steps.
-        average_px: for a picture in two greys: each square of this many pixels a side becomes one pixel of
-            the layout, whose level is the number of lighter pixels in the square; a remainder at right and
-            bottom is cut off.
+        average_px: for a picture in two greys: each square with this many pixels on a side becomes one pixel
+            of the layout, whose level is the number of lighter pixels in the square; a remainder at the right
+            and bottom is cropped.
 
     Raises:
-        InputError: no such file, a damaged file, another format, a true colour image, values that are neither
-            levels nor whole steps of grey, or the sidecar of another file.
+        InputError: the file does not exist, is damaged, has another format or is a true colour image, its
+            values are neither levels nor whole steps of grey, or its sidecar belongs to another file.
     """
     file = require_file(path)
     if says := export_of(file):
@@ -63,7 +61,7 @@ def _averaged(file: Path, pixels: Array, side: int) -> Array:
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:
-        wanted = f"two greys, and {side} x {side} px at least"
+        wanted = f"two greys, and at least {side} x {side} px"
         raise InputError(f"layout {file}", got=f"{len(greys)} greys, {pixels.shape} px", wanted=wanted)
     light = (pixels == greys[-1]) & (greys[-1] > 0)
     squares = light[: ny * side, : nx * side].reshape(ny, side, nx, side)

@@ -32,14 +32,13 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
             list if there are none.
 
     Raises:
-        InputError: a word that is not in ``missing``, or, if ``missing`` is None, a number that looks like a
-            mark.
+        InputError: a word is not in ``missing``, or, if ``missing`` is None, a number looks like a mark.
     """
     marks = {one for one in missing or () if isinstance(one, str)}
     for word, line in channel.words.items():
         if word not in marks:
             shown = f"{word[:24]!r}" if word else "an empty cell"
-            hint = f'if it marks pixels without a measurement: missing = ["{word[:24]}"]'
+            hint = f'if it marks pixels without a measurement, set missing = ["{word[:24]}"]'
             raise InputError(f"line {line}", got=shown, wanted="a number", hint=hint)
     values = np.array(values, dtype=float)
     for number in (one for one in missing or () if not isinstance(one, str)):
@@ -48,8 +47,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
     if missing is None and (found := _marks(values)):
         shown = ", ".join(f"{value:g} in {count} pixels" for value, count in found)
         keys = ", ".join(f"{value:.8g}" for value, _ in found)
-        hint = f"if it marks pixels without a measurement: missing = [{keys}]; if not: missing = []"
-        raise InputError("heights", got=f"{shown}, far from all others", wanted="heights", hint=hint)
+        hint = f"if it marks pixels without a measurement, set missing = [{keys}]; if not, set missing = []"
+        raise InputError("heights", got=f"{shown}, far from all others", wanted="measured heights", hint=hint)
     return values
 
 
@@ -82,4 +81,4 @@ def extreme_note(values: Array) -> str:
     what = (
         f"its {'lowest' if counts[0] >= least else 'highest'} value occurs in many pixels ({'; '.join(said)})"
     )
-    return f"{what}: cut off by the instrument, or a mark of missing pixels?" if said else ""
+    return f"{what}: was it cut off by the instrument, or does it mark missing pixels?" if said else ""

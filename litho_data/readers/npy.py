@@ -22,7 +22,7 @@ def read_channels(path: Path) -> list[Channel]:
     """Read the one channel of a two-dimensional array; a ``.npy`` file states neither unit nor size.
 
     Raises:
-        InputError: damaged file, or not a two-dimensional array of numbers.
+        InputError: the file is damaged, or is not a two-dimensional array of numbers.
     """
     array = load_array(path)
     if array.ndim != 2:
@@ -36,7 +36,7 @@ def read_archive(path: Path) -> list[Channel]:
     Single values and one-dimensional arrays beside them give the unit and the axes, as in a MATLAB file.
 
     Raises:
-        InputError: damaged file.
+        InputError: the file is damaged.
     """
     held: dict[str, Held] = {}
     with zipfile.ZipFile(path) as archive:
@@ -58,10 +58,10 @@ def _member(path: Path, name: str) -> Array:
 
 
 def load_array(path: Path) -> Array:
-    """Map the array of a ``.npy`` file without reading it.
+    """Memory-map the array of a ``.npy`` file without reading it.
 
     Raises:
-        InputError: damaged file, pickled objects, or values that are not real numbers.
+        InputError: the file is damaged or contains pickled objects, or the values are not real numbers.
     """
     with foreign_parser("NPY"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)

@@ -15,7 +15,7 @@ _GZIP = b"\x1f\x8b"
 _SURF, _PACKED_SURF = b"DIGITAL SURF", b"DSCOMPRESSED"
 _MOST_BYTES = 1 << 30
 _PIECE = 1 << 20
-# Position of the sizes of comment and private zone, which follow the 512 bytes of Digital Surf's header.
+# Position of the sizes of the comment and the private zone, which follow Digital Surf's header of 512 bytes.
 _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 
@@ -24,7 +24,7 @@ def unpacked(path: Path) -> Iterator[Path]:
     """Yield the file itself, or a temporary file with the unpacked content.
 
     Raises:
-        InputError: damaged, or more than 1 GiB inside.
+        InputError: the file is damaged, or contains more than 1 GiB.
     """
     with path.open("rb") as stream:
         head = stream.read(len(_PACKED_SURF))
@@ -51,8 +51,8 @@ def _unpack_gzip(path: Path, content: Path) -> None:
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
-    """Copy header, comment and private zone; after these the file has a count, the sizes of the streams, and
-    the streams.
+    """Copy header, comment and private zone, and append the unpacked streams. In the file, the number of
+    streams, their sizes, and the streams follow the private zone.
     """
     raw = path.read_bytes()
     start = _SURF_HEADER + sum(struct.unpack_from("<2H", raw, _SURF_ZONES))

@@ -18,10 +18,10 @@ GREY_MAX = 255
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
 ) -> dict[str, Array]:
-    """Join one field from its layouts and heights (first all layouts, then all heights, in quadrant order).
+    """Join the quadrants of one field; ``files`` are first all layouts, then all heights, in quadrant order.
 
     Raises:
-        InputError: unreadable files, quadrants of different sizes, levels above the stated number.
+        InputError: a file is unreadable, quadrants have different sizes, or levels exceed the stated number.
     """
     images = [read_layout(path) for path in files]
     if len({image.shape for image in images}) != 1:

@@ -20,8 +20,8 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
         what: what messages call the file.
 
     Raises:
-        InputError: no such file, a damaged file, another format, a true colour image, or numbers that are not
-            finite.
+        InputError: the file does not exist, is damaged, has another format, is a true colour image, or has
+            numbers that are not finite.
     """
     file = require_file(path)
     with about(f"{what} {file}"):

@@ -49,19 +49,19 @@ def read_scan(
         path: the instrument's file.
         format: one of ``formats()``, or ``"auto"`` to detect it from the content.
         unit: unit of the heights, needed if the file states none.
-        size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
-            pitch stays unknown (None).
+        size_um: (y, x) extent from edge to edge, µm, for files that state none; without it, the pitch stays
+            unknown (None).
         channel: which channel; needed if a file has several height channels.
         fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
-        full_scale_um: height of the largest integer value, for images that hold integers:
-            height = value / largest value · full_scale_um. Replaces ``unit``.
+        full_scale_um: height of the largest integer value, for images that hold integers: height = value /
+            largest value · full_scale_um. It replaces ``unit``.
         missing: numbers (as in the file) and words that mark pixels without a measurement, besides those that
-            the file states; an empty list says that there are none.
-        defaults: whether ``unit`` and ``size_um`` are only used if the file states none. Otherwise they must
+            the file states; an empty list says that there are no such marks.
+        defaults: whether ``unit`` and ``size_um`` are only used if the file states none. Otherwise, they must
             not contradict the file.
 
     Raises:
-        InputError: an unreadable file, no height channel or several, a missing or contradicting unit or size,
+        InputError: an unreadable file, no height channel or several, a missing or contradictory unit or size,
             a value that looks like a mark of missing pixels that ``missing`` does not name, impossible
             heights, or no finite value.
     """
@@ -79,13 +79,13 @@ def read_scan(
         if defaults and size_um is not None and chosen.size_um is not None:
             if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
                 side_y, side_x = chosen.size_um
-                notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
+                notes.append(f"size {side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
             size_um = None
         stated_unit, factor = _settle_unit(chosen, values, unit, full_scale_um)
         height = _to_um(values, factor)
         finite = height[np.isfinite(height)]
         ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
-        HEIGHT_UM.require(f"heights in µm, by unit {stated_unit!r}", ends_um)
+        HEIGHT_UM.require(f"heights in µm, converted from unit {stated_unit!r}", ends_um)
         return Scan(
             height_um=height,
             pitch_um=_settle_pitch(chosen, size_um, stated_unit),
@@ -129,7 +129,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
-            raise InputError(reader.name, got=got, wanted="more", hint=DAMAGED)
+            raise InputError(reader.name, got=got, wanted="more bytes", hint=DAMAGED)
     return [_with_unit_of_name(replace(one, load=partial(run, one.load))) for one in channels]
 
 
@@ -154,14 +154,16 @@ def _choose(channels: list[Channel], name: str | None) -> Channel:
                 if channel.problem:
                     raise InputError(channel.problem)
                 if not channel.is_height:
-                    raise InputError(f"channel {name!r} is no height", got=f"unit {channel.unit!r}")
+                    raise InputError(
+                        f"channel {name!r} does not contain heights", got=f"unit {channel.unit!r}"
+                    )
                 return channel
         raise InputError("channel", got=repr(name), wanted=f"one of {listed}")
     heights = [channel for channel in channels if channel.is_height]
     if len(heights) == 1:
         return heights[0]
     problem = "several height channels" if heights else "no height channel"
-    hint = "choose one by its name with channel" if heights else ""
+    hint = "choose one by its name with the option channel" if heights else ""
     raise InputError(problem, got=listed, wanted="one", hint=hint)
 
 
@@ -179,8 +181,8 @@ def _settle_unit(
         first = ", ".join(f"{value:g}" for value in np.asarray(values)[0, :3])
         raise InputError(
             "it does not state the unit of its heights",
-            wanted="unit, for example 'm'",
-            hint=f"the first row begins {first}: unit 'm' reads these as metres, 'nm' as nanometres",
+            wanted="the option unit, for example 'm'",
+            hint=f"the first row begins {first}: with unit 'm' these are metres, with 'nm' nanometres",
         )
     if unit is not None and channel.unit is not None and um_per(unit) != um_per(channel.unit):
         raise InputError("unit", got=repr(unit), wanted=f"{channel.unit!r} as in the file, or none")

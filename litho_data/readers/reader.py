@@ -78,13 +78,13 @@ class Channel:
             raise InputError(
                 f"channel {self.name!r}: size in pixels",
                 got=f"{self.shape[0]} x {self.shape[1]}",
-                wanted=f"2 x 2 up to {_MAX_PIXELS} pixels",
+                wanted=f"at least 2 x 2 and at most {_MAX_PIXELS} pixels",
                 hint=DAMAGED,
             )
 
     @property
     def is_height(self) -> bool:
-        """Return whether the unit is a length, or unknown so that the caller must state it."""
+        """Return whether the unit is a length, or is unknown and must be stated by the caller."""
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
@@ -104,9 +104,9 @@ class Reader:
         recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
         read_channels: function that returns the channels of a file, in the order of the file. Any exception
             here, or when a channel is loaded, becomes one line about the file.
-        parsers: modules of other projects that ``read_channels`` uses. If any, it runs in a child process
-            within limits of time and memory, so it must be importable by name, and its results must be
-            picklable.
+        parsers: modules of other projects that ``read_channels`` uses. If there are any, ``read_channels``
+            runs in a child process within limits of time and memory, so it must be importable by name, and
+            its results must be picklable.
     """
 
     name: str

@@ -35,11 +35,11 @@ def formats() -> tuple[str, ...]:
 def register_reader(reader: Reader) -> Reader:
     """Register a reader of another format; it is tried before the existing readers.
 
-    To build in several processes, call this in a plug-in, or in the script that starts the build, at its top
-    level.
+    To build in several processes, call this in a plug-in, or at the top level of the script that starts the
+    build.
 
     Raises:
-        InputError: a format of that name exists.
+        InputError: a format of that name already exists.
     """
     if reader.name in ("auto", PICTURE, *formats()):
         raise InputError("reader to register", got=f"{reader.name!r}, which exists", wanted="another name")
@@ -76,10 +76,10 @@ def detect_format(path: Path) -> str:
 
 
 def require_file(path: str | Path) -> Path:
-    """Return the path, if it is a file that is not empty.
+    """Return the path if it is a file that is not empty.
 
     Raises:
-        InputError: no such file, a folder, not readable, or empty.
+        InputError: the path does not exist, is a folder, is not readable, or is an empty file.
     """
     file = Path(path)
     try:

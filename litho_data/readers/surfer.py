@@ -1,4 +1,4 @@
-"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), y upwards."""
+"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), with y upwards."""
 
 import struct
 from pathlib import Path
@@ -9,7 +9,7 @@ from litho_data.foundation import Array, InputError
 from litho_data.readers.reader import Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
-# The blank value as float32, and as written with six digits.
+# The value of blank pixels, as float32 and as text with six digits.
 _BLANK = 1.7014e38
 
 
@@ -22,7 +22,7 @@ def read_channels(path: Path) -> list[Channel]:
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
-        raise InputError("no Surfer grid", got=repr(raw[:4]), wanted="DSAA, DSBB or DSRB")
+        raise InputError("not a Surfer grid", got=repr(raw[:4]), wanted="DSAA, DSBB or DSRB")
     values, step_y, step_x, blank = _sections(raw) if raw.startswith(b"DSRB") else _older(raw)
     values = np.where(values >= blank, np.nan, values)[::-1]
     extent = step_y * values.shape[0], step_x * values.shape[1]
@@ -30,7 +30,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _older(raw: bytes) -> tuple[Array, float, float, float]:
-    """Read the numbers of columns and rows, the ends of x, y and z, and the heights, as text or binary."""
+    """Read the numbers of columns and rows, the ends of x, y and z, and the heights, from text or binary
+    data.
+    """
     if raw.startswith(b"DSAA"):
         numbers = np.array(raw.split()[1:], dtype=float)
         nx, ny, x_low, x_high, y_low, y_high, *_ = numbers[:8].tolist()
@@ -43,7 +45,7 @@ def _older(raw: bytes) -> tuple[Array, float, float, float]:
 
 
 def _sections(raw: bytes) -> tuple[Array, float, float, float]:
-    """Read sections of tag, size and content: GRID contains the geometry, and DATA after it the heights."""
+    """Read sections of tag, size and content: GRID contains the geometry, and DATA, after it, the heights."""
     position = 0
     ny = nx = step_x = step_y = blank = 0
     while True:

@@ -15,8 +15,8 @@ NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+
 _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
-# A semicolon may also precede the first cell of a row. A spreadsheet's cell with an error begins with the
-# character of a comment.
+# A semicolon may also precede the first cell of a row. A spreadsheet's cell with an error, such as #N/A,
+# begins with the character of a comment.
 _COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
@@ -135,11 +135,11 @@ def refuse_scales(header: Mapping[str, str]) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Read the text of a file, with lines separated by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western
-    Europe.
+    """Return the text of a file in UTF-8, UTF-16 or an 8-bit code of Western Europe, with lines separated by
+    ``\\n``.
 
     Raises:
-        InputError: UTF-16 with an incomplete character, or bytes that are no text; the message names the
+        InputError: the UTF-16 has an incomplete character, or the bytes are not text; the message names the
             line.
     """
     raw = path.read_bytes()

@@ -47,8 +47,8 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
     lengths.
 
     Raises:
-        InputError: a first row and column that look like coordinates at uneven steps, or a last row and
-            column that look like coordinates.
+        InputError: the first row and column look like coordinates at uneven steps, or the last row and column
+            look like coordinates.
     """
     body = values[1:, 1:]
     if min(body.shape) <= _FEWEST_STEPS:
@@ -63,9 +63,15 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
             return Map(body, corner=True)
         return Map(body if x and x > 0 else body[:, ::-1], extent, _size_um(words, extent), corner=True)
     if has_y and len(column) >= _FEWEST_ALONE:
-        return Map(values[:, 1:], notes=("its first column, evenly spaced, was taken for an axis",))
+        return Map(
+            values[:, 1:], notes=("its first column was taken as an axis, because it is evenly spaced",)
+        )
     if has_x and x and x > 0 and len(row) >= _FEWEST_ALONE:
-        return Map(values[1:], corner=True, notes=("its first row, evenly spaced, was taken for an axis",))
+        return Map(
+            values[1:],
+            corner=True,
+            notes=("its first row was taken as an axis, because it is evenly spaced",),
+        )
     pairs = ((row, body[0]), (column, body[:, 0]))
     if all(len(line) >= _FEWEST_ALONE and _rises(line) and not _rises(beside) for line, beside in pairs):
         raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even steps")
@@ -142,7 +148,9 @@ def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
     size_um = _size_um(words, extent)
-    note = f"points of a grid, the rows as in the file: y {'grows' if down else 'falls'} downwards"
+    note = (
+        f"points of a grid; rows are in the order of the file, so y {'grows' if down else 'falls'} downwards"
+    )
     counted = _counts(x) and _counts(y)
     return Map(
         values, None if counted else extent, size_um, x_is=f"column {columns[0] + 1} of points", notes=(note,)

@@ -26,8 +26,8 @@ def read_channels(path: Path) -> list[Channel]:
     the first row and column, and points that lie on a regular grid, become a map.
 
     Raises:
-        InputError: binary or empty file, rows of different lengths, mixed separators, numbers too large, or a
-            last number that was cut off; the message names the line.
+        InputError: the file is binary or empty, rows differ in length, separators are mixed, a number is too
+            large, or the last number was cut off; the message names the line.
     """
     text = read_text(path)
     if text.startswith(_IGOR):
@@ -86,11 +86,11 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
         height_um: finite heights below 10 m, µm, shape (ny, nx).
 
     Raises:
-        InputError: a value that the format cannot hold.
+        InputError: the format cannot hold a value.
     """
     if not np.isfinite(height_um).all():
         raise InputError("height in a text matrix", got="NaN or infinity", wanted="finite numbers")
-    # Avoids -0.
+    # Adding zero avoids -0.
     metres = (height_um * 1e-6 + 0.0).ravel().tolist()
     row = "\t".join(["%.4e"] * height_um.shape[1]) + "\r\n"
     text = row * len(height_um) % tuple(metres)
@@ -121,8 +121,8 @@ def _refuse_points(path: Path) -> None:
         if _may_be_points(table.values.shape) and map_of_points(table.values, block.words) is None:
             raise InputError(
                 f"holds {'a profile' if columns == 2 else 'a point cloud or profiles'}",
-                got=f"{columns} numbers in a row, the first {' '.join(cells_of(block.rows[0]))}",
-                wanted="a height map, or the points of a whole regular grid",
+                got=f"{columns} numbers per row, in the first row {' '.join(cells_of(block.rows[0]))}",
+                wanted="a height map, or the points of a complete regular grid",
             )
 
 

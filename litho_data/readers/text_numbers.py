@@ -1,4 +1,4 @@
-"""Convert rows of text to numbers: separators, decimal commas, words in place of numbers, damage."""
+"""Convert rows of text to numbers: handle separators, decimal commas and words, and detect damage."""
 
 import io
 import re
@@ -37,7 +37,7 @@ def numbers_of(block: Block) -> Table:
     A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
 
     Raises:
-        InputError: rows of different lengths, mixed separators, numbers too large, or a last number that was
+        InputError: rows differ in length, separators are mixed, a number is too large, or the last number was
             cut off; the message names the line and shows the first rows.
     """
     try:
@@ -117,7 +117,9 @@ def _refuse_decimal_commas(text: str, first_line: int) -> None:
     every, other = ({len(cell) for row in rows for cell in row[start::2]} for start in (1, 0))
     if len(every) == 1 and every.isdisjoint(other) and all(len(row) % 2 == 0 for row in rows):
         got = repr(",".join(rows[0])[:_SHOWN_CHARACTERS])
-        raise InputError(f"line {first_line}", got=got, wanted="decimal commas or commas between cells")
+        raise InputError(
+            f"line {first_line}", got=got, wanted="decimal commas or commas between cells, not both"
+        )
 
 
 def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:

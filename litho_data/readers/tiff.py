@@ -37,12 +37,13 @@ _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "
 def read_channels(path: Path) -> list[Channel]:
     """Read one channel per page; RGB pages count as one channel if their samples are identical.
 
-    The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their
-    unit; otherwise these usually describe paper, not the sample. Calibrations of the values by ImageJ and
-    GDAL are applied; GDAL's no-data value marks a missing pixel. Reduced copies of a page are skipped.
+    The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their unit;
+    otherwise, these tags usually describe a print on paper, not the sample. Calibrations of the values by
+    ImageJ and GDAL are applied; GDAL's no-data value marks a missing pixel. Reduced copies of a page are
+    skipped.
 
     Raises:
-        InputError: damaged file.
+        InputError: the file is damaged.
     """
     with open_tiff(path) as file:
         pages: list[tuple[int, Any]] = [
@@ -66,14 +67,14 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
 
 
 def require_upright(page: Any) -> None:
-    """Refuse a page marked as turned or mirrored, because programs differ in how they show it.
+    """Refuse a page marked as rotated or mirrored, because programs differ in how they show it.
 
     Raises:
         InputError: the orientation is not upright.
     """
     stated = page.tags.valueof(_ORIENTATION, _UPRIGHT)
     if stated != _UPRIGHT:
-        raise InputError("Orientation of the page", got=int(stated), wanted="1, the first row on top")
+        raise InputError("Orientation of the page", got=int(stated), wanted="1 (first row at the top)")
 
 
 def maker_of(path: Path) -> str:
@@ -129,8 +130,7 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     """Return scale, offset, unit and no-data value of a page.
 
     Raises:
-        InputError: a calibration by ImageJ that is not a straight line, or an unknown scale in the
-            description.
+        InputError: a calibration by ImageJ is not a straight line, or the description has an unknown scale.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -139,7 +139,7 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     if "c0" in imagej or "c1" in imagej or int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE:
         if int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE or "c2" in imagej:
             stated = ", ".join(f"{key} = {imagej[key]}" for key in ("cf", "c0", "c1", "c2") if key in imagej)
-            raise InputError("calibration by ImageJ", got=stated, wanted="a straight line, cf = 0")
+            raise InputError("calibration by ImageJ", got=stated, wanted="a straight line (cf = 0)")
         scale, offset = float(imagej.get("c1", 1.0)), float(imagej.get("c0", 0.0))
     if str(imagej.get("vunit", "")).strip().lower() not in _WITHOUT_MEANING:
         unit = _plain_unit(imagej["vunit"])
@@ -166,7 +166,8 @@ def _plain_unit(unit: Any) -> str:
 
 
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
-    """Read (y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
+    """Read the pixel size (y, x) of every page from OME metadata; its lengths are in µm unless it names
+    another unit.
 
     The pages are those of the first image, then those of the second, and so on. Each image has as many pages
     as its sizes in z, channel and time say.
@@ -179,7 +180,7 @@ def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
 
 
 def _ome_pitch_um(image: str) -> YX | None:
-    """Read (y, x) that the element of one image states."""
+    """Read the pixel size (y, x) that the element of one image states."""
     says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
         pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]

@@ -114,8 +114,8 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Refuse a wave shorter than its header says, because igor2 trusts the header of version 5 and could read
-    through gigabytes.
+    """Refuse a wave that is shorter than its header says, because igor2 trusts the header of version 5 and
+    could read through gigabytes.
     """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
@@ -125,7 +125,7 @@ def _require_whole_igor_file(path: Path, head: bytes) -> None:
         raise InputError(
             "cannot be read as ibw",
             got=f"{path.stat().st_size} bytes",
-            wanted=f"the {stated} of its header",
+            wanted=f"{stated} bytes, as its header states",
             hint=DAMAGED,
         )
 
@@ -152,7 +152,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         load=partial(_load, path, kind, info.index, sizes is None),
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
-        notes=(f"read by SurfaceTopography as {kind}, which no test here covers",)
+        notes=(f"read by SurfaceTopography as {kind}, a format that no test of this project covers",)
         if kind in _FORMATS["kinds"]["untested"]
         else (),
     )
@@ -178,7 +178,7 @@ def _flatten(content: Facts, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _vendor_header(path: Path, kind: str) -> dict[str, str]:
-    """Read the header of an Igor wave or a Nanoscope file, word by word; empty for other formats.
+    """Read the header of an Igor wave or a Nanoscope file verbatim; return an empty dict for other formats.
 
     SurfaceTopography passes on only parts of these headers.
     """

@@ -1,5 +1,5 @@
-"""Read Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm; missing pixels are
-``Bad``.
+"""Read Wyko ASCII: a header of tab-separated lines, then blocks of numbers in waves or nm; missing pixels are
+marked ``Bad``.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ def read_channels(path: Path) -> list[Channel]:
     row by row.
 
     Raises:
-        InputError: a header without sizes or wavelength, or blocks of other sizes.
+        InputError: the header lacks the sizes or the wavelength, or blocks have other sizes.
     """
     lines = read_text(path).split("\n")
     in_nm = lines[0].removeprefix(_MAGIC).split()[1:2] == ["1"]
@@ -55,13 +55,13 @@ def _channel(name: str, block: Block, shape: Shape, says: dict[str, str], in_nm:
     values, by_columns = table.values, table.values.shape == shape[::-1]
     if not by_columns and values.shape != shape:
         got = f"{values.shape[0]} lines of {values.shape[1]}"
-        raise InputError(name, got=got, wanted=f"{shape[1]} of {shape[0]}", hint=DAMAGED)
+        raise InputError(name, got=got, wanted=f"{shape[1]} lines of {shape[0]}", hint=DAMAGED)
     values = values.T[::-1] if by_columns else values
     wavelength_nm, pitch_mm = number(says.get("Wavelength", "")), number(says.get("Pixel_size", ""))
     multiplier, aspect = (number(says.get(key, "1")) or 1.0 for key in ("Mult", "Aspect"))
     scale = 1.0 if in_nm else wavelength_nm / multiplier
     if name in _HEIGHTS and not np.isfinite(scale):
-        raise InputError("Wavelength", got=says.get("Wavelength"), wanted="a number of nm")
+        raise InputError("Wavelength", got=says.get("Wavelength"), wanted="a wavelength in nm")
     pitch_um = abs(pitch_mm) * 1e3
     return Channel(
         name=name,

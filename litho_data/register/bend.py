@@ -1,4 +1,4 @@
-"""The bend of a scan: the smooth difference between the true and the stated positions of the scanner."""
+"""Describe the bend of a scan: the smooth difference between the scanner's true and stated positions."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from litho_data.foundation import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# Tolerance of the iteration, as a share of the half width of the scan. It is far below a thousandth of a
+# Tolerance of the iteration, as a share of half the width of the scan. This is far below a thousandth of a
 # pixel.
 _SETTLED = 1e-9
-# A bend with a slope of 0.1 is undone in 10 steps, one with a slope of 0.9 in 200.
+# Undoing a bend with a slope of 0.1 takes 10 steps; a slope of 0.9 takes 200.
 _STEPS = 400
 # Number of points along each side of the frame at which the size of a bend is evaluated.
 _GRID = 65
@@ -21,12 +21,13 @@ _GRID = 65
 
 @dataclass(frozen=True)
 class Bend:
-    """Displacement of the points of a scan: a polynomial of u and v, which run from -1 to 1 over the frame.
+    """The displacement of a scan's points: a polynomial of u and v, which run from -1 to 1 over the frame.
 
-    ``amount`` (2, 3), along x and y, contains the coefficients of u² - 1/3, uv and v² - 1/3. If the scanner
-    creeps, ``amount`` is (2, 11), with the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v) in addition. All
-    terms are centred, so the best affine part of a bend over the frame is zero. ``middle`` and ``half`` are
-    the centre and half the size (x, y) of the frame, in the unit of ``amount``; u = (x - middle) / half.
+    ``amount`` (2, 3) contains the coefficients of u² - 1/3, uv and v² - 1/3, one row for x and one for y. If
+    the scanner creeps, ``amount`` is (2, 11), and also contains those of the Legendre polynomials P₃(u),
+    P₃(v), P₄(u), … P₆(v). All terms are centred, so the best affine fit to a bend over the frame is zero.
+    ``middle`` and ``half`` are the centre and half the size (x, y) of the frame, in the unit of ``amount``; u
+    = (x - middle) / half.
     """
 
     amount: Array
@@ -35,17 +36,15 @@ class Bend:
 
     @classmethod
     def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
-        """Make the bend of a scan with (ny, nx) pixels and this (y, x) pitch, in µm of the scan's own
-        frame.
-        """
+        """Make the bend, in µm in the scan's own frame, of a scan of this (ny, nx) shape and (y, x) pitch."""
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
         return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
     @property
     def figures(self) -> dict[str, float]:
-        """Describe the bend for the quality record: its largest displacement and its six coefficients, µm.
+        """Return the largest displacement and the six coefficients of the bend for the quality record, in µm.
 
-        ``bend_x_by_xx_um`` is the displacement along x per u² - 1/3, and so on.
+        ``bend_x_by_xx_um`` is the coefficient of u² - 1/3 in the displacement along x, and so on.
         """
         names = [f"bend_{axis}_by_{term}_um" for axis in "xy" for term in ("xx", "xy", "yy")]
         values = (float(value) for value in self.amount[:, :3].ravel())
@@ -53,7 +52,7 @@ class Bend:
 
     @classmethod
     def none_yet(cls, shape: Shape) -> Bend:
-        """Make the bend of a straight scan of this (ny, nx) shape, in the scan's index frame."""
+        """Make a bend of zero for a scan of this (ny, nx) shape, in the scan's index frame."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
@@ -67,9 +66,9 @@ class Bend:
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the distance (along x, along y) of points of the scan from their nominal positions.
+        """Return the displacement (along x, along y) of points of the scan from their nominal positions.
 
-        Points outside the frame have the distance of the nearest point of the frame.
+        A point outside the frame has the displacement of the nearest point of the frame.
         """
         u, v = (np.clip(one, -1, 1) for one in self.unit(x, y))
         terms = _terms(u, v, self.degree)
@@ -81,9 +80,7 @@ class Bend:
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the points of the scan whose true position is (x, y); the result is exact if ``slope`` is
-        below 1.
-        """
+        """Return the points of the scan whose true positions are (x, y); exact if ``slope`` is below 1."""
         at_x, at_y = x, y
         for _ in range(_STEPS):
             shift_x, shift_y = self.shift(at_x, at_y)
@@ -100,22 +97,23 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """Return the largest local stretch or rotation of the bend, as a fraction. A bend with a slope of 1
-        or more may fold.
+        """Return the largest local stretch or rotation that the bend causes, as a fraction.
+
+        A bend with a slope of 1 or more may fold the scan.
         """
-        # The grid is exact for a bend, and exact to a thousandth for creep.
+        # On this grid, the slope is exact for a quadratic bend and accurate to a thousandth for creep.
         spacing = 2 * self.half[::-1] / (_GRID - 1)
         gradient = np.array([np.gradient(one, *spacing, edge_order=2) for one in self._field()])
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
     def _field(self) -> tuple[Array, Array]:
-        """Return displacements on an even grid over the frame."""
+        """Return the displacements on a regular grid over the frame."""
         unit = np.linspace(-1, 1, _GRID)
         return self.shift(*np.meshgrid(*(self.middle[:, None] + self.half[:, None] * unit)))
 
     @property
     def kind(self) -> str:
-        """Return ``quadratic`` or ``creep``."""
+        """Return the kind of the bend, ``quadratic`` or ``creep``."""
         return "quadratic" if self.degree == 2 else "creep"
 
     @property
@@ -139,20 +137,20 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """Fit by least squares the affine (3×3) and the bend that map points (n, 2) to their images.
+    """Fit by least squares an affine map (3×3) and a bend that together map points (n, 2) to their images.
 
-    ``images`` ≈ affine(``points`` + bend(``points``)), where ``middle`` and ``half`` belong to the bend's
-    frame, and ``degree`` is 2, or 6 for creep.
+    The model is ``images`` ≈ affine(``points`` + bend(``points``)). ``middle`` and ``half`` define the bend's
+    frame; ``degree`` is 2, or 6 for creep.
 
     Raises:
-        numpy.linalg.LinAlgError: points that do not determine six coefficients per axis (too few, or all on
-            one conic, as on a line), or images on a line.
+        numpy.linalg.LinAlgError: the points do not determine six coefficients per axis, because they are too
+            few or lie on one conic, such as a line; or the images lie on a line.
     """
     u, v = ((points - middle) / half).T
     basis = np.stack([np.ones_like(u), u, v, *_terms(u, v, degree)], axis=1)
     coefficients, _, rank, _ = np.linalg.lstsq(basis, images, rcond=None)
     if rank < basis.shape[1]:
-        raise np.linalg.LinAlgError(f"{len(points)} points do not determine an affine and a bend")
+        raise np.linalg.LinAlgError(f"the {len(points)} points do not determine an affine map and a bend")
     matrix = np.eye(3)
     matrix[:2, :2] = coefficients[1:3].T / half
     matrix[:2, 2] = coefficients[0] - matrix[:2, :2] @ middle

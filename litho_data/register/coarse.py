@@ -1,4 +1,4 @@
-"""Find the coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
+"""Find orientation, polarity and a robust affine warp to within a few pixels, by keypoints or correlation."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ from litho_data.register.geometry import (
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
 
 CLEAR_MARGIN = 0.1
-# Above this correlation a hypothesis is accepted without support from features.
+# Above this correlation, a hypothesis is accepted without matching features.
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
@@ -30,7 +30,8 @@ class CoarseFit:
     """The position of the scan to within a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
-    ``points`` is None if too few keypoints match; the fit is then the best correlation over all shifts.
+    ``points`` is None if keypoints were not used or too few match; the fit is then the best correlation over
+    all shifts.
     """
 
     orientation: str
@@ -55,10 +56,10 @@ def find_coarse(
     """Find the best coarse fit; return None if scan or layout shows no structure.
 
     Args:
-        scan: (ny, nx) heights at the layout's pitch, bow removed, NaN where not measured.
+        scan: (ny, nx) heights at the layout's pitch, with the bow removed; NaN where not measured.
         layout_level: (ny, nx) integer levels.
-        smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
-        features: whether to match keypoints; on a repeating layout they would match everywhere.
+        smooth_layout: (ny, nx) topography predicted from the layout with a blur of ``SEARCH_BLUR_PX``.
+        features: whether to match keypoints; on a repeating layout, keypoints would match everywhere.
         seed: seed of the robust estimators.
     """
     hypotheses = search_orientation(scan, smooth_layout)
@@ -73,9 +74,7 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """Return the best hypothesis, or the upright one if the layout is symmetric and fits equally well
-    upright.
-    """
+    """Return the best hypothesis, or the upright one if it fits about as well, as on a symmetric layout."""
     best = hypotheses[0]
     for hypothesis in hypotheses:
         upright = (hypothesis.orientation, hypothesis.polarity) == ("identity", 1)
@@ -87,8 +86,8 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
     """Return the orientations and polarities in which to look for keypoints.
 
-    ORB does not depend on rotation, so only the four combinations of mirror image and polarity differ. All
-    are tried if the correlation does not determine the orientation.
+    ORB features are invariant to rotation, so only the four combinations of mirroring and polarity differ.
+    All four are tried if the correlation does not determine the orientation.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
@@ -104,7 +103,7 @@ def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str,
 def _fit_features(
     scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
-    """Fit matched keypoints; return None if the inliers are too few or too clustered."""
+    """Fit a warp to matched keypoints; return None if the inliers are too few or too clustered."""
     points = match_features(polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:
         return None

@@ -1,8 +1,8 @@
-"""Register scans that no straight warp fits, because the scanner bends the image or creeps.
+"""Register scans that no straight warp fits because the scanner bends the image or creeps.
 
-A bend displaces the image by a quadratic function of position. A scanner that is still settling displaces its
-lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the linear part of
-this creep. The remaining part distorts the print by a tenth of the creep and cannot be seen in any other way.
+A bend displaces the image by a quadratic function of position. A scanner that is still settling (creep)
+displaces its lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the
+linear part of this creep. The rest distorts the print by a tenth of the creep and shows in no other way.
 """
 
 from __future__ import annotations
@@ -20,31 +20,30 @@ from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
 
 Curve = int | Literal["quadratic"] | None
-"""What is fitted in addition to an affine: creep along the slow axis (0 = x, 1 = y), a bend, or nothing."""
-# Step between the pixels that are used, in both directions. Every second pixel locates the print as well as
-# all pixels do.
+"""What is fitted besides an affine map: creep along the slow axis (0 = x, 1 = y), a bend, or nothing."""
+# Every how manyth row and column is used. Every second pixel locates the print as well as all pixels do.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
-# Largest probability that held-out blocks prefer the creep by chance.
+# Largest accepted probability that held-out blocks prefer the creep by chance.
 _CHANCE = 0.01
 _BACKGROUND = 6
 
 
 def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Curve) -> FineFit | None:
-    """Refine the straight warp as an affine and a curve; return None if the fit does not converge.
+    """Refine a straight warp by adding a curve; return None if the fit fails or held-out blocks reject creep.
 
-    Creep displaces along x and y by a polynomial of degree 6 in the slow coordinate: ten numbers in addition
-    to the affine. The curve must also do better on blocks held out of the fit. Curve and straight warp are
-    fitted to each half of the field (squares of 64 px in a chequerboard), and each fit predicts the other
-    half.
+    The displacement by creep, along x and along y, is a polynomial of degree 6 in the slow coordinate. It
+    adds ten numbers to the affine map. Creep must also predict held-out blocks better than the straight warp.
+    For this, both are fitted to each half of the field (squares of 64 px in a chequerboard), and each fit
+    predicts the other half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``; its error may reach the width of structures at a quarter
-            resolution.
-        curve: ``quadratic``, or the slow axis of the oriented scan, across its lines.
+        straight: the result of ``refine_pyramid``; at a quarter of the resolution, its error may be as large
+            as the width of the structures.
+        curve: ``quadratic`` for a bend; for creep, the slow axis of the oriented scan, across its lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -81,8 +80,9 @@ def _from_coarse_to_fine(
 def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
     """Subtract from the scan the quadratic surface that the topography does not explain.
 
-    A surface that is quadratic in the scan's frame, including the print's share of it, is no longer quadratic
-    in the layout's frame after the scan is straightened. There it would distort the bend.
+    Such a surface is quadratic in the scan's frame, but no longer in the layout's frame once the scan is
+    straightened. There it would distort the fit of the bend. The part of the print that is quadratic is
+    included.
     """
     from scipy.ndimage import map_coordinates
 
@@ -115,7 +115,7 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # A rank test is used, because creep fades along the scan, so that a few blocks gain most.
+    # A rank test is used because creep fades along the scan, so a few blocks gain most.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
@@ -124,7 +124,7 @@ class _Images:
     """A scan and the topography with which it is compared, for fitting warps to any choice of pixels."""
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """``every``: use every n-th row and column of the topography; indices refer to these."""
+        """Use every ``every``-th row and column of the topography; indices count only these."""
         from scipy.ndimage import spline_filter
 
         self._measured = np.isfinite(scan)
@@ -137,7 +137,7 @@ class _Images:
         self.everywhere = interior_of(shape, BORDER_PX // every)
 
     def fit(self, matrix: Array, bend: Bend, curve: Curve, chosen: Array) -> tuple[Array, Bend] | None:
-        """Fit affine and curve by Gauss-Newton steps; return None if they do not converge."""
+        """Fit an affine map and a curve by Gauss-Newton steps; return None if the steps do not converge."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
         points = lattice(y, x)
         for _ in range(_ITERATIONS):
@@ -165,8 +165,9 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Return the squared misfit of every pixel after gain and background are fitted to the pixels
-        ``fitted``; NaN outside the scan.
+        """Return the squared misfit of every pixel; gain and background are fitted to the pixels ``fitted``.
+
+        The misfit is NaN outside the scan.
         """
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)
@@ -185,7 +186,7 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """Return the terms that can move a point of the scan along one axis: 1, u, v, and those of the curve."""
+    """Return the terms of the displacement along one axis at points of the scan: 1, u, v and the curve's."""
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]
     if curve == "quadratic":

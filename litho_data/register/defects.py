@@ -1,7 +1,7 @@
 """Find areas where a scan does not show the print: dust, collapsed or missing parts, lifted film.
 
-Such an area can shift a least-squares warp by whole pixels. Over this connected area the heights differ from
-the prediction of the layout by many times the usual misfit, for any response of the printer.
+Such an area can shift a least-squares warp by whole pixels. A defect is a connected area where the heights
+differ from any prediction based on the layout by many times the usual misfit.
 """
 
 from dataclasses import replace
@@ -15,14 +15,15 @@ from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-# Misfits in units of their robust standard deviation. An area whose misfit reaches the first value is
-# suspected and traced down to the second. The area is a defect if its misfit reaches the third value after
-# the warp is fitted without the area. Effects of a printer other than a Gaussian blur stay below the third
-# value: 13.5 on the measured prints.
+# Misfits in units of their robust standard deviation. An area whose misfit exceeds the first value is
+# suspected, and extends to where the misfit falls to the second value. The area is a defect if its misfit
+# reaches the third value after the warp is fitted without the area. Printer effects other than a Gaussian
+# blur stay below the third value; on the measured prints they reach 13.5.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# If defects cover a larger share of the field, no main surface remains, and the whole print is doubtful.
+# If defects cover more than this share of the field, no main surface remains, and the whole print is
+# doubtful.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
@@ -31,13 +32,13 @@ _FEWEST_PX = 60
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
-# As pixels at the edge of a mask enter and leave the fit, its steps do not fall below a thousandth of a
+# Pixels at the edge of a mask enter and leave the fit, so its steps do not fall below a thousandth of a
 # pixel.
 _TOLERANCE_PX = 0.01
-# A suspected area of at least this share of the field may have spoiled the fit, so that its own misfit looks
-# small.
+# A suspected area of at least this share of the field may have distorted the fit so much that the area's own
+# misfit looks small.
 _WORTH_A_FIT = 0.005
-# Below this correlation the fit of the whole print may be wrong. The measured prints have 0.945 and more.
+# Below this correlation, the fit of the whole print may be wrong. The measured prints reach 0.945 or more.
 _SUSPICIOUS = 0.9
 _MAD_PER_SIGMA = 0.6745
 _TUKEY = 4.685
@@ -47,21 +48,22 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """Return the fit to the pixels outside the defects, and the defects, bool (ny, nx) of the layout. Without
-    defects, return the plain fit.
+    """Find defects and refit the warp without them; return the fit, and the defects or None.
 
-    Every round starts from the coarse warp, which is robust. The round finds the defects under the last warp
-    and fits the warp to the rest, until the corners of the warp no longer move.
+    The defects are bool (ny, nx), on the layout's pixels. If there are none, the plain fit is returned.
+
+    Every round finds the defects under the last warp and fits a new warp to the other pixels, starting from
+    the robust coarse warp. The rounds end when the corners of the warp no longer move.
 
     Args:
         plain: ``refine_pyramid(scan, layout_level, start, model)``.
-        scan, layout_level, start, model: as there.
+        scan, layout_level, start, model: as in ``refine_pyramid``.
     """
     fine, defects = plain, None
     for attempt in range(_ROUNDS):
         found, largest_sigma = find_defects(plain.scan, fine)
         if not found.any() and attempt == 0 and plain.refinement.correlation < _SUSPICIOUS:
-            # A large defect may have pulled the plain fit so far that the whole print misfits.
+            # A large defect may have shifted the plain fit so far that the whole print does not match.
             fine = replace(plain, refinement=replace(plain.refinement, layout_to_scan=start))
             found, largest_sigma = find_defects(plain.scan, fine)
         if not found.any() or (largest_sigma < DEFECT_SIGMA and found.mean() < _WORTH_A_FIT):
@@ -70,8 +72,8 @@ def refine_around_defects(
         masked = without_defects(scan, found, warp)
         fine = refine_pyramid(masked, layout_level, start, model, tolerance_px=_TOLERANCE_PX)
         defects = found
-        # What remains without true defects fits better. Where every edge is shifted, all edges are suspected,
-        # and little remains but flat ground.
+        # Without true defects, the remaining pixels must fit better. If the warp shifts every edge, all edges
+        # are suspected, and little more than flat ground remains.
         if not fine.refinement.converged or fine.refinement.correlation < plain.refinement.correlation:
             return plain, None
         ends = corners(layout_level.shape)
@@ -82,19 +84,18 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Find the pixels of the layout where the scan shows something other than the print, with a margin; also
-    return the largest misfit.
+    """Return the layout pixels where the scan does not show the print, with a margin, and the largest misfit.
 
     The misfit is the scan on the layout's pixels, minus a free function of the predicted topography
     (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
-    connected area of 30 pixels or more with a misfit of 3 sigma that reaches 8 sigma somewhere.
+    connected area of at least 30 pixels whose misfit exceeds 3 sigma everywhere and 8 sigma somewhere.
 
     Args:
-        scan: (ny, nx) smoothed, with the defects, in the frame of the scan of ``fine``.
-        fine: the warp, perhaps fitted without some defects.
+        scan: (ny, nx) smoothed heights, including the defects, in the same frame as ``fine.scan``.
+        fine: the fit of the warp, which may exclude some defects.
 
     Returns:
-        bool (ny, nx) of the layout, and the misfit in units of its robust standard deviation.
+        bool (ny, nx) on the layout's pixels, and the misfit in units of its robust standard deviation.
     """
     from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
 
@@ -103,7 +104,7 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     if misfit is None:
         return nowhere
     # Without noise, the whole misfit may come from edges. Sigma therefore has a lower limit, so that a misfit
-    # that is small compared with the print is not a defect.
+    # that is small compared with the print does not count as a defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
     if size.max() <= SUSPECT_SIGMA:
@@ -115,13 +116,13 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
         return nowhere
-    # Inside a missing part, the ground may happen to have the right height. Such pixels are marked too.
+    # Inside a missing part, some ground may have the right height by chance. Such pixels are marked too.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 
 
 def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array:
-    """Copy the scan (ny, nx), with NaN where it shows a defect of the layout's pixels."""
+    """Return a copy of the scan (ny, nx) with NaN at the defects, which are given on the layout's pixels."""
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
     inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
@@ -129,10 +130,10 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Return the scan minus the part that the layout explains, (ny, nx); NaN at the border and where not
-    measured.
+    """Return the scan minus the part that the layout explains, (ny, nx), on the layout's pixels.
 
-    Return None if the scan shows almost nothing of the layout.
+    The result is NaN at the border and where nothing was measured. It is None if the scan shows almost
+    nothing of the layout.
     """
     from scipy.ndimage import map_coordinates
 
@@ -157,7 +158,7 @@ def _misfit(scan: Array, fine: FineFit) -> Array | None:
 
 
 def _robust(design: Array, values: Array) -> Array:
-    """Fit coefficients with Tukey's weights, starting from a fit with weights that fall off slowly."""
+    """Fit coefficients with Tukey's weights, after some passes with weights that fall off slowly."""
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])
     for step in range(_PASSES):

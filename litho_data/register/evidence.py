@@ -1,4 +1,4 @@
-"""Estimate the uncertainty of a registration by held-out blocks, bootstrap and correlation."""
+"""Estimate the uncertainty of a registration from held-out blocks, a bootstrap and a correlation."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# On straight scans, the mean shifts of blocks differ by up to this many pixels, and by up to 4 standard
-# errors.
+# On straight scans, the mean shifts of blocks differ by no more than the first value, in pixels, and by at
+# most 4 standard errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
@@ -22,8 +22,8 @@ SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 class BlockShifts:
     """Shifts of single blocks of the field relative to the warp; arrays (n, 2) of (x, y) in layout pixels.
 
-    ``shift_px`` is the displacement of a block's content from its position by the warp. ``held_out_px`` is
-    the same for a warp fitted without the block.
+    ``shift_px`` is the displacement of a block's content from the position that the warp predicts.
+    ``held_out_px`` is the same for a warp fitted without the block.
     """
 
     middle_px: Array
@@ -31,24 +31,22 @@ class BlockShifts:
     held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
-        """Return the percentiles of the target registration error; NaN without blocks."""
+        """Return these percentiles of the target registration error, or NaN if there are no blocks."""
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Return the peak-to-valley range of the mean shift along ``axis`` (0 = x, 1 = y) as a function of
-        ``along``.
+        """Return the peak-to-valley range, along one axis, of the blocks' mean shift along ``axis``.
 
-        A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
-        not linear or that the scanner creeps. No warp of the ladder describes this.
+        ``along`` is the axis of the positions (0 = x, 1 = y). With a straight scanner and a sufficient model,
+        the range is only noise. A larger range means that the scanner's axis is not linear or that the
+        scanner creeps, which no warp of the ladder describes.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Return whether the curve along this axis is large, and larger than the scatter of blocks at the
-        same place.
-        """
+        """Return whether the curve along this axis is large and clearly exceeds the scatter of the blocks."""
         for axis in (0, 1):
             groups = self._by_place(axis, along)
             if len(groups) < 3 or min(len(group) for group in groups) < 3:
@@ -68,17 +66,16 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """Return the shift of every block, under the warp and under a warp refitted to the pixels outside the
-    block.
+    """Return the shift of every block relative to the warp, and to a warp fitted without the block.
 
     Args:
-        registered: (ny, nx) smoothed scan on the layout's pixels, background removed, gaps filled.
-        measured: (ny, nx) where it was measured.
-        topography: (ny, nx) blur-matched topography.
+        registered: (ny, nx) smoothed scan on the layout's pixels, with background removed and gaps filled.
+        measured: (ny, nx) mask of the pixels that were measured.
+        topography: (ny, nx) topography with the blur of the scan.
 
-    Blocks are half-overlapping windows of four cells, away from the layout's border, with structure and with
-    gaps in at most a tenth of their area. A block's shift is the peak of its normalised cross-correlation
-    (parabola through the neighbours).
+    Blocks are square windows with sides of four cells; neighbours overlap by half. A block must lie away
+    from the layout's border, contain structure, and have gaps in at most a tenth of its area. Its shift is
+    the peak of the normalised cross-correlation, refined by a parabola through the neighbouring values.
     """
     import cv2
 
@@ -104,7 +101,7 @@ def match_blocks_of_field(
             shift = _peak(cv2.matchTemplate(window, block, cv2.TM_CCOEFF_NORMED)) - WINDOW_SEARCH_PX
             others = total - gram[i : i + size, j : j + size].sum(axis=(0, 1))
             middle = np.array([(left + right - 1) / 2, (top + bottom - 1) / 2])
-            # The scan shows at x what the topography has at x - shift; the refit explains x + motion.
+            # The scan at x shows the topography at x - shift; the refitted warp accounts for x + motion.
             motion = corner_motion_px(solve_gram(others), shape, middle[None])[0]
             middles.append(middle)
             shifts.append(shift)
@@ -113,7 +110,7 @@ def match_blocks_of_field(
 
 
 def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> float:
-    """Return the largest standard deviation of a corner over bootstrap draws of the field's blocks, px."""
+    """Return the largest standard deviation of a corner's position, in px, over a bootstrap of the blocks."""
     blocks = refinement.blocks()
     blocks = blocks.reshape(-1, *blocks.shape[2:])
     if len(blocks) < 4:
@@ -126,9 +123,9 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 
 
 def height_correlation(height: Array, layout_level: Array) -> float:
-    """Return the Pearson correlation of heights, smoothed with sigma = 1 px, with the unblurred layout.
+    """Return the Pearson correlation between heights smoothed with sigma = 1 px and the unblurred layout.
 
-    Only valid pixels at least 8 px from the border of the layout are used. Heights (ny, nx) may contain NaN.
+    Only valid pixels at least 8 px from the layout's border are used. The heights (ny, nx) may contain NaN.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:
@@ -137,7 +134,7 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Return the sub-pixel position (x, y) of the maximum; a maximum on the border is returned as it is."""
+    """Return the sub-pixel position (x, y) of the maximum, or its pixel if it lies on the border."""
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)
     for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):

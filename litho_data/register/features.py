@@ -1,4 +1,4 @@
-"""Register coarsely without assuming a position: match points and fit a robust affine."""
+"""Register coarsely, without an initial position, by matching keypoints and fitting a robust affine map."""
 
 from dataclasses import dataclass
 
@@ -19,11 +19,11 @@ _FEWEST_MATCHES = 6
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Matched points and the affine that most of them agree on.
+    """Matched points, and the affine map with which most of them agree.
 
     ``layout_points`` and ``scan_points`` are (n, 2) index coordinates (x, y) of the matches. ``inlier`` says
-    which of them agree with ``layout_to_scan`` within ``INLIER_PX``. ``hull_px2`` is the area of the layout
-    inside the convex hull of the inliers, and ``keypoints`` the smaller count of the two images.
+    which matches agree with ``layout_to_scan`` within ``INLIER_PX``. ``hull_px2`` is the area of the layout
+    inside the convex hull of the inliers. ``keypoints`` is the smaller of the two images' keypoint counts.
     """
 
     keypoints: int
@@ -38,8 +38,9 @@ class Correspondence:
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
     def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
-        """Return the root mean square distance of the inliers from a warp, in pixels of the (straightened)
-        scan.
+        """Return the root mean square distance of the inliers from the warp, in scan pixels.
+
+        If a bend is given, the distances are those in the straightened scan.
         """
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
         found = self.scan_points[self.inlier]
@@ -48,7 +49,7 @@ class Correspondence:
 
 
 def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
-    """Find keypoints of both images by ORB, match them with a cross-check, and fit an affine by MAGSAC.
+    """Find ORB keypoints in both images, match them with a cross-check, and fit an affine map by MAGSAC++.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
@@ -56,7 +57,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
         seed: seed of the robust estimator.
 
     Returns:
-        None if there are too few matches or no affine fits them.
+        The correspondence, or None if there are too few matches or no affine map fits them.
 
     ORB: E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544. MAGSAC++: D. Barath et al., CVPR 2020,
     doi:10.1109/CVPR42600.2020.00138.
@@ -80,7 +81,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
     affine, inlier = cv2.estimateAffine2D(
         layout_points, scan_points, method=cv2.USAC_MAGSAC, ransacReprojThreshold=INLIER_PX, maxIters=5000
     )
-    # OpenCV gives None where its types promise a matrix.
+    # OpenCV may return None, although its type annotations promise a matrix.
     if not np.isfinite(np.asarray(affine, dtype=float)).all():
         return None
     inlier = np.asarray(inlier).reshape(-1).astype(bool)
@@ -93,9 +94,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
 
 
 def _contrast_image(image: Array) -> Array:
-    """Return an 8-bit copy with equalised local contrast, which is used to find keypoints, never for
-    heights.
-    """
+    """Return an 8-bit copy with equalised local contrast, used only to find keypoints."""
     import cv2
 
     low, high = np.percentile(image, (0.5, 99.5))

@@ -1,4 +1,4 @@
-"""Compute the figures of one registration from the fit and the images that it compared."""
+"""Compute the quality figures of one registration from the fit and the images that it compared."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from litho_data.register.topography import quadratic_basis
 
 
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    """Return figures of the fit: how the warp was found, and how well it explains matches and heights."""
+    """Return figures that say how the warp was found and how well it explains the matches and heights."""
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
     return {
@@ -34,9 +34,9 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
-    """Return place, scale and rotation at the layout's middle; a bent scan has those of the closest affine.
+    """Return shift, scale and rotation at the layout's centre; for a bent scan, those of its affine part.
 
-    The place is the position of the middle in the scan minus its position in the layout.
+    The shift is the position of the centre in the scan minus its position in the layout.
     """
     middle_um = (centre(layout_shape) + 0.5) * pitch_um
     linear = np.linalg.inv(linear_part(layout_to_scan, middle_um))
@@ -53,8 +53,9 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
-    """Return figures of the warp's uncertainty, from held-out blocks, bootstrap and other candidates; also
-    return the blocks.
+    """Return figures of the warp's uncertainty, and the shifts of the blocks.
+
+    The figures come from held-out blocks, a bootstrap, and other shifts and orientations of the scan.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))

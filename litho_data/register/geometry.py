@@ -1,8 +1,7 @@
-"""Frames, units and orientations: how pixel indices, micrometres and rotated images correspond.
+"""Convert between pixel indices, micrometres, and rotated or mirrored images.
 
-Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. An *index* frame counts
-pixel centres 0, 1, 2 …; the micrometre frame of the same image has those centres at
-``(i + 0.5) * pitch_um``.
+Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. In an *index* frame, pixel centres lie
+at 0, 1, 2 …; in the micrometre frame of the same image, they lie at ``(i + 0.5) * pitch_um``.
 """
 
 import numpy as np
@@ -11,8 +10,8 @@ from litho_data.foundation import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
-# For each name: whether to transpose, then flip rows, then flip columns. The operation turns the scan onto
-# the layout.
+# Each name tells whether to transpose the scan, then flip its rows, then flip its columns. After the
+# operation, the scan has the orientation of the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -32,7 +31,7 @@ def index_to_um(pitch_um: YX) -> Array:
 
 
 def orient(image: Array, orientation: str) -> Array:
-    """Return the image after one of the eight operations of ``ORIENTATIONS`` (a view)."""
+    """Return a view of the image after one of the eight operations of ``ORIENTATIONS``."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     turned = image.T if transpose else image
     turned = turned[::-1] if flip_y else turned
@@ -40,8 +39,9 @@ def orient(image: Array, orientation: str) -> Array:
 
 
 def orientation_matrix(orientation: str, shape: Shape) -> Array:
-    """Return the matrix that maps indices of an image of this (y, x) shape to indices of ``orient(image,
-    orientation)``.
+    """Return the matrix that maps indices of an image to indices of ``orient(image, orientation)``.
+
+    ``shape`` is the (y, x) shape of the image.
     """
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
@@ -56,16 +56,16 @@ def orientation_matrix(orientation: str, shape: Shape) -> Array:
 
 
 def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
-    """Return the axis (0 = x, 1 = y) of an oriented scan along which its lines follow each other.
+    """Return the slow axis (0 = x, 1 = y) of an oriented scan: the axis across its lines.
 
-    Lines run along the ``fast_axis`` of the scan as it was read; x if unknown.
+    ``fast_axis`` is the direction of the lines in the scan as it was read; None counts as x.
     """
     transposed = ORIENTATIONS[orientation][0]
     return int((fast_axis == "y") == transposed)
 
 
 def nearest_orientation(linear: Array) -> str:
-    """Return the orientation whose linear part is closest (Frobenius norm) to a 2×2 matrix."""
+    """Return the orientation whose linear part is closest, in the Frobenius norm, to a 2×2 matrix."""
     unit = linear / np.sqrt(abs(np.linalg.det(linear)))
 
     def distance(name: str) -> float:
@@ -75,16 +75,16 @@ def nearest_orientation(linear: Array) -> str:
 
 
 def apply_transform(matrix: Array, points: Array) -> Array:
-    """Map (n, 2) points (x, y) by a 3×3 matrix."""
+    """Map points (x, y), shape (n, 2), by a 3×3 matrix."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
-    """Return the (rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
+    """Return the (rows, columns) to which a 3×3 index matrix maps every pixel of an image.
 
-    If the target image has a bend, the matrix gives true positions, and the result is the points at these
-    positions.
+    If the target image has a bend, the matrix gives true positions, and the function returns the points of
+    the bent image at these true positions.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]
@@ -97,9 +97,7 @@ def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[
 def overlap_of(
     layout_to_scan: Array, layout_shape: Shape, measured: Array, bend: Bend | None = None
 ) -> Array:
-    """Return a mask, bool (ny, nx), of the layout pixels whose centres lie inside the measured part of the
-    scan.
-    """
+    """Return a bool mask (ny, nx) of the layout pixels whose centres fall on measured pixels of the scan."""
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
@@ -107,13 +105,13 @@ def overlap_of(
 
 
 def nearest(image: Array, rows: Array, columns: Array) -> Array:
-    """Return the pixels of an image (ny, nx) that lie nearest to these places."""
+    """Return the values of the pixels of an image (ny, nx) nearest to these positions."""
     clipped = (np.clip(np.rint(k), 0, n - 1) for k, n in zip((rows, columns), image.shape, strict=True))
     return image[tuple(k.astype(int) for k in clipped)]
 
 
 def lattice(y: Array, x: Array) -> Array:
-    """Return the points (x, y) of a grid with these rows and columns, (n, 2), row by row."""
+    """Return the points (x, y) of a grid with these y and x, row by row, shape (n, 2)."""
     return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
 
 
@@ -131,5 +129,5 @@ def corners(shape: Shape) -> Array:
 
 
 def centre(shape: Shape) -> Array:
-    """Return the index coordinates (x, y) of the middle of an image, shape (2,)."""
+    """Return the index coordinates (x, y) of the centre of an image, shape (2,)."""
     return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])

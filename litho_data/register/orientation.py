@@ -1,4 +1,4 @@
-"""Find orientation, sign and rough position by masked normalised cross-correlation over all shifts."""
+"""Find orientation, polarity and rough position by masked normalised cross-correlation over all shifts."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ TIE = 0.02
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One orientation and polarity of the scan with its best shift.
+    """One orientation and polarity of the scan, with the shift that correlates best.
 
     ``layout_to_oriented`` maps layout indices to indices of the oriented scan. ``ncc`` is the correlation at
     this shift, already multiplied by the polarity.
@@ -27,14 +27,14 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """Return all hypotheses, best first, by masked correlation of low-resolution copies.
+    """Return one hypothesis per orientation and polarity, best first, by correlating low-resolution copies.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
         topography: (ny, nx) predicted topography.
 
     Returns:
-        The list is empty if the scan or the layout shows no structure at all.
+        The list of hypotheses, which is empty if the scan or the layout shows no structure at all.
     """
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
@@ -44,15 +44,14 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
         correlation, overlap = masked_correlation(small_topography, moving)
         if np.isnan(correlation).all():
             continue
-        # This only breaks ties: on a repeating layout, the shift with the larger overlap is the better guess.
+        # This term only breaks ties. On a repeating layout, the shift with more overlap is the better guess.
         handicap = TIE * (1 - overlap / overlap.max())
         # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the size is
         # not a multiple of the factor, rotating a scan moves the remainder to the other side.
         cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
         for polarity in (1, -1):
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
-            # Shifts run from -(fixed size - 1) to moving size - 1, and negative shifts are wrapped to the
-            # end.
+            # Shifts run from -(fixed size - 1) to moving size - 1. Negative shifts are stored at the end.
             shift_y = int(row) - (correlation.shape[0] if row >= moving.shape[0] else 0)
             shift_x = int(column) - (correlation.shape[1] if column >= moving.shape[1] else 0)
             matrix = np.array(
@@ -64,9 +63,9 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Return the correlation of the best rival shift, as a share of the registration's own correlation.
+    """Return the correlation at the best rival shift, divided by the correlation of the registration itself.
 
-    A rival is a local maximum of the correlation over shifts at least a sixteenth of the field away. If the
+    A rival is a local maximum of the correlation at a shift of at least a sixteenth of the field. If the
     topography is given in place of the scan, the result says how strongly the layout repeats.
     """
     from scipy.ndimage import maximum_filter
@@ -84,8 +83,9 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Return the largest correlation with the topography, over all shifts, of the registered scan after
-    rotation, mirroring or inversion.
+    """Return the largest correlation, over all shifts, of the rotated, mirrored or inverted scan.
+
+    The registered scan is correlated with the topography.
     """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
@@ -100,8 +100,9 @@ def rival_orientation(registered: Array, topography: Array) -> float:
 
 
 def reduce_image(image: Array, factor: int) -> Array:
-    """Average blocks of ``factor`` × ``factor`` pixels, without the remainder; NaN where half of a block is
-    missing.
+    """Average blocks of ``factor`` × ``factor`` pixels; a block of which half or more is missing gives NaN.
+
+    Rows and columns at the end that do not fill a block are cropped.
     """
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
@@ -118,8 +119,9 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     doi:10.1109/TIP.2011.2181402, eq. 11.
 
     Returns:
-        Correlation and number of overlapping pixels, indexed by the shift modulo their shape; the
-        correlation is NaN if less than ``MIN_OVERLAP`` of the smaller image overlaps or one side is constant.
+        Correlation and number of overlapping pixels, both indexed by the shift modulo the shape. The
+        correlation is NaN if less than ``MIN_OVERLAP`` of the smaller image overlaps or one image is constant
+        in the overlap.
     """
     from scipy.fft import irfft2, next_fast_len
 
@@ -136,14 +138,14 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     variance2 = summed(mask1, square2) - total2**2 / overlap
     covariance = summed(height1, height2) - total1 * total2 / overlap
     least = MIN_OVERLAP * min(np.isfinite(one).sum() for one in (fixed, moving))
-    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of the energy has no structure.
+    # Rounding errors are 1e-12 of the energy. An image with less than 1e-6 of the energy has no structure.
     usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
     product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
     return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
 
 
 def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Transform the mask of an image's measured pixels, its heights at unit energy, and their squares."""
+    """Return the spectra of the mask of measured pixels, the heights at unit energy, and their squares."""
     from scipy.fft import rfft2
 
     measured = np.isfinite(image)

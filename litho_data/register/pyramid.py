@@ -1,4 +1,4 @@
-"""Refine a registration from coarse to fine, and match the blur of the print on the way."""
+"""Refine a registration from coarse to fine resolution, and estimate the blur of the print on the way."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,9 +25,7 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """The refinement and the two images that it compared: the smoothed scan and the blur-matched
-    topography.
-    """
+    """The refinement and the two images that it compared: the smoothed scan and the blurred topography."""
 
     refinement: Refinement
     scan: Array
@@ -48,11 +46,11 @@ def refine_pyramid(
     Args:
         scan: (ny, nx) oriented heights without bow at the layout's pitch, NaN where not measured.
         layout_level: (ny, nx) integer levels.
-        start: 3×3 index matrix, layout to scan.
-        model: rung of the ladder; the reduced levels use at most an affine.
-        tolerance_px: tolerance of the last level.
+        start: 3×3 index matrix from the layout to the scan.
+        model: rung of the ladder; at reduced resolution, a homography is replaced by an affine map.
+        tolerance_px: tolerance at full resolution.
 
-    If the last level does not converge, the coarse warp is returned, marked as not converged.
+    If the fit at full resolution does not converge, the coarse warp is returned, marked as not converged.
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, layout_level.shape)
@@ -78,13 +76,14 @@ def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model:
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield factor, scan and predicted topography at a quarter and at half resolution, if they are large
-    enough.
+    """Yield factor, scan and predicted topography at a quarter and at half resolution.
+
+    A resolution at which the images would be too small is skipped.
     """
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
-        # The extra blur widens the basin of convergence to the few pixels by which a coarse fit may be off.
+        # A coarse fit may be off by a few pixels. The extra blur lets the refinement converge from there.
         small_scan = _smooth(scan, factor)[::factor, ::factor]
         yield factor, small_scan, predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
 
@@ -92,7 +91,7 @@ def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Arra
 def match_blur(
     smooth_scan: Array, layout_level: Array, layout_to_scan: Array, bend: Bend | None = None
 ) -> float:
-    """Find the Gaussian sigma, in layout pixels, whose topography correlates best with an aligned scan."""
+    """Return the Gaussian sigma, in layout pixels, whose topography correlates best with the aligned scan."""
     from scipy.ndimage import map_coordinates
 
     grid = warped_grid(layout_to_scan, layout_level.shape, bend)
@@ -112,8 +111,10 @@ def match_blur(
 
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
-    """Return the warp of a lower rung that moves the corners of the field most nearly as a given warp
-    does.
+    """Return the warp of this model that approximates a given warp best.
+
+    An affine map matches the given warp to first order at the centre of the field. Simpler models fit the
+    positions of the corners.
     """
     if model == "homography":
         return matrix
@@ -133,7 +134,7 @@ def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
 
 
 def _about(linear: Array, point: Array, image: Array) -> Array:
-    """Return the affine that has a given linear part and maps one point to its image."""
+    """Return the affine map that has a given linear part and maps one point to its image."""
     matrix = np.eye(3)
     matrix[:2, :2] = linear
     matrix[:2, 2] = image - linear @ point
@@ -141,7 +142,7 @@ def _about(linear: Array, point: Array, image: Array) -> Array:
 
 
 def _smooth(scan: Array, sigma_px: float) -> Array:
-    """Smooth the scan where it was measured; gaps stay NaN, because smoothing fills them without evidence."""
+    """Smooth the scan where it was measured, and keep NaN in the gaps, where nothing is known."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)
 
 
@@ -149,13 +150,12 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """Return the fit on the lowest rung of the ladder that no higher rung surpasses on held-out blocks.
+    """Return the fit on the lowest rung of the ladder that no higher rung beats on held-out blocks.
 
     Args:
-        fine: a converged affine fit; every rung starts from its projection.
+        fine: a converged affine fit; the fit on every rung starts from this warp, projected to the rung.
 
-    A higher rung is better if its gain on held-out blocks, averaged over the blocks, exceeds three standard
-    errors.
+    A higher rung is better if its mean gain on held-out blocks exceeds three standard errors of this mean.
     """
     shape = fine.topography.shape
     start = fine.refinement.layout_to_scan
@@ -170,9 +170,9 @@ def climb(fine: FineFit) -> FineFit:
 
 
 def held_out_energy(refinement: Refinement) -> Array:
-    """Return the residual energy of every block under the fit to the blocks of the other folds, (n,).
+    """Return the residual energy (n,) of every block under a fit to the blocks of the other folds.
 
-    The folds interleave, so each is spread over the whole field.
+    The folds interleave, so each fold is spread over the whole field.
     """
     blocks = refinement.blocks()
     rows, columns = np.indices(blocks.shape[:2])

@@ -1,4 +1,4 @@
-"""The record of one registration, and the limits that it must meet to pass."""
+"""Define the quality record of a registration, and the limits within which a registration passes."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -8,18 +8,18 @@ from litho_data.register.bend import Bend
 
 @dataclass(frozen=True)
 class RegistrationQuality:
-    """The figures of one registration; NaN for a figure that could not be computed.
+    """The quality figures of one registration; a figure that could not be computed is NaN.
 
-    Lengths in px are layout pixels; figures in nm are the same lengths times the pitch.
+    Lengths in px are in layout pixels; figures in nm are the same lengths times the pitch.
     """
 
     passed: bool
-    reason: str  # why it failed; empty when passed
-    warning: str  # what to know about a scan that passed
+    reason: str  # why the registration failed; empty if it passed
+    warning: str  # what the user should know about the registration, even if it passed
     model: str
-    method: str  # orb | correlation: what found the coarse fit
-    dihedral: str  # the operation that brings the scan onto the layout
-    polarity: int  # -1: the scan shows the layout's negative
+    method: str  # how the coarse fit was found: orb | correlation
+    dihedral: str  # the operation that gives the scan the orientation of the layout
+    polarity: int  # -1 if the scan shows the layout's negative
     converged: bool
     keypoints: int
     matches: int
@@ -54,14 +54,14 @@ class RegistrationQuality:
     noise_variance_factor: float
 
 
-# Limits of a pass; docs/registration.md gives the reason for each.
+# A registration must meet these limits to pass; docs/registration.md gives the reason for each.
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
-# If the blur of the print (sigma) exceeds this, MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX grow with the blur.
+# If the sigma of the print's blur exceeds this, MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX grow with the blur.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
-# If the slope is 1 or more, two points of the scan may show the same position.
+# If the slope of a bend is 1 or more, two points of the scan may show the same position.
 MAX_BEND_SLOPE = 1.0
 
 
@@ -70,7 +70,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
 
     Args:
         figures: figures of the fit, the warp and the evidence.
-        blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
+        blur_px: sigma, in layout pixels, of the blur that makes the layout most similar to the scan.
         bend_um: the bend of the scan in its own frame, if one was fitted.
     """
     smallest, largest = figures["singular_min"], figures["singular_max"]
@@ -85,41 +85,48 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     low, high = SINGULAR_RANGE
     warning_low, warning_high = SINGULAR_WARNING_RANGE
     bent_um = 0.0 if bend_um is None else bend_um.largest
-    how = "registered with a quadratic distortion"
+    how = "a quadratic distortion was fitted"
     if bend_um is not None and bend_um.kind == "creep":
-        how = "its lines creep along the slow axis; the creep is corrected"
-    # Each test is written as "not >=", so that a figure that could not be computed fails.
+        how = "its lines creep along the slow axis, and the creep was corrected"
+    # Some tests are written as "not >=", so that a figure that could not be computed (NaN) fails.
     failures = {
-        f"correlation {ecc:.2f}, at least {MIN_ECC} wanted": not fits,
-        f"ambiguous: the layout repeats itself, correlation {repeats:.2f} with its own shift": repeating,
-        f"ambiguous: at another shift the correlation is {second:.2f} times as high": fits
+        f"the correlation of scan and layout is {ecc:.2f}, but must be at least {MIN_ECC}": not fits,
+        f"ambiguous: the layout repeats itself (correlation {repeats:.2f} with a shifted copy)": repeating,
+        f"ambiguous: at another shift, the correlation is {second:.2f} times that of the fit": fits
         and not repeating
         and second > MAX_SECOND_ALIGNMENT,
-        f"ambiguous: another orientation or polarity correlates within {margin:.2f}": tied and not upright,
-        f"overlap {overlap:.2f}, at least {MIN_OVERLAP} wanted": not overlap >= MIN_OVERLAP,
-        f"{scale}, {low} to {high} wanted; is the pitch right?": not low <= smallest <= largest <= high,
-        f"target registration error {tre_px:.2f} px": tre_px > softness * MAX_TRE_MEDIAN_PX,
-        "corners not determined": spread_px != spread_px,
-        f"corners are known only to {spread_px:.2f} px": spread_px > softness * MAX_CORNER_SD_PX,
-        f"bent by up to {bent_um:.2f} µm, which may fold the scan": bend_um is not None
+        f"ambiguous: the correlation in another orientation or polarity is only {margin:.2f} lower": tied
+        and not upright,
+        f"the overlap of scan and layout is {overlap:.2f}, but must be at least {MIN_OVERLAP}": not (
+            overlap >= MIN_OVERLAP
+        ),
+        f"{scale}, but only {low} to {high} is allowed; check the pitch": not (
+            low <= smallest <= largest <= high
+        ),
+        f"the target registration error of {tre_px:.2f} px is too large": tre_px
+        > softness * MAX_TRE_MEDIAN_PX,
+        "the fit does not determine the positions of the corners": spread_px != spread_px,
+        f"the positions of the corners are uncertain by {spread_px:.2f} px": spread_px
+        > softness * MAX_CORNER_SD_PX,
+        f"the bend of up to {bent_um:.2f} µm is so steep that it may fold the scan": bend_um is not None
         and not bend_um.slope < MAX_BEND_SLOPE,
     }
     warnings = {
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
-        f"{defects:.1%} of the field does not show the print and is left out": defects > 0,
-        f"{scale}; is the pitch right?": not warning_low <= smallest <= largest <= warning_high,
-        "layout looks the same in another orientation; upright assumed": tied and upright,
-        f"target registration error {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,
-        "inverted contrast": figures["polarity"] == -1,
-        "coarse fit by correlation, no feature matches": figures["method"] != "orb",
-        "refinement did not converge": not figures["converged"],
+        f"{defects:.1%} of the field does not show the print and was excluded": defects > 0,
+        f"{scale}; check the pitch": not warning_low <= smallest <= largest <= warning_high,
+        "the layout looks the same in another orientation, so upright was assumed": tied and upright,
+        f"the target registration error is {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,
+        "the contrast of the scan is inverted": figures["polarity"] == -1,
+        "coarse fit by correlation only, without matched features": figures["method"] != "orb",
+        "the refinement did not converge": not figures["converged"],
     }
     reasons, said = ("; ".join(text for text, so in one.items() if so) for one in (failures, warnings))
     return not reasons, reasons, said
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
-    """Make the record of a scan without any fit, in which every figure is missing."""
+    """Make the quality record of a scan that could not be fitted at all; every figure is missing."""
     empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
     figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
     return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

@@ -1,5 +1,4 @@
-"""Refine a registration to sub-pixel accuracy on the heights themselves, by enhanced correlation, on any rung
-of the ladder.
+"""Refine a registration to sub-pixel accuracy by maximising the correlation of heights and topography.
 
 Gauss-Newton steps in the inverse compositional form maximise the correlation between the scan and the
 predicted topography over a warp, a gain and a quadratic background at once. G. D. Evangelidis, E. Z.
@@ -22,20 +21,20 @@ from litho_data.register.topography import fill_gaps, quadratic_basis
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
 _BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
 CELL_PX = 32
-# In a border of this width, the blurred heights depend on the unknown surroundings of the print (bare ground
-# or a neighbouring print).
+# Within this distance of the border, the blurred heights depend on the unknown surroundings of the print,
+# such as bare ground or a neighbouring print.
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """A converged warp, and the data that determine its uncertainty.
+    """A refined warp, whether it converged, and the data that determine its uncertainty.
 
-    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it maps to the straightened scan.
+    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend``, it maps to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, with gaps filled. ``gram`` (cells_y,
-    cells_x, k, k) contains, for each cell of ``CELL_PX`` pixels, the inner products of the regressors (gain,
-    background, warp) and, last, the scan. These sums are enough to refit any part of the field.
+    cells_x, k, k) contains the inner products of the regressors (gain, background, warp) and, last, the scan,
+    for each cell with sides of about ``CELL_PX`` pixels. These sums suffice to refit any part of the field.
     """
 
     model: Model
@@ -46,7 +45,7 @@ class Refinement:
     bend: Bend | None = None
 
     def blocks(self) -> Array:
-        """Sum ``gram`` over blocks, see ``in_blocks``."""
+        """Return ``gram``, summed over blocks by ``in_blocks``."""
         return in_blocks(self.gram)
 
     @property
@@ -56,8 +55,9 @@ class Refinement:
 
     @property
     def correlation(self) -> float:
-        """Return the partial correlation of scan and topography given the background; 0 if the gain is not
-        positive.
+        """Return the partial correlation of scan and topography, given the background.
+
+        The correlation is 0 if the fitted gain is not positive.
         """
         total = self.gram.sum(axis=(0, 1))
         background = total[np.ix_(_BACKGROUND_AND_SCAN, _BACKGROUND_AND_SCAN)]
@@ -78,16 +78,17 @@ def refine(
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
-    """Find the warp of this model that maximises the correlation; the error of the start may reach the width
-    of the structures.
+    """Find the warp of this model that maximises the correlation of scan and topography.
 
     Args:
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
-        start: 3×3 index matrix, layout to scan, of the kind ``model``.
-        bend: bend of the scan. The start is then an affine, and warp and bend are evaluated, not refined.
+        start: 3×3 index matrix from the layout to the scan, of the kind ``model``. Its error may be as large
+            as the width of the structures.
+        bend: bend of the scan. If given, ``start`` must be an affine map, and warp and bend are evaluated but
+            not refined.
         max_iterations: largest number of Gauss-Newton steps; 0 only evaluates the start.
-        tolerance_px: the iteration ends at a step that moves every corner by less.
+        tolerance_px: the iteration ends when a step moves every corner by less than this.
     """
     from scipy.linalg import expm
     from scipy.ndimage import map_coordinates, spline_filter
@@ -127,11 +128,10 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """Return the ``gram`` of a scan that is already aligned with the topography (ny, nx); NaN where not
-    measured.
+    """Return the ``gram`` of a scan that is already aligned with the topography.
 
-    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further``: more regressors (ny,
-    nx).
+    Both are (ny, nx); the scan is NaN where not measured. ``count`` is the number of flows of the warp, see
+    ``LADDER`` and ``BENT_COUNT``. ``further`` are additional regressors (ny, nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)
@@ -140,35 +140,38 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
 
 
 def in_blocks(gram: Array) -> Array:
-    """Sum the inner products per cell over blocks of two by two cells, (blocks_y, blocks_x, k, k).
+    """Sum the inner products of the cells over blocks of two by two cells, (blocks_y, blocks_x, k, k).
 
-    Errors of the topography extend over one or two features, so a block is the smallest independent piece.
+    Errors of the topography extend over one or two features, so a block is the smallest area that counts as
+    independent.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
 
 
 def solve_gram(gram: Array) -> Array:
-    """Return the least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
+    """Return the coefficients of the least-squares fit of the regressors to the scan, from inner products.
+
+    The inner products have the shape (…, k, k).
+    """
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge at the float32 precision of the regressors keeps what the layout does not determine at zero.
+    # A ridge at the float32 precision of the regressors sets coefficients to zero that the layout does not
+    # determine.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
 
 def residual_energy(gram: Array, coefficients: Array) -> Array:
-    """Return the sum of squared residuals of given coefficients over the pixels behind inner products (…, k,
-    k).
-    """
+    """Return the sum of squared residuals for given coefficients and inner products (…, k, k)."""
     extended = np.concatenate([coefficients, -np.ones((*coefficients.shape[:-1], 1))], axis=-1)
     return np.einsum("...i,...ij,...j->...", extended, gram, extended)
 
 
 def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
-    """Return the displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
+    """Return the displacements (…, n, 2), in layout pixels, that fitted coefficients (…, k) give to points.
 
-    The result is not finite where the fitted gain of the topography is 0.
+    The points are (n, 2). The result is not finite where the fitted gain of the topography is 0.
     """
     normalise = normalisation(shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -179,14 +182,15 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
 
 
 def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
-    """Return a mask (ny, nx) of the pixels away from the border."""
+    """Return a mask (ny, nx) of the pixels that do not lie in the border."""
     border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
 def _regressors(topography: Array, count: int) -> Array:
-    """Return the regressors (7 + count, ny, nx): topography, quadratic background, change of the topography
-    per generator.
+    """Return the regressors: topography, quadratic background, and the topography's change by each generator.
+
+    The shape is (7 + count, ny, nx).
     """
     shape = topography.shape
     scale = normalisation(shape)[0, 0]
@@ -209,7 +213,7 @@ def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:
     gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
     for i, (top, bottom) in enumerate(pairwise(rows)):
         for j, (left, right) in enumerate(pairwise(columns)):
-            # Sums are in float64, because the result must not depend on the order in which BLAS adds.
+            # The sums use float64, because the result must not depend on the order in which BLAS adds.
             cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(float)
             gram[i, j] = cell @ cell.T
     return gram

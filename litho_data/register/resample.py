@@ -1,4 +1,4 @@
-"""The only resampling between a scan and the dataset: float heights, gaps kept."""
+"""Resample a scan onto the layout's pixels, once; the heights stay floats, and gaps stay gaps."""
 
 from functools import lru_cache
 
@@ -10,7 +10,7 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# Number of sub-pixel positions, and reach of the spline in pixels, for the figures of the resampling.
+# Sub-pixel positions, and pixels that the spline reaches, used to compute how resampling changes noise.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -24,33 +24,33 @@ def resample_to_layout(
     layout_pitch_um: float,
     bend_um: Bend | None = None,
 ) -> tuple[Array, Array]:
-    """Interpolate the heights of a scan once, by a cubic spline, at the pixel centres of the layout.
+    """Interpolate the heights of a scan at the layout's pixel centres by a cubic spline.
 
     Args:
         height_um: (ny, nx) in the scan's own frame, NaN where not measured.
-        scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
+        scan_to_layout: 3×3 matrix that maps (x_um, y_um, 1) of the scan to the layout.
         layout_shape: (ny, nx) of the result.
         scan_pitch_um: (y, x) pitch of the scan.
         layout_pitch_um: pitch of the layout.
-        bend_um: bend of the scan, in µm of its frame; it changes where the heights are interpolated.
+        bend_um: bend of the scan, in µm in the scan's frame; it changes where the heights are interpolated.
 
     Returns:
         ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
-        valid if it falls between the scan's pixel centres and no gap lies within two pixels of it, the
+        valid if it falls between the scan's pixel centres and no gap lies within two pixels, which is the
         reach of the spline's kernel.
 
     Raises:
-        InputError: a transform that is not an invertible 3×3 matrix, or a scan without a measured pixel.
+        InputError: the transform is not an invertible 3×3 matrix, or the scan has no measured pixel.
 
-    A scan sampled more finely than the layout is first averaged over the layout's pixel (with a Gaussian of
-    the missing width), because plain interpolation would alias its noise.
+    If the scan is sampled more finely than the layout, a Gaussian first averages it over the size of a layout
+    pixel, because plain interpolation would alias the scan's noise.
     """
     from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 
     height, matrix = np.asarray(height_um, dtype=float), np.asarray(scan_to_layout, dtype=float)
     measured = np.isfinite(height)
     if not measured.any():
-        raise InputError("scan", got="no measured pixel", wanted="finite heights")
+        raise InputError("scan to resample", got="no measured pixel", wanted="finite heights")
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
         raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
     layout_to_um = index_to_um((layout_pitch_um, layout_pitch_um))
@@ -69,25 +69,26 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Return the share of the variance of white pixel noise that resampling leaves, averaged over sub-pixel
-    positions.
+    """Return the share of the variance of white pixel noise that remains after resampling.
+
+    The share is a mean over sub-pixel positions.
     """
     along_y, along_x = (line_variance_factor(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um)
     return along_y * along_x
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the share of the variance of white line offsets that resampling across the lines leaves."""
+    """Return the share of white line offsets' variance that remains after resampling across the lines."""
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Return frequencies (n,) up to the Nyquist frequency, cycles/µm, and the squared error of a resampled
-    wave at each frequency.
+    """Return frequencies (n,) and, for each, the squared error that resampling causes in a wave.
 
-    The error is relative to the wave's squared amplitude and averaged over sub-pixel positions. Averaging a
-    finely sampled scan over the layout's pixel does not count as an error.
+    The frequencies run up to the Nyquist frequency, in cycles/µm. The error is relative to the wave's squared
+    amplitude and averaged over sub-pixel positions. Averaging a finely sampled scan over the layout's pixel
+    does not count as an error.
     """
     frequency = np.linspace(0, 0.5, 129)
     lags = _LAGS[None, :] + _PHASES[:, None]
@@ -99,8 +100,9 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return the weights (phases, lags) in one layout pixel of the scan pixels at a distance of lag + phase
-    pixels.
+    """Return the weights (phases, lags) with which scan pixels enter one layout pixel.
+
+    The distance of each scan pixel from the layout pixel is lag + phase, in pixels.
     """
     from scipy.ndimage import map_coordinates
 
@@ -120,7 +122,6 @@ def _average_over_layout_pixel(height: Array, scan_pitch_um: YX, layout_pitch_um
 
 def _average_px(pitch_um: float, layout_pitch_um: float) -> float:
     """Return the sigma, in scan pixels, of the Gaussian that averages a scan over the layout's pixel."""
-    # A box of r pixels has variance (r² - 1) / 12; if the pitches differ by less than 10 % they count as
-    # equal.
+    # A box of r pixels has the variance (r² - 1) / 12. Pitches that differ by less than 10 % count as equal.
     ratio = layout_pitch_um / pitch_um
     return ((ratio**2 - 1) / 12) ** 0.5 if ratio > 1.1 else 0.0

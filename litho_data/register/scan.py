@@ -31,29 +31,29 @@ from litho_data.register.topography import predicted_topography, remove_bow
 from litho_data.scan import Axis, Scan
 
 MIN_SIZE_PX = 32
-# One picometre is below the resolution of any instrument and above rounding errors.
+# One picometre is below the resolution of any instrument, but above rounding errors.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend is fitted together with an affine. If the caller chose a stiffer model, no bend is fitted.
+# A bend is fitted together with an affine map. If the caller chose a stiffer model, no bend is fitted.
 BENDABLE = ("affine", "homography", "ladder")
-# A bend is accepted if it reduces the error on held-out blocks to this share. A real bend removes nearly all
-# of the error, so the limit separates real bends clearly from others.
+# A bend is accepted if it reduces the error on held-out blocks to this share or less. A real bend removes
+# nearly all of the error, so the limit clearly separates real bends from spurious ones.
 BENT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class Registration:
-    """The registration of a scan on its layout.
+    """The registration of a scan onto its layout.
 
-    ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's. Both frames have
-    pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, the matrix is the best guess, or
-    the centred placement if there was no guess.
+    ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's. In both frames,
+    pixel centres lie at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, the matrix is the best guess,
+    or the centred placement if there was no guess.
 
-    ``bend_um`` is set if the scanner has bent the scan. Then ``bend_um.straighten`` gives the true position
-    of a point (x_um, y_um), and ``scan_to_layout``, the affine closest to the whole map, acts on this
-    position.
+    ``bend_um`` is set if the scanner bent the scan. ``bend_um.straighten`` then gives the true position of a
+    point (x_um, y_um), and ``scan_to_layout`` acts on this position. It is the affine map closest to the
+    whole mapping.
 
     ``defects`` (ny, nx) bool, on the layout's pixels, marks where the scan shows something other than the
-    print (dust, collapsed or lifted parts); None if nothing is marked.
+    print (dust, collapsed or lifted parts). It is None if nothing is marked.
     """
 
     scan_to_layout: Array
@@ -72,31 +72,33 @@ def register_scan(
     fast_axis: Axis | None = None,
     seed: int = 0,
 ) -> Registration:
-    """Find the warp from a scan to its layout, in any orientation and polarity, and say how far to trust it.
+    """Find the warp from a scan, in any orientation and polarity, to its layout, and assess its quality.
 
     Args:
         scan: a ``Scan``, whose pitch is used, or heights (ny, nx) in µm, NaN where not measured.
         layout_level: (ny, nx) integer levels.
         layout_pitch_um: pitch of the layout.
-        scan_pitch_um: (y, x) pitch of plain heights.
-        model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
-        fast_axis: of plain heights, the axis along which the tip moved fast; ``x`` if unknown.
+        scan_pitch_um: (y, x) pitch, needed if ``scan`` is an array of heights.
+        model: a rung of the ladder, or ``ladder`` to let held-out blocks choose the rung.
+        fast_axis: axis along which the tip moved fast, if the scan does not state it; None counts as ``x``.
         seed: seed of the robust estimator and the bootstrap.
 
     Raises:
-        InputError: arrays that are not 2-D or smaller than 32 pixels, or pitches that are missing or not
+        InputError: an array is not 2-D or has fewer than 32 pixels on a side, or a pitch is missing or not
             positive. A fit that fails does not raise; ``quality.passed`` and ``quality.reason`` report it.
     """
     if isinstance(scan, Scan):
         scan_pitch_um, fast_axis, scan = scan.require_pitch(), scan.fast_axis or fast_axis, scan.height_um
     if scan_pitch_um is None:
-        raise InputError("registration of plain heights", got="no scan_pitch_um", wanted="(y, x) in µm")
+        raise InputError(
+            "registration of an array of heights", got="no scan_pitch_um", wanted="its pitch (y, x) in µm"
+        )
     height = np.asarray(scan, dtype=float)
     layout = np.asarray(layout_level)
     _check(height, layout, scan_pitch_um, layout_pitch_um)
     centred = centred_placement(height.shape, scan_pitch_um, layout.shape, layout_pitch_um)
     if not np.isfinite(height).any():
-        return Registration(centred, unregistered_quality("no measured pixel in the scan"))
+        return Registration(centred, unregistered_quality("the scan has no measured pixel"))
     flat = remove_bow(at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
     has_structure = layout.min() < layout.max() and np.nanstd(flat) > SMALLEST_STRUCTURE_UM
     smooth_layout = predicted_topography(layout, SEARCH_BLUR_PX)
@@ -106,9 +108,9 @@ def register_scan(
     if has_structure:
         coarse = find_coarse(flat, layout, smooth_layout, features=features, seed=seed)
     if coarse is None:
-        why = "no structure in the scan or the layout"
+        why = "the scan or the layout shows no structure"
         if np.nanstd(flat) <= SMALLEST_STRUCTURE_UM:
-            why = f"no structure in the scan: heights vary by {np.nanstd(flat):.1e} µm; check their unit"
+            why = f"the scan shows no structure: its heights vary by {np.nanstd(flat):.1e} µm; check the unit"
         return Registration(centred, unregistered_quality(why))
 
     oriented = coarse.polarity * orient(flat, coarse.orientation)
@@ -146,15 +148,13 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Return whether a bend explains what the straight warp missed: within all limits, and on held-out
-    blocks.
-    """
+    """Return whether the bent fit passes and halves the error of the straight warp on held-out blocks."""
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan and its layout; ``known`` contains the figures that do not depend on the warp between them."""
+    """One scan and its layout; ``known`` contains the quality figures that do not depend on the warp."""
 
     height_um: Array
     layout: Array
@@ -165,7 +165,7 @@ class _Case:
     known: Mapping[str, float]
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
-        """Return the fit in µm of both frames, with its figures and verdict, and the shifts of its blocks."""
+        """Return the registration in µm, with its figures and verdict, and the shifts of its blocks."""
         height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
@@ -186,9 +186,7 @@ class _Case:
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
     def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[Array, Bend | None]:
-        """Return the matrix from the layout to the (straightened) scan, µm, and the bend in the scan's own
-        frame.
-        """
+        """Return the matrix from layout to straightened scan, in µm, and the bend in the scan's own frame."""
         frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
         ny, nx = self.height_um.shape
         size_um = np.array([nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]])
@@ -197,7 +195,7 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # A bend turned by 90° is again a bend, and points and their images determine it.
+        # A bend rotated by 90° is again a bend. It is fitted to points and their images.
         points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
@@ -205,7 +203,7 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # The bend is rounded like the matrix, to digits with physical meaning.
+        # Like the matrix, the bend is rounded to digits with physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -216,7 +214,7 @@ def centred_placement(
     layout_shape: Shape,
     layout_pitch_um: float,
 ) -> Array:
-    """Return the ``scan_to_layout`` that places the middle of the scan on the middle of the layout."""
+    """Return the ``scan_to_layout`` that places the centre of the scan on the centre of the layout."""
     matrix = np.eye(3)
     matrix[0, 2] = (layout_shape[1] * layout_pitch_um - scan_shape[1] * scan_pitch_um[1]) / 2
     matrix[1, 2] = (layout_shape[0] * layout_pitch_um - scan_shape[0] * scan_pitch_um[0]) / 2
@@ -233,8 +231,9 @@ def _check(height: Array, layout: Array, scan_pitch_um: YX, layout_pitch_um: flo
 
 
 def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
-    """Resample a copy of the scan for comparison. The stored heights are resampled once, from the original
-    scan.
+    """Resample a copy of the scan to the layout's pitch, only for finding the warp.
+
+    The stored heights are resampled once, from the original scan.
     """
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
@@ -261,13 +260,13 @@ def _on_layout(
 
 
 def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> tuple[int, int]:
-    """Return the size of a scan at the layout's pitch, whole pixels."""
+    """Return the shape (ny, nx) of a scan at the layout's pitch, in whole pixels."""
     ny, nx = (max(1, round(n * p / layout_pitch_um)) for n, p in zip(scan_shape, scan_pitch_um, strict=True))
     return ny, nx
 
 
 def _rounded(matrix: Array) -> Array:
-    """Round the matrix to digits with physical meaning, as further digits could differ between machines."""
+    """Round the matrix to digits with physical meaning, because more digits may differ between machines."""
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)

@@ -1,6 +1,4 @@
-"""Make images that can be compared: the topography that a layout predicts, and a scan without gaps and
-bow.
-"""
+"""Prepare layout and scan for comparison: predict a topography, smooth heights, fill gaps and remove bow."""
 
 from functools import lru_cache
 
@@ -10,14 +8,14 @@ from litho_data.foundation import Array, Shape
 
 
 def predicted_topography(layout_level: Array, blur_px: float) -> Array:
-    """Predict to first order how the printer renders the layout: the levels, blurred by a Gaussian.
+    """Predict the printed topography to first order, by blurring the layout's levels with a Gaussian.
 
     Args:
         layout_level: (ny, nx) integer levels.
         blur_px: Gaussian sigma of the process, layout pixels.
 
     Returns:
-        (ny, nx) float32 in levels; gain and offset to heights remain free.
+        (ny, nx) float32 in levels; the gain and offset that turn levels into heights remain free.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -25,15 +23,15 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
 
 
 def smooth_measured(height: Array, sigma_px: float) -> Array:
-    """Smooth with a Gaussian by normalised convolution, so that gaps neither bias the mean nor grow.
+    """Smooth heights with a Gaussian by normalised convolution, so that gaps neither bias the mean nor grow.
 
     Args:
         height: (ny, nx), NaN where not measured.
         sigma_px: Gaussian sigma, pixels.
 
     Returns:
-        (ny, nx) float64; gaps are filled from their surroundings, NaN only where no measured pixel
-        lies within 4 sigma.
+        (ny, nx) float64; gaps are filled from their surroundings. Pixels are NaN only where no measured
+        pixel lies within 4 sigma.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -42,13 +40,13 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         return gaussian_filter(height.astype(float), sigma_px)
     weight = gaussian_filter(measured.astype(float), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
-    # A weight above 1e-9 means that at least a few distant measured pixels lie within reach. A smaller weight
-    # is only rounding error.
+    # If the weight exceeds 1e-9, at least a few distant measured pixels lie within reach. A smaller weight is
+    # only rounding error.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: Array) -> Array:
-    """Replace every NaN in the heights: extrapolate for three pixels, then continue with a constant.
+    """Replace every NaN in the heights by extrapolating for three pixels and then holding a constant.
 
     The first three pixels of a gap are a point reflection of the measured heights about the nearest measured
     pixel. Slopes therefore continue, and an interpolating spline does not ring at the border.
@@ -69,7 +67,7 @@ def fill_gaps(height: Array) -> Array:
 
 
 def remove_bow(height: Array) -> Array:
-    """Subtract the least-squares quadratic surface from the heights; used only on copies for comparison."""
+    """Subtract the least-squares quadratic surface from heights; used only on copies for comparison."""
     basis = quadratic_basis(height.shape)
     measured = np.isfinite(height)
     # A third of the rows and columns determines six coefficients as well as all of them do.
@@ -82,7 +80,7 @@ def remove_bow(height: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def quadratic_basis(shape: Shape) -> Array:
-    """Return 1, x, y, x², xy, y² over an image in coordinates from -1 to 1, read-only (6, ny, nx)."""
+    """Return 1, x, y, x², xy and y² on every pixel, read-only (6, ny, nx); x and y run from -1 to 1."""
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
     one = np.ones(shape)
@@ -92,9 +90,9 @@ def quadratic_basis(shape: Shape) -> Array:
 
 
 def pearson(a: Array, b: Array) -> float:
-    """Return the Pearson correlation of two equally long vectors, 0 if one is constant.
+    """Return the Pearson correlation of two equally long vectors, or 0 if one of them is constant.
 
-    Plain sums replace a matrix product, so that the digits do not depend on the number of BLAS threads.
+    Sums are used in place of a matrix product, so that no digit depends on the number of BLAS threads.
     """
     a, b = (values - values.mean(dtype=float) for values in (a, b))
     energy = float((a * a).sum()) * float((b * b).sum())

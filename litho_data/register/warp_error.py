@@ -1,8 +1,7 @@
-"""Estimate the position error of a registered scan at each pixel, and the surface in its heights that is not
-the print.
+"""Estimate the error of a registration's warp, and the surface in the heights that is not the print.
 
-Gain, quadratic surface and warp are fitted again without each block of the field in turn (jackknife). The
-spread of the fits includes what the topography does not explain, as far as it differs between blocks.
+Gain, quadratic surface and warp are refitted with each block of the field left out in turn (jackknife). The
+spread of these fits includes effects that the topography does not explain, if they differ between blocks.
 """
 
 from dataclasses import dataclass
@@ -16,30 +15,29 @@ from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
 from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
 
-# A surface is real if the root mean square of its terms exceeds that of their standard errors by this factor.
-# On virtual prints without tilt and bow the factor is at most 1.9.
+# A surface is significant if the root mean square of its terms, each divided by its standard error, exceeds
+# this value. On virtual prints without tilt and bow, the root mean square is at most 1.9.
 _CLEAR = 6.0**0.5
-# Distances over which the surrounding print has an effect (proximity, shrinkage), in layout pixels. A fit
-# that ignores this effect mistakes it for a surface. The surface is similar in neighbouring blocks, so the
-# jackknife does not show the error.
+# Distances, in layout pixels, over which the surrounding print affects the height (proximity, shrinkage). A
+# fit that ignores this effect mistakes it for a surface. The surface is similar in neighbouring blocks, so
+# the jackknife does not reveal the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
-# Within a cell's width of the layout's border, a print has different surroundings than in the interior. The
-# effect of these surroundings is the same on all four sides and in all blocks there, and changes the
-# magnification by more than the jackknife states. A field of this many cells keeps two thirds of its area
-# without the outermost cells.
+# Within a cell's width of the layout's border, a print has other surroundings than in the interior. Their
+# effect is the same on all four sides and in all blocks there, and changes the magnification by more than
+# the jackknife states. Without its outermost cells, a field of this many cells keeps two thirds of its area.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
 
 @dataclass(frozen=True)
 class WarpError:
-    """The errors of the fit that places a scan on its layout.
+    """The errors of the warp between a scan and its layout, and of the surface that is not the print.
 
     Attributes:
         covariance: covariance (k, k) of the amounts of the flows in ``register.flows``, in the normalised
             layout frame.
-        surface_rms: root mean square over the field of the quadratic surface that the fit finds in addition
-            to the print, without its offset, in the unit of the heights.
+        surface_rms: root mean square, over the field, of the quadratic surface that the fit finds in
+            addition to the print. It excludes the offset and has the unit of the heights.
         surface_error_rms: root mean square of the error of that surface.
         is_clear: whether the surface is significant.
     """
@@ -53,18 +51,15 @@ class WarpError:
         """Return the mean square of the surface that the heights contain in addition to the print.
 
         The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
-        Levelling wrongly removes the quadratic part of the print and its roughness. That part is then missing
-        from the heights and is described by the error of the fit. After levelling, the two mean squares are
-        therefore added.
+        Levelling wrongly removes the quadratic part of the print and its roughness. The error of the fit
+        estimates this missing part. For levelled heights, the two mean squares are therefore added.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
         return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
     def warp_variance(self, height: Array) -> Array:
-        """Return the variance of registered heights (ny, nx) that the error of the warp causes; it is largest
-        on slopes.
-        """
+        """Return the variance (ny, nx) that the error of the warp causes in the heights, mainly on slopes."""
         shape = height.shape
         normalise = normalisation(shape)
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
@@ -82,13 +77,13 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """Return the errors of a registration, and the surface in the heights that is not the print.
+    """Return the errors of a registration's warp, and of the surface in the heights that is not the print.
 
     Args:
         height: (ny, nx) registered heights, NaN where not valid.
         layout_level: (ny, nx) integer levels.
         blur_px: Gaussian sigma of the topography, layout pixels.
-        model: as in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
+        model: the model in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
     """
     shape = height.shape
     smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
@@ -97,8 +92,7 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
     around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
     cells = aligned_gram(smooth, topography, count, around)
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
-    # The registration ignores the surroundings, so its error is that of a fit without the terms of the
-    # surroundings.
+    # The registration ignores the surroundings, so its error is that of a fit without their terms.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
     _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:
@@ -118,7 +112,7 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
 
 
 def _around(topography: Array, reach_px: float) -> Array:
-    """Return the Gaussian mean of the surroundings of each place, reflected at the border."""
+    """Return the Gaussian mean of the topography around each pixel, with reflection at the border."""
     import cv2
 
     width_px = 2 * round(3 * reach_px) + 1
@@ -127,7 +121,7 @@ def _around(topography: Array, reach_px: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _products(shape: Shape) -> Array:
-    """Return the covariances (5, 5) of the terms of a quadratic surface over the field."""
+    """Return the covariance matrix (5, 5), over the field, of the terms of a quadratic surface."""
     return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
 
 

@@ -1,1 +1,1 @@
-"""Make reports for people: a page of few parts, and its pictures."""
+"""Make reports: HTML pages, their pictures, and copies of figures and tables for papers."""

@@ -1,6 +1,4 @@
-"""Write self-contained HTML reports: a verdict, pictures, folded tables (also as CSV), and how they were
-made.
-"""
+"""Write self-contained HTML reports: a verdict, pictures, tables (also as CSV), and how they were made."""
 
 from __future__ import annotations
 
@@ -26,13 +24,13 @@ if TYPE_CHECKING:
 
     Table = pd.DataFrame | Facts | Iterable[Facts | BaseModel]
 
-# Maps a column of a table to its title and meaning; the CSV keeps the key.
+# Maps the key of a table's column to its title and meaning; the CSV file keeps the key.
 Words = Mapping[str, Sequence[str]]
 
 _SPELT = table_beside(__file__, "words.toml")
-# Columns that name a model are coloured like it.
+# Columns whose cells name models; each cell has the colour of its model.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns whose values are keys. These keys are spelt out like the names of columns.
+# Columns whose values are keys, which are spelt out like the names of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -40,12 +38,12 @@ class Page:
     """A report under construction; parts appear in the order in which they are added.
 
     Args:
-        title: what was done, on what.
+        title: what was done, and with what.
         lead: one line below the title.
-        run: the run that made the result; by default the one that writes the page.
+        run: the run that made the result; by default the run that writes the page.
         facts: further facts that identify the result, such as hashes and seeds, by name.
-        words: titles and meanings of the columns of its tables, or the TOML file with them; other columns are
-            spelt out from their key.
+        words: titles and meanings of table columns, or the TOML file that contains them. The titles of other
+            columns are spelt out from their keys.
     """
 
     def __init__(
@@ -71,7 +69,7 @@ class Page:
         self._sections.append({"title": text, "folded": folded, "parts": []})
 
     def verdict(self, text: str) -> None:
-        """Add the answer in plain words: what is best, by how much, and whether that is more than chance."""
+        """Add the answer in plain words: what is best, by how much, and whether chance could explain it."""
         self._add("verdict", text=text)
 
     def paragraph(self, text: str) -> None:
@@ -79,7 +77,7 @@ class Page:
         self._add("paragraph", text=text)
 
     def note(self, *texts: str) -> None:
-        """Add a box with texts that the reader must not overlook. Without texts, add nothing."""
+        """Add a box with texts that the reader must not overlook, or nothing if there are no texts."""
         if texts:
             self._add("note", texts=texts)
 
@@ -88,15 +86,15 @@ class Page:
         self._add("points", texts=list(texts))
 
     def code(self, text: str) -> None:
-        """Add a text in a font of fixed width."""
+        """Add a text in a fixed-width font."""
         self._add("code", text=text)
 
     def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:
-        """Add the few figures that matter most: (value with unit, label)."""
+        """Add tiles with the few most important numbers, each as (value with unit, label)."""
         self._add("tiles", tiles=list(tiles))
 
     def links(self, links: Sequence[tuple[str, str]]) -> None:
-        """Add relative links: (target, text)."""
+        """Add relative links, each as (target, text)."""
         self._add("links", links=list(links))
 
     def table(
@@ -111,9 +109,9 @@ class Page:
 
         Args:
             table: a frame, a mapping of names to columns, or a sequence of rows (mappings or records). A
-                record inside a row gets a column for each of its fields, ``row_field``. Intervals and lists
-                are spelt out.
-            digits: decimal places; numbers too small for them keep two significant figures.
+                record inside a row becomes one column per field, named ``row_field``. Intervals and lists
+                are written as text.
+            digits: decimal places; smaller numbers are shown with two significant digits.
             columns: the columns to show, in this order; all by default.
         """
         frame = _frame(table, digits)
@@ -131,7 +129,7 @@ class Page:
         self._tables.append((csv_name, frame, [str(column["name"]) for column in shown], digits))
 
     def figure(self, figure: Figure, caption: str) -> None:
-        """Add a matplotlib figure of :func:`new_figure`."""
+        """Add a matplotlib figure made by :func:`new_figure`."""
         self._add("figure", caption=caption, address=svg_address(figure))
         if wanted().figures:
             self._figures.append(figure)
@@ -142,8 +140,8 @@ class Page:
         """Add small pictures in rows and columns.
 
         Args:
-            columns: title and colour bar of each.
-            rows: label and one picture per column, as :func:`coloured_png` returns it.
+            columns: title and colour bar of each column.
+            rows: for each row, its label and one picture per column, as :func:`coloured_png` returns it.
             caption: text below the pictures.
         """
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
@@ -193,7 +191,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
 
 
 def _cells(row: Facts | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the columns and values of a row, including those of the records in it."""
+    """Yield the columns and values of a row, including those of records inside the row."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):
             yield from _cells(value, digits, f"{prefix}{key}_")
@@ -214,12 +212,12 @@ def _template() -> jinja2.Template:
 
 
 def filled(template: Path, **values: object) -> str:
-    """Fill a template (Jinja) with the values that it names, and return the text."""
+    """Fill a Jinja template with the values that it names, and return the text."""
     return _plain(template).render(values)
 
 
 def sentences(template: Path, about: str, one: object) -> str:
-    """Render a macro of a template in one line."""
+    """Render a macro of a template as a single line."""
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
 
@@ -234,7 +232,7 @@ def _plain(template: Path) -> jinja2.Template:
 
 
 def _whole_options(text: str) -> Markup:
-    """Keep options of commands in a sentence from breaking over two lines."""
+    """Prevent line breaks inside the command options that a text mentions."""
     from markupsafe import Markup, escape
 
     return Markup(
@@ -248,7 +246,7 @@ def capitalised(text: str) -> str:
 
 
 def spelt_out(key: str) -> str:
-    """Spell out the key of a column: ``mae_abs_nm`` is "MAE abs (nm)"."""
+    """Spell out the key of a column; for example, ``mae_abs_nm`` becomes "MAE abs (nm)"."""
     if "_" not in key:
         return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")

@@ -1,4 +1,4 @@
-"""Write copies of the figures and tables of a report in the form that a paper needs."""
+"""Write copies of a report's figures and tables in formats for papers."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 Figures = Literal["pdf", "svg", "png"]
 Tables = Literal["csv", "latex", "markdown"]
 
-# Widths of one and of two columns of a two-column page.
+# Widths of one column and of both columns of a two-column page.
 _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
-# A figure that is wider than this on the screen is not legible in one column.
+# A figure that is wider than this on the screen would not be legible in one column.
 _WIDE_INCH = 8.0
 _FONT_PT, _DPI = 7.0, 300
 
 
 @dataclass(frozen=True)
 class PaperCopies:
-    """What is written beside a report: figures in one format, tables in one format besides CSV."""
+    """Formats in which a report's figures and, in addition to CSV, its tables are also written."""
 
     figures: Figures | None = None
     tables: Tables = "csv"
@@ -40,7 +40,7 @@ _WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=Non
 
 @contextmanager
 def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
-    """Make every report that is written in this context also write its figures and tables for a paper."""
+    """Make every report that is written in this context also write copies for a paper."""
     token = _WANTED.set(PaperCopies(figures, tables))
     try:
         yield
@@ -61,14 +61,15 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
         with paper_copies(values.pop("figures"), values.pop("tables")):
             command(**values)
 
-    figures = Annotated[Figures | None, option("also write the figures, in the widths of a paper's columns")]
-    tables = Annotated[Tables, option("format of the tables, besides CSV")]
+    figures = Annotated[Figures | None, option("also write figures in this format, for a paper's columns")]
+    tables = Annotated[Tables, option("also write tables in this format, in addition to CSV")]
     return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 
 def write_figures(figures: Sequence[Figure], folder: Path) -> None:
-    """Write ``figure-1.pdf`` … with embedded fonts, as wide as a column or a page. The figures are changed in
-    place.
+    """Write figures as ``figure-1.pdf`` … with embedded fonts, as wide as a paper's column or page.
+
+    The size and fonts of the given figures are changed in place.
     """
     if not figures:
         return
@@ -88,12 +89,11 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
 
 
 def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
-    """Write a table in the requested format with ``digits`` decimal places, beside its CSV file with full
-    precision.
+    """Write a table beside its CSV file, in the requested format and with ``digits`` decimal places.
 
     Args:
         frame: the table; ``names``: the titles of its columns.
-        csv_path: its CSV file.
+        csv_path: path of the CSV file, which has full precision.
     """
     if wanted().tables == "csv":
         return

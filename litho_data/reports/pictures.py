@@ -1,4 +1,4 @@
-"""Draw the pictures of reports: figures and maps, in colours for light and dark screens."""
+"""Draw the figures and maps of reports in colours that suit light and dark screens."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _OWN = table_beside(__file__, "colours.toml")
 LIGHT, DARK = _OWN["light"], _OWN["dark"]
-# Colours of a figure that follow the light or dark mode of the screen.
+# Colours of a figure that change with the light or dark mode of the screen.
 _OF_SCREEN = ("ink", "paper", "soft", "accent")
 _FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87400")
 _PICTURE_DPI = 110
@@ -29,15 +29,16 @@ _GAP = 255  # the last entry of the palette, transparent
 
 
 def model_colour(name: str) -> str:
-    """Return the colour of a model on every page: fixed for the project's models, otherwise derived from the
-    name.
+    """Return the colour of a model, which is the same on every page.
+
+    The project's models have fixed colours; for other models, the name determines the colour.
     """
     known = _OWN["models"].get(name)
     return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
 
 
 def new_figure(width_inch: float, height_inch: float) -> Figure:
-    """Make a figure outside pyplot's global state, so that reports never leak memory or need a display."""
+    """Make a figure without pyplot's global state, so that reports neither leak memory nor need a display."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -47,7 +48,7 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
 
 
 def svg_address(figure: Figure) -> str:
-    """Return the data address of a figure as SVG. Its ``LIGHT`` colours follow the mode of the screen."""
+    """Return a figure as a data address (SVG), whose ``LIGHT`` colours follow the mode of the screen."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
@@ -65,7 +66,7 @@ def svg_address(figure: Figure) -> str:
 
 
 def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
-    """Return the data address of an image in one of matplotlib's colour maps, transparent where it is NaN.
+    """Return an image as a data address (PNG), coloured by a matplotlib colour map and transparent at NaN.
 
     Args:
         image: (ny, nx), one value per pixel of the picture.
@@ -86,28 +87,27 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
 
 
 def limits(image: Array) -> tuple[float, float]:
-    """Return the lowest and highest value of a picture, ignoring a few outliers."""
+    """Return the lowest and the highest value of an image, ignoring a few outliers."""
     low, high = np.nanpercentile(image, (0.5, 99.5))
     return float(low), float(high)
 
 
 def thumbnail(image: Array, side_px: int = 180) -> Array:
-    """Take every n-th pixel of an image (ny, nx), so that no side has more than ``side_px``."""
+    """Reduce an image (ny, nx) to every n-th pixel, so that no side exceeds ``side_px`` pixels."""
     step = max(1, -(-max(image.shape) // side_px))
     return image[::step, ::step]
 
 
 def colour_bar_png(colours: str) -> str:
-    """Return a picture of the colours from low to high, one pixel high, which is stretched for display."""
+    """Return a picture of the colours from low to high; it is one pixel high and is stretched for display."""
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
 
 
 def shown_html(line: str, **images: Array) -> str:
-    """Return what a notebook shows of an object with maps: the line of its ``repr``, then each map with its
-    range.
+    """Return the HTML that a notebook shows for an object: its ``repr``, then its maps with their ranges.
 
     Args:
-        line: the ``repr`` of the object, one line.
+        line: the ``repr`` of the object, on one line.
         images: maps (ny, nx) by name.
     """
     figures = []

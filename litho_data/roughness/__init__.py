@@ -1,6 +1,4 @@
-"""Measure roughness and noise of scans: amplitudes, spectra, correlation, step heights, and what levelling
-hides.
-"""
+"""Measure roughness, noise and step heights of scans, and how much roughness levelling removes."""
 
 from litho_data.roughness.amplitude import (
     AmplitudeParameters,

@@ -8,15 +8,15 @@ from litho_data.foundation.results import Record
 
 
 class AmplitudeParameters(Record):
-    """Amplitudes about the mean height; they are valid for one pitch, field of view and levelling only.
+    """Amplitudes about the mean height; they are valid only for one pitch, field of view and levelling.
 
     Args:
         sa_nm: mean absolute deviation.
         sq_nm: root mean square.
-        ssk: skewness, 0 for a flat surface.
-        sku: kurtosis, 3 for a Gaussian, 0 for a flat surface.
-        sz_nm: highest minus lowest pixel.
-        pixels: pixels counted.
+        ssk: skewness; 0 for a flat surface.
+        sku: kurtosis; 3 for a Gaussian surface, 0 for a flat surface.
+        sz_nm: height of the highest pixel minus that of the lowest.
+        pixels: number of pixels used.
     """
 
     sa_nm: float
@@ -30,22 +30,23 @@ class AmplitudeParameters(Record):
 def amplitude_parameters(height_um: Array, valid: Array | None = None) -> AmplitudeParameters:
     """Return Sa, Sq, Ssk, Sku and Sz of a levelled surface.
 
-    Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴ with h about the mean.
+    Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴, where h is the height about the
+    mean.
 
     Args:
-        height_um: levelled height, µm, any shape; NaN is left out.
-        valid: pixels to count; all by default.
+        height_um: levelled height, µm, any shape; NaN is ignored.
+        valid: pixels to use; all by default.
 
     Raises:
-        InputError: no pixel left.
+        InputError: there is no valid pixel.
     """
     counted = np.isfinite(height_um) if valid is None else np.isfinite(height_um) & valid
     height_nm = 1e3 * height_um[counted].astype(float)
     if height_nm.size == 0:
-        raise InputError("surface", got="no valid pixel", wanted="at least one")
+        raise InputError("surface", got="no valid pixel", wanted="at least one valid pixel")
     deviation = height_nm - height_nm.mean()
     sq_nm = float(np.sqrt(np.mean(deviation**2)))
-    # Rounding of the mean leaves 1e-16 of the height; a surface with less variation is flat.
+    # Rounding errors of the mean are 1e-16 of the height. A surface whose Sq is hardly larger is flat.
     flat = sq_nm <= 1e-12 * max(1.0, float(np.abs(height_nm).max()))
     return AmplitudeParameters(
         sa_nm=float(np.abs(deviation).mean()),
@@ -58,14 +59,13 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
 
 
 def autocorrelation(height_um: Array) -> Array:
-    """Return the normalised autocorrelation for lags from 0 to half the field, shape (ny // 2, 2 (nx // 2) −
-    1).
+    """Return the normalised autocorrelation for lags from 0 to half the field.
 
-    Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx // 2 − 1)`` columns. The sum at each lag is
-    divided by the number of pixel pairs.
+    The shape is (ny // 2, 2 (nx // 2) − 1). Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx //
+    2 − 1)`` columns. The sum at each lag is divided by the number of pixel pairs.
 
     Raises:
-        InputError: NaN in the surface, or constant heights.
+        InputError: the surface contains NaN, or its heights are constant.
     """
     if not np.isfinite(height_um).all():
         raise InputError("surface", got="NaN", wanted="finite heights for an autocorrelation")
@@ -83,10 +83,10 @@ def autocorrelation(height_um: Array) -> Array:
 
 
 def effective_samples(height_um: Array) -> float:
-    """Return the number of independent heights in a field, for its variance: pixels / Σ ρ² over all lags.
+    """Return the effective number of independent heights in a field, pixels / Σ ρ², for its variance.
 
-    For a Gaussian surface, an estimated mean square has the relative variance ``2 Σ ρ² / pixels``. Lags
-    beyond a quarter of the field are left out, because ρ² there is noise of the estimate.
+    For a Gaussian surface, the estimated mean square has the relative variance ``2 Σ ρ² / pixels``. The sum
+    excludes lags beyond a quarter of the field, because ρ² there is only noise of the estimate.
     """
     correlation = autocorrelation(height_um)
     rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
@@ -98,7 +98,8 @@ def effective_samples(height_um: Array) -> float:
 
 
 def sq_uncertainty_nm(height_um: Array) -> float:
-    """Return the standard uncertainty of Sq that the finite field causes: ``Sq / √(2 n_eff)``, nm (Gaussian
-    heights).
+    """Return the standard uncertainty of Sq due to the finite field, nm.
+
+    It is ``Sq / √(2 n_eff)`` for Gaussian heights.
     """
     return amplitude_parameters(height_um).sq_nm / float(np.sqrt(2 * effective_samples(height_um)))

@@ -1,6 +1,4 @@
-"""Find the period of a grating: first where its spectrum peaks, then how its phase advances over the
-field.
-"""
+"""Find the period of a grating from the peak of its spectrum, then from the phase across the field."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +9,12 @@ from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
-# The period that an uncalibrated scanner shows differs from the true period by at most this factor.
+# An uncalibrated scanner may show a period that differs from the true period by up to this factor.
 SEARCHED = 1.25
-# In a window of two periods, the mean and all harmonics cancel. A fit of the phases needs several windows
+# In a window of two periods, the mean and all harmonics cancel. The fit of the phases needs several windows
 # side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
-# The limit is far below 1.8 rad, by which the phases of noise scatter.
+# Largest accepted scatter of the phases. Phases of pure noise scatter by 1.8 rad.
 _MOST_SCATTER_RAD = 0.5
 # Neighbouring windows overlap by half, so their noise is correlated by 1/6 on both sides.
 _OVERLAP_VARIANCE = 1 + 2 / 6
@@ -24,7 +22,7 @@ _OVERLAP_VARIANCE = 1 + 2 / 6
 
 @dataclass(frozen=True)
 class Wave:
-    """Fundamental of a grating: cycles/µm along x and y, and their standard uncertainty."""
+    """The fundamental wave of a grating: frequencies along x and y, cycles/µm, and standard uncertainty."""
 
     x_per_um: float
     y_per_um: float
@@ -39,20 +37,20 @@ class Scale(Record):
 
 
 def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> Wave:
-    """Find the fundamental wave of a grating whose period lies along an axis, to within a few degrees.
+    """Find the fundamental wave of a grating that repeats along an axis, to within a few degrees.
 
-    The phase is measured in windows of two periods (Hann along the axis, all of the other axis). The slope of
-    the phase along the axis corrects the frequency. The scatter of the phases about the line gives the
-    uncertainty from noise, drift and a bent scanner axis together.
+    The phase is measured in Hann windows of two periods along the axis, over the whole length of the other
+    axis. The slope of the phase along the axis corrects the frequency. The scatter of the phases about a
+    straight line gives the combined uncertainty from noise, drift and a bent scanner axis.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
         pitch_um: stated (y, x) pitch.
-        period_um: known period; the search covers a factor of ``SEARCHED`` around it.
-        axis: the axis of the period.
+        period_um: known period; the search covers this period times and divided by ``SEARCHED``.
+        axis: the axis along which the grating repeats.
 
     Raises:
-        InputError: fewer than eight periods, or nothing that is periodic.
+        InputError: the scan shows fewer than eight periods, or nothing periodic.
     """
     lines = height_um if axis == "x" else height_um.T
     along_um, across_um = pitch_um[::-1] if axis == "x" else pitch_um
@@ -79,10 +77,10 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
 
 def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
-    """Return how far the middle of a line is displaced along x relative to its ends, µm, with its
-    uncertainty.
+    """Return the displacement along x of a line's middle relative to its ends, and its uncertainty, µm.
 
-    A pixel at x of a line of length L shows what lies at x + 4 b (x / L) (1 - x / L), up to shift and scale.
+    If the displacement is b, a pixel at x on a line of length L shows the surface at x + 4 b (x / L) (1 - x /
+    L), apart from shift and scale.
 
     Args:
         height_um: (ny, nx) of a grating along x; ``pitch_um``: stated (y, x).
@@ -102,11 +100,11 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
     """Return the scales of the axes whose gratings were measured, for a scanner without shear.
 
     If stated lengths are c times too short, a frequency is c times too high. The square of the true frequency
-    is therefore (x / c_x)² + (y / c_y)², whatever the angle of the grating.
+    is therefore (x / c_x)² + (y / c_y)² for any angle of the grating.
 
     Args:
-        waves: measured wave, known period and its standard uncertainty (µm) of each grating.
-        axes: which axis each is for; an axis without grating keeps its stated scale.
+        waves: for each grating, the measured wave, the known period and its standard uncertainty (µm).
+        axes: for each grating, the axis that it calibrates. An axis without a grating keeps its stated scale.
     """
     design = np.array([[wave.x_per_um**2, wave.y_per_um**2] for wave, _, _ in waves])
     known = np.array([1 / period_um**2 for _, period_um, _ in waves])
@@ -122,7 +120,7 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
 
 
 def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
-    """Return the strongest frequency (along, across) within the range and within 15° of the axis."""
+    """Return the frequency (along, across) of highest power in the searched range within 15° of the axis."""
     ny, nx = flat.shape
     windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
     power = np.abs(np.fft.fft2(windowed)[:, : nx // 2 + 1]) ** 2
@@ -136,14 +134,14 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """Return the error of the frequency (along, across), the uncertainty of the first value, and the scatter
-    in rad.
+    """Return the correction to a frequency (along, across), the uncertainty of its part along the axis, and
+    the scatter of the phases in rad.
     """
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
     places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
     slope, error, scatter = _line(places, phases)
-    # Across the axis, four bands are enough for a small angle; in each band the other waves average out.
+    # Four bands across the axis are enough to measure a small angle. In each band, other waves average out.
     window = np.hanning(len(x))
     bands = [band @ window for band in np.array_split(carried, 4)]
     centres = np.array([band.mean() for band in np.array_split(y, 4)])
@@ -161,14 +159,12 @@ def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array
 
 
 def _line(places: Array, phases: Array) -> tuple[float, float, float]:
-    """Fit a straight line to phases; return its slope, the slope's standard uncertainty, and the scatter."""
+    """Fit a straight line to phases; return the slope, its standard uncertainty, and the scatter."""
     return _last_weight([np.ones_like(places), places - places.mean()], phases)
 
 
 def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
-    """Return the weight of the last column in a least-squares fit, its standard uncertainty, and the
-    scatter.
-    """
+    """Return the last column's weight in a least-squares fit, its standard uncertainty, and the scatter."""
     design = np.column_stack(columns)
     weights, *_ = np.linalg.lstsq(design, values, rcond=None)
     rest = values - design @ weights
@@ -179,7 +175,8 @@ def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, flo
 
 
 def _wider(freedom: int) -> float:
-    """Return the standard deviation of Student's t with this number of degrees of freedom. As a factor, it
-    corrects an uncertainty whose scatter was estimated from few phases.
+    """Return the standard deviation of Student's t with this number of degrees of freedom.
+
+    This factor corrects an uncertainty whose scatter was estimated from few phases.
     """
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

@@ -1,5 +1,4 @@
-"""Compute how much levelling lowers Sq, because it removes some of the roughness together with the
-background.
+"""Compute how much levelling lowers Sq, because levelling also removes some of the roughness.
 
 After a least-squares fit on a basis Q (orthonormal over the N pixels) is subtracted, a surface with
 correlation matrix C has the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. The formula is exact for any
@@ -18,12 +17,12 @@ Correlation = Callable[[Array, Array], Array]
 
 
 def gaussian_correlation(length_um: float) -> Correlation:
-    """Return ``exp(−r²/T²)``, which falls to 1/e at ``length_um``."""
+    """Return the correlation function ``exp(−r²/T²)``, which falls to 1/e at ``length_um``."""
     return lambda y_um, x_um: np.exp(-(y_um**2 + x_um**2) / length_um**2)
 
 
 def exponential_correlation(length_um: float) -> Correlation:
-    """Return ``exp(−r/T)``, which falls to 1/e at ``length_um``."""
+    """Return the correlation function ``exp(−r/T)``, which falls to 1/e at ``length_um``."""
     return lambda y_um, x_um: np.exp(-np.hypot(y_um, x_um) / length_um)
 
 
@@ -34,17 +33,16 @@ def retained_variance(
     *,
     degree: int | tuple[int, int],
 ) -> float:
-    """Return the expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
+    """Return the expected Sq² after polynomial levelling, as a share (0…1) of the surface's true variance.
 
-    Sq of a levelled surface is too low by a factor that is the square root of this share. To correct Sq,
-    divide it by that factor.
+    To correct the Sq of a levelled surface, divide it by the square root of this share.
 
     Args:
-        shape: (ny, nx), pixels; (1, nx) with a degree of (0, n) for rows that are levelled separately.
+        shape: (ny, nx), pixels. For rows that are levelled separately, use (1, nx) and a degree of (0, n).
         pitch_um: pixel pitch, µm.
         correlation: normalised autocorrelation as a function of (y, x) lags, µm.
-        degree: largest total degree (1 = plane), or largest degrees along (y, x) for independent
-            degrees. Degree 0 subtracts the mean.
+        degree: the largest total degree (1 = plane), or the largest independent degrees along (y, x). Degree
+            0 subtracts the mean.
     """
     degrees = (degree, degree) if isinstance(degree, int) else degree
     along_y, along_x = (_orthonormal_polynomials(n, most) for n, most in zip(shape, degrees, strict=True))
@@ -62,9 +60,7 @@ def retained_variance(
 
 
 def _orthonormal_polynomials(size: int, degree: int) -> Array:
-    """Return polynomials of degree 0…``degree``, orthonormal over ``size`` pixels, shape (degree + 1,
-    size).
-    """
+    """Return orthonormal polynomials of degree 0…``degree`` on ``size`` pixels, shape (degree + 1, size)."""
     if not 0 <= degree < size:
         raise InputError("degree of a levelling polynomial", got=degree, wanted=f"0 to {size - 1}")
     columns = np.polynomial.legendre.legvander(np.linspace(-1, 1, size), degree)

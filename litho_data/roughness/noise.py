@@ -10,26 +10,25 @@ from litho_data.scan import Axis
 
 # The median absolute deviation of a Gaussian is 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
-# Differences of this order pass half of the amplitude at 0.84 of the Nyquist frequency, and a fiftieth at
-# 0.56 (0.28 cycles per pixel).
+# Differences of this order pass half of the amplitude at 0.84 of the Nyquist frequency, and a fiftieth of it
+# at 0.56 of the Nyquist frequency (0.28 cycles per pixel).
 _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
-    """Estimate the pixel noise and line noise of a scan of any print, nm: the noise that is white at the
-    finest scales.
+    """Estimate the white pixel noise and line noise of a scan, in nm, whatever was printed.
 
-    A printer writes nothing finer than its spot, so differences of high order leave only noise. Differences
-    along both axes give the noise of the pixels. Differences of the line means along the slow axis give the
-    noise of the lines. Line noise that is correlated over lines (drift), and noise that the feedback smooths,
-    look like the print and are not counted.
+    A printer writes nothing finer than its spot, so high-order differences contain only noise. Differences
+    along both axes give the pixel noise. Differences of the line means along the slow axis give the line
+    noise. Noise that is correlated between lines (drift) and noise that the feedback smooths look like the
+    print, so they are not included.
 
     Args:
         height_um: heights, µm, shape (ny, nx), NaN where not measured.
         fast_axis: axis along which the tip moved.
 
     Returns:
-        sd of the pixel noise and of the line noise; NaN where too few pixels determine it.
+        sd of the pixel noise and of the line noise; NaN if there are too few pixels to determine it.
     """
     lines = lines_nm(height_um, fast_axis)
     pixel_nm = _fine_sd(_fine(_fine(lines, 0), 1))
@@ -46,7 +45,8 @@ def _fine(values: Array, axis: int) -> Array:
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
     """Return differences of an order along an axis, scaled so that white noise keeps its variance.
-    Polynomials of lower order vanish.
+
+    The differences of polynomials of lower degree are zero.
     """
     return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 
@@ -56,6 +56,6 @@ def _fine_sd(differences: Array) -> float:
 
 
 def robust_sd(values: Array) -> float:
-    """Return the standard deviation from the median absolute deviation, ignoring NaN; NaN without values."""
+    """Estimate a standard deviation from the median absolute deviation, ignoring NaN; NaN without values."""
     known = values[np.isfinite(values)]
     return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

@@ -11,11 +11,11 @@ from litho_data.scan import Axis
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A spectrum on positive frequencies.
+    """A one-sided spectrum at positive frequencies.
 
     Args:
-        frequency_per_um: cycles/µm, ascending.
-        density: nm²·µm; its integral over frequency is Sq², one-sided.
+        frequency_per_um: frequencies in cycles/µm, ascending.
+        density: power spectral density in nm²·µm, whose integral over frequency is Sq².
     """
 
     frequency_per_um: Array
@@ -25,17 +25,17 @@ class Spectrum:
 def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
     """Return the one-sided power spectral density along one axis, averaged over the lines.
 
-    Mean and slope of each line are removed. The line is weighted by a Hann window, whose power is divided
-    out. The spectrum is scaled so that ``Σ density·Δf`` is the mean square of the lines.
+    The mean and slope of each line are removed. The line is multiplied by a Hann window, for whose power the
+    spectrum is corrected, so that ``Σ density·Δf`` is the mean square of the lines.
 
     Args:
         height_um: finite heights, µm, shape (ny, nx).
         pitch_um: pitch along the axis, µm.
         axis: ``x`` along rows, ``y`` along columns.
-        window: False leaves the lines unweighted, for periodic or noise-like surfaces.
+        window: whether to remove the slope and use the window; False is for periodic or noise-like surfaces.
 
     Raises:
-        InputError: NaN in the surface, lines shorter than 8 pixels, or another axis.
+        InputError: the surface contains NaN, the lines are shorter than 8 pixels, or the axis is unknown.
     """
     from scipy.signal import periodogram
 
@@ -47,7 +47,7 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
 
 
 def hann(shape: Shape) -> Array:
-    """Return the Hann window of a field (ny, nx), which is zero nowhere."""
+    """Return the Hann window of a field (ny, nx), without the zeros at its ends."""
     ny, nx = shape
     return np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
 
@@ -56,7 +56,7 @@ def lines_nm(height_um: Array, axis: Axis) -> Array:
     """Return the profiles along an axis as rows, nm.
 
     Raises:
-        InputError: another axis.
+        InputError: the axis is neither x nor y.
     """
     require_known("axis", axis, get_args(Axis))
     return 1e3 * (height_um if axis == "x" else height_um.T).astype(float)
@@ -69,5 +69,5 @@ def _lines(height_um: Array, axis: Axis) -> Array:
             "surface", got="NaN", wanted="finite heights for a spectrum", hint="crop to valid pixels"
         )
     if lines.shape[1] < 8:
-        raise InputError("lines of a spectrum", got=f"{lines.shape[1]} px", wanted="at least 8 px")
+        raise InputError("length of lines for a spectrum", got=f"{lines.shape[1]} px", wanted="at least 8 px")
     return lines

@@ -1,6 +1,4 @@
-"""Measure step heights line by line in the windows of ISO 5436-1, away from the edges, with one common
-slope.
-"""
+"""Measure step heights line by line, in the windows of ISO 5436-1 away from the edges."""
 
 from collections.abc import Sequence
 
@@ -11,19 +9,20 @@ from litho_data.foundation.results import Record
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
-# On a rough surface without a step, the largest change is 4 to 5 times the usual one.
+# An edge must change the profile by more than this many times the median change. On a rough surface without a
+# step, the largest change is 4 to 5 times the median.
 _EDGE_SIGMA = 9.0
 
 
 class StepHeight(Record):
-    """One step.
+    """The measured height of one step.
 
     Args:
-        height_nm: mean over the lines.
-        line_sd_nm: sd over the lines.
-        uncertainty_nm: standard uncertainty of the mean, from the sd and the number of independent
-            lines; it does not include the calibration of the z scale.
-        lines: lines that were fitted.
+        height_nm: mean height over the lines.
+        line_sd_nm: standard deviation over the lines.
+        uncertainty_nm: standard uncertainty of the mean, from the standard deviation and the number of
+            independent lines. It does not include the calibration of the z scale.
+        lines: number of lines that were fitted.
     """
 
     height_nm: float
@@ -36,16 +35,16 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     """Return the height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
 
     ``z = a·x + b + h·δ`` is fitted to every line, with δ = 1 on the middle third of the feature and δ = 0 on
-    two reference arms. If W is the width of the feature, the arms lie between W/3 and W from its edges, so
-    that the profile spans three widths.
+    two reference arms. If W is the width of the feature, the arms extend from W/3 to W from its edges, so the
+    profile spans three widths.
 
     Args:
-        height_um: heights, µm, shape (ny, nx); NaN is left out.
-        left_um: first edge along the axis, µm from the field's border.
-        right_um: second edge, µm.
+        height_um: heights, µm, shape (ny, nx); NaN is ignored.
+        left_um: position of the first edge along x, µm from the field's border.
+        right_um: position of the second edge, µm.
 
     Raises:
-        InputError: edges in the wrong order, or arms outside the field.
+        InputError: the edges are in the wrong order, or the arms extend beyond the field.
     """
     width_um = right_um - left_um
     lines, position_um = _profiles(height_um, pitch_um, "x")
@@ -54,7 +53,7 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
         raise InputError(
             "edges of a groove",
             got=f"{left_um:g} and {right_um:g} µm",
-            wanted=f"left < right, and one width free on both sides within {extent_um:g} µm",
+            wanted=f"left < right, with one width free on both sides in a field of {extent_um:g} µm",
         )
     third_um = width_um / 3
     feature = (position_um >= left_um + third_um) & (position_um <= right_um - third_um)
@@ -68,14 +67,15 @@ def stair_steps(
 ) -> list[StepHeight]:
     """Return the heights of the steps of a staircase, one per edge, positive upwards.
 
-    On every line, one height per tread and one common slope are fitted to the middle thirds of the treads. A
-    step is the difference of two neighbouring treads.
+    On every line, one height per tread and one common slope are fitted to the middle thirds of the treads.
+    The height of a step is the difference between two neighbouring treads.
 
     Args:
         edges_um: positions of the edges along the axis, ascending, µm.
 
     Raises:
-        InputError: edges that are not ascending inside the field, or treads under 3 pixels.
+        InputError: the edges are not ascending positions inside the field, or a tread is narrower than 3
+            pixels.
     """
     lines, position_um = _profiles(height_um, pitch_um, axis)
     limits_um = np.array([0.0, *edges_um, lines.shape[1] * pitch_um])
@@ -84,7 +84,7 @@ def stair_steps(
         raise InputError(
             "edges of a staircase",
             got=list(edges_um),
-            wanted="ascending, inside the field, 3 pixels apart or more",
+            wanted="ascending positions inside the field, at least 3 pixels apart",
         )
     treads = [
         (position_um >= start + width / 3) & (position_um <= start + 2 * width / 3)
@@ -112,7 +112,7 @@ def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[St
         weights, *_ = np.linalg.lstsq(design[finite], line[finite], rcond=None)
         heights.append(np.diff(weights[1:]))
     if len(heights) < 2:
-        raise InputError("lines of a step height", got=f"{len(heights)} complete", wanted="at least 2")
+        raise InputError("lines that show all treads of a step", got=len(heights), wanted="at least 2")
     return [_summary(step) for step in np.array(heights).T]
 
 
@@ -129,7 +129,7 @@ def _summary(step_nm: Array) -> StepHeight:
 
 
 def _independent_lines(values: Array) -> float:
-    """Return n / (1 + 2 Σ ρ), with the sum up to the first negative ρ (initial positive sequence)."""
+    """Return the number of independent lines, n / (1 + 2 Σ ρ), summed up to the first negative ρ."""
     deviation = values - values.mean()
     correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
     negative = np.flatnonzero(correlation < 0)
@@ -138,14 +138,14 @@ def _independent_lines(values: Array) -> float:
 
 
 def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
-    """Return the mean height of the edges of a step, ridge, groove or row of grooves, wherever they are.
+    """Find the edges of a step, ridge, groove or row of grooves in a scan, and return their mean height.
 
-    An edge is where the median profile, without the slope of the field, changes by at least half of its
-    largest change. The heights come from ``stair_steps`` and are averaged without sign. The edges of one scan
-    share their treads, so the uncertainty of the mean is taken as that of one edge.
+    An edge is a place where the median profile, without the slope of the field, changes by at least half of
+    its largest change. ``stair_steps`` measures the heights, whose absolute values are averaged. The edges of
+    one scan share treads, so the mean is given the uncertainty of a single edge.
 
     Raises:
-        InputError: no edge stands out of the profile, or edges closer than three pixels.
+        InputError: no edge stands out from the profile, or edges are closer than three pixels.
     """
     lines, _ = _profiles(height_um, pitch_um, axis)
     profile = np.nanmedian(lines, axis=0)

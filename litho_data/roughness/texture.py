@@ -1,4 +1,4 @@
-"""Find whether a surface has lines, in which direction, and whether they repeat."""
+"""Find out whether a surface has lines, in which direction they run, and whether they repeat."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from litho_data.foundation import Array, InputError
 from litho_data.roughness.spectrum import hann
 
 FEWEST_LINES = 64
-# A peak is compared with the frequencies around it, beyond its own width under a Hann window.
+# A peak is compared with the frequencies around it that lie outside its own width under a Hann window.
 _AROUND = 16
 _OWN = 3
-# Share of independent powers: under a Hann window, powers 0, 1 or 2 frequencies apart correlate by 1, 4/9 or
-# 1/36.
+# Share of the powers that are independent. Under a Hann window, powers that are 0, 1 or 2 frequencies apart
+# have a correlation of 1, 4/9 or 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
 # The lowest frequencies contain the part of a bow that levelling did not remove.
@@ -26,11 +26,11 @@ class LineDirection:
     """Direction of the lines of a surface.
 
     Args:
-        angle_deg: angle of the lines to the rows, from -90 (excluded) to 90; 0 is along x, positive from x to
-            y.
+        angle_deg: angle of the lines to the rows, from -90 (excluded) to 90. An angle of 0 is along x;
+            positive angles are from x towards y.
         strength: length of the mean double-angle vector of the power spectrum; 0 for an isotropic surface, 1
-            for lines of one direction.
-        p: chance of this strength on an isotropic surface (Rayleigh's test).
+            for lines that all have one direction.
+        p: probability of at least this strength on an isotropic surface (Rayleigh's test).
     """
 
     angle_deg: float
@@ -43,10 +43,10 @@ class LinePeriod:
     """The strongest period of lines.
 
     Args:
-        period_um: centre of the peak that exceeds its surroundings most.
-        share: share of the squared line means that is in the peak.
-        p: chance of such a peak anywhere in a smooth spectrum.
-        amplitude_um: root mean square over the surfaces of the amplitude at this period.
+        period_um: period at the centre of the peak that exceeds its surroundings most.
+        share: share of the power of the line means that lies in the peak.
+        p: probability of such a peak anywhere in a smooth spectrum.
+        amplitude_um: amplitude at this period, as a root mean square over the surfaces.
         coherence: length of the mean of the surfaces' unit phasors at this period; 1 if all have the same
             phase, about 1 / √F if the phases of F surfaces are independent.
     """
@@ -61,19 +61,20 @@ class LinePeriod:
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) is weighted by its power and enters at twice its angle. Each surface is scaled by
-    its own variance. Random surfaces have independent exponential powers. The mean vector of an isotropic
-    surface is therefore normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
+    Each frequency (fx, fy) contributes a vector at twice its angle, with its power as the length. Each
+    surface is scaled by its own variance. The powers of random surfaces are independent and exponentially
+    distributed. The mean vector of an isotropic surface is therefore normal with variance 1 / n, where n = (Σ
+    P)² / Σ P² is the effective number of frequencies.
 
     Args:
-        heights_um: (ny, nx) µm on square pixels, levelled; NaN counts as the mean.
+        heights_um: levelled heights (ny, nx), µm, on square pixels; NaN counts as the mean.
 
     Raises:
-        InputError: fewer than 64 rows or columns.
+        InputError: a surface has fewer than 64 rows or columns.
     """
     vectors, variances = zip(*(_mean_vector(height) for height in heights_um), strict=True)
     vector, variance = np.mean(vectors), np.mean(variances) / len(heights_um)
-    # In the spectrum, the power of lines lies across the lines.
+    # In the spectrum, the power of lines lies in the direction across the lines.
     across = 0.5 * float(np.degrees(np.angle(vector)))
     return LineDirection(
         angle_deg=across - 90 if across > 0 else across + 90,
@@ -83,12 +84,12 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
 
 
 def _mean_vector(height_um: Array) -> tuple[complex, float]:
-    """Return the mean double-angle vector of the power of a surface, and its variance if the surface is
-    isotropic.
-    """
+    """Return the mean double-angle vector of a surface's power, and its variance for an isotropic surface."""
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
-        raise InputError("surface", got=height.shape, wanted=f"at least {FEWEST_LINES} rows and columns")
+        raise InputError(
+            "shape of the surface", got=height.shape, wanted=f"at least {FEWEST_LINES} rows and columns"
+        )
     finite = np.isfinite(height)
     height = np.where(finite, height - height[finite].mean(), 0.0)
     ny, nx = height.shape
@@ -96,8 +97,8 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
-    # Beyond the Nyquist frequency of the axes, the spectrum has only its four corners. They would favour four
-    # directions.
+    # Beyond the Nyquist frequency of the axes, the spectrum consists only of its four corners, which would
+    # favour four directions.
     used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
     power, angle = power[used], np.arctan2(fy, fx)[used]
     total = power.sum()
@@ -108,15 +109,15 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
 
 
 def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
-    """Find the strongest period that the line means of all scans have in common; return None below 64 lines.
+    """Find the strongest period that the line means of all scans share; return None below 64 lines.
 
-    If lines are random, the mean periodogram of F scans divided by its level is distributed as Gamma(F) / F.
-    The level is a parabola through the logarithms at the surrounding frequencies, and its uncertainty is
+    If lines are random, the mean periodogram of F scans, divided by its level, is distributed as Gamma(F) /
+    F. The level is a parabola fitted to the logarithms at the surrounding frequencies, and its uncertainty is
     integrated out. The p-value of the largest peak is corrected for the number of frequencies (Bonferroni).
 
     Args:
-        means_um: mean height of each line, one array per scan; all are cut to the shortest.
-        pitch_um: distance of lines.
+        means_um: mean height of each line, one array per scan; all arrays are cropped to the shortest.
+        pitch_um: distance between lines.
     """
     count, scans = min(len(own) for own in means_um), len(means_um)
     if count < FEWEST_LINES:
@@ -147,9 +148,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """Return the level at each frequency, estimated from those around it, and the chance of a peak so far
-    above it.
-    """
+    """Return the level at each frequency, from the surrounding ones, and the probability of such a peak."""
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)
     level, chance = np.empty(len(power)), np.empty(len(power))

@@ -107,7 +107,7 @@ def _require_alike(wanted: Facts, folder: str) -> None:
             f"Dask worker {worker.address}",
             got=f"{worker.state.nthreads} threads",
             wanted="one thread; start more workers instead",
-            hint="dask worker ADDRESS --nworkers N --nthreads 1",
+            hint="for example: dask worker ADDRESS --nworkers N --nthreads 1",
         )
     if not os.path.isdir(folder):
         raise InputError(
@@ -122,14 +122,14 @@ def _require_alike(wanted: Facts, folder: str) -> None:
             raise InputError(
                 f"{package} of Dask worker {worker.address}",
                 got=found or "none",
-                wanted=f"{asked or 'none'}, as here",
+                wanted=f"{asked or 'none'}, as on this machine",
                 hint="start the workers again in this environment",
             )
 
 
 @cache
 def _keep_freed_memory() -> None:
-    """Let a Dask worker use freed memory again, as other processes do.
+    """Let a Dask worker reuse freed memory, as other processes do.
 
     Dask starts its workers with MALLOC_TRIM_THRESHOLD_, so that every array above 128 KiB gets new pages.
     Making these pages takes a third of the time of a build.

@@ -37,10 +37,11 @@ _TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that take jobs: their present number, and the errors that mean that a job was lost with its
-    worker.
+    """Workers that run jobs. ``present`` returns their current number; the errors in ``lost`` mean that a job
+    was lost with its worker.
 
-    ``tries`` is how often a job is started at most; ``restart`` is called before lost jobs are started again.
+    ``tries`` is the largest number of times that a job is started; ``restart`` is called before lost jobs are
+    started again.
     """
 
     submit: Callable[..., Future[bytes]]
@@ -92,17 +93,18 @@ def run_jobs(
 ) -> Generator[tuple[J, R], None, None]:
     """Yield each job with its result, in the order in which the jobs are finished.
 
-    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
-    worker died is run again, one at a time, at most twice; Dask repeats it as often as its scheduler allows.
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. Jobs whose
+    workers died are run again, one at a time and at most twice; Dask repeats them as often as its scheduler
+    allows.
 
     Args:
-        function: importable by name; jobs and results can be pickled.
+        function: must be importable by name; jobs and results must be picklable.
         name: what messages call a job.
         apart: whether the function starts a process and waits for it. Local workers can then be threads.
 
     Raises:
-        InputError: no scheduler at the address, a worker of other software or with several threads, or a job
-            whose worker died.
+        InputError: there is no scheduler at the address, a worker has other software or several threads, or
+            the worker of a job died.
     """
     if not workers.elsewhere or len(jobs) < (1 if workers.dask else 2):
         yield from ((job, function(job)) for job in jobs)
@@ -147,9 +149,9 @@ def _tried(
             except pool.lost as error:
                 if tries[number] >= pool.tries:
                     raise InputError(
-                        f"the worker of {name(number)}",
-                        got=pool.fate,
-                        hint="run it again to resume; if memory ran out, use fewer or larger workers",
+                        f"the worker of {name(number)} {pool.fate}",
+                        hint="run the command again to resume; "
+                        "if memory ran out, use fewer or larger workers",
                     ) from error
                 lost.append(number)
             else:
@@ -171,7 +173,7 @@ def kept_open(workers: Workers) -> Iterator[Workers]:
     at once.
 
     Raises:
-        InputError: no scheduler at the address, or no worker there.
+        InputError: there is no scheduler at the address, or it has no worker.
     """
     if not workers.elsewhere:
         yield workers
@@ -238,8 +240,8 @@ def _local(count: int, apart: bool) -> Iterator[Pool]:
 
 
 def _die_with_parent() -> None:
-    """End this worker with its parent; if the parent is killed, it would otherwise wait forever for its next
-    job.
+    """End this worker when its parent ends; otherwise, a worker whose parent was killed would wait forever
+    for its next job.
     """
     from multiprocessing import parent_process
 
@@ -257,7 +259,9 @@ def _dask(address: str) -> Iterator[Pool]:
     try:
         from distributed import Client, KilledWorker
     except ImportError as error:
-        raise InputError("dask", got="not installed", wanted="pip install 'litholoop[cluster]'") from error
+        raise InputError(
+            "dask is not installed", hint="install it with pip install 'litholoop[cluster]'"
+        ) from error
     try:
         _require_scheduler(address)
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
@@ -265,7 +269,9 @@ def _dask(address: str) -> Iterator[Pool]:
         # MemoryError: another program answers at the address, and its bytes are taken for sizes.
         said = str(error) or f"no answer in {_CONNECT_S:g} s"
         raise InputError(
-            "Dask scheduler", got=f"none at {address} ({said})", wanted="for example tcp://host:8786"
+            "Dask scheduler",
+            got=f"none at {address} ({said})",
+            wanted="the address of a running scheduler, for example tcp://host:8786",
         ) from error
 
     def count() -> int:
@@ -292,8 +298,8 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Check that a scheduler answers at the address. A client that meets another program there waits long and
-    then crashes.
+    """Check that a scheduler answers at the address. A client that meets another program there waits for a
+    long time and then crashes.
     """
     from distributed.core import rpc
 

@@ -1,4 +1,4 @@
-"""Access Zarr groups and arrays with types and checks; damaged bytes become one clear error."""
+"""Access Zarr groups and arrays with types and checks, and report damaged bytes as one clear error."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ T = TypeVar("T")
 
 
 def open_root(path: str | Path) -> zarr.Group:
-    """Open the root group of a store, read-only, without trusting consolidated metadata.
+    """Open the root group of a store read-only, without using its consolidated metadata.
 
     Raises:
-        InputError: no such path, or not a Zarr v3 group.
+        InputError: the path does not exist, or is not a Zarr v3 group.
     """
     import zarr
     from zarr.storage import ZipStore
@@ -28,7 +28,9 @@ def open_root(path: str | Path) -> zarr.Group:
     location = Path(path)
     if not location.exists():
         raise InputError(
-            "dataset store", got=f"{location}, which does not exist", wanted="a .zarr folder or .zarr.zip"
+            "dataset store",
+            got=f"{location}, which does not exist",
+            wanted="an existing .zarr folder or .zarr.zip file",
         )
     try:
         source = ZipStore(location, mode="r") if location.is_file() else location
@@ -42,10 +44,10 @@ def open_root(path: str | Path) -> zarr.Group:
 
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
-    """Return the child group of that name.
+    """Return the child group of this name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no group of this name.
     """
     import zarr
 
@@ -53,10 +55,10 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
 
 
 def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Return the child array of that name.
+    """Return the child array of this name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no array of this name.
     """
     import zarr
 
@@ -64,10 +66,10 @@ def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
 
 
 def has_child(parent: zarr.Group, name: str) -> bool:
-    """Return whether there is a child of that name.
+    """Return whether there is a child of this name.
 
     Raises:
-        InputError: there is one, with damaged metadata.
+        InputError: there is one, but its metadata is damaged.
     """
     return _child(parent, name) is not None
 
@@ -76,7 +78,7 @@ def values_of(parent: zarr.Group, name: str) -> Array:
     """Return all values of a child array.
 
     Raises:
-        InputError: no such array, or a stored chunk that does not decode.
+        InputError: there is no such array, or a stored chunk cannot be decoded.
     """
     return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
 
@@ -85,13 +87,13 @@ def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
     """Read a selection of an array.
 
     Raises:
-        InputError: a stored chunk that does not decode; the message names its array.
+        InputError: a stored chunk cannot be decoded; the message names its array.
     """
     try:
         return np.asarray(array[selection])
     except Exception as error:  # each codec raises its own type for damaged bytes
         raise InputError(
-            f"{what} does not decode", got=str(error), hint="the stored chunk is damaged"
+            f"{what} cannot be decoded", got=str(error), hint="the stored chunk is damaged"
         ) from error
 
 
@@ -99,7 +101,7 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
     """Return all child groups by name.
 
     Raises:
-        InputError: a child with damaged metadata.
+        InputError: a child has damaged metadata.
     """
     import zarr
 
@@ -107,10 +109,10 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
 
 
 def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """Read the one-dimensional arrays of a group as a table, with the column ``first`` in front.
+    """Read the one-dimensional arrays of a group as a table whose first column is ``first``.
 
     Raises:
-        InputError: damaged metadata or chunks, or columns of different lengths.
+        InputError: metadata or chunks are damaged, or the columns have different lengths.
     """
     import pandas as pd
     import zarr
@@ -118,7 +120,9 @@ def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
     names = [name for name, child in _children(group).items() if isinstance(child, zarr.Array)]
     columns = {name: _plain(values_of(group, name)) for name in sorted(names, key=lambda n: (n != first, n))}
     if len({values.shape for values in columns.values()}) > 1:
-        raise InputError(f"table {group.store_path}", got="columns of different lengths", wanted="one length")
+        raise InputError(
+            f"table {group.store_path}", got="columns of different lengths", wanted="equal lengths"
+        )
     return pd.DataFrame(columns)
 
 

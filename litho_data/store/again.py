@@ -26,14 +26,14 @@ class StoredScans:
         """Read the scans.
 
         Raises:
-            InputError: no store at the path, or a store of another dataset.
+            InputError: there is no store at the path, or it contains another dataset.
         """
         store = open_store(self.path)
         if store.sha256 != self.sha256:
             raise InputError(
                 f"store {self.path}",
                 got=f"dataset {store.sha256[:12]}…",
-                wanted=f"{self.sha256[:12]}…, as at the start",
+                wanted=f"dataset {self.sha256[:12]}…, as at the start of the run",
             )
         return [store.scan(scan_id) for scan_id in self.ids]
 

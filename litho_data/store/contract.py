@@ -1,4 +1,4 @@
-"""Refuse a store unless it has every file that it declares and every number is possible."""
+"""Check a store when it is opened: refuse it if a declared file is missing or a number is impossible."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def require_complete(path: Path) -> None:
             f"store {path}",
             got=f"no {name}",
             wanted="every file that it declares",
-            hint="copy or build it again; a program that copies its groups has to write empty chunks too",
+            hint="copy or build the store again; a program that copies it must write empty chunks too",
         )
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Yield the files that a store declares but lacks: documents of groups and arrays, and chunks."""
+    """Yield the files that a store declares but lacks: metadata documents and chunks."""
     names = file_names(path)
     with damaged(f"metadata of {path}"):
         documents = {name: json.loads(content) for name, content in read_documents(path, names)}
@@ -79,20 +79,20 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Facts) -> bool:
-    """Return whether a copy by xarray, which has no groups, may lack the chunk of this array.
+    """Return whether a copy made by xarray, which has no groups, may lack the chunk of this array.
 
-    xarray writes no chunk that contains only fill values, such as order 0 of a single scan, or a column that
-    no scan of a part states.
+    xarray does not write chunks that contain only fill values. Examples are the order 0 of a single scan, and
+    a column that is empty for all scans of the copy.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
 
 
 def file_names(path: Path) -> set[str]:
-    """Return the names of all files of a store, a folder or a zip file, with forward slashes.
+    """Return the names, with forward slashes, of all files of a store, which is a folder or a zip file.
 
     Raises:
-        InputError: a zip file with a name that leads out of it.
+        InputError: a name in the zip file leads out of the store.
     """
     if path.is_dir():
         found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
@@ -129,9 +129,7 @@ def _chunks(document: Facts) -> Iterator[str]:
 
 
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    """Return name, pitch, level height, number of levels and write table of a store; raise InputError if one
-    is wrong.
-    """
+    """Return name, pitch, level height, levels, write table and instrument of a store; refuse wrong ones."""
     attributes = dict(root.attrs)
     name = str(attributes.get("name", path.name.partition(".")[0]))
     write = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
@@ -151,9 +149,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """Return the arrays over all scans by name; raise InputError if one is missing or has another shape, type
-    or order.
-    """
+    """Return the arrays over all scans by name; refuse missing arrays, wrong shapes, types or dimensions."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -164,7 +160,7 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        # xarray stores booleans as small integers, and says so.
+        # xarray stores booleans as small integers, and notes this in the attributes.
         as_integers = variable.dtype == array.attrs.get("dtype") == "bool"
         known = as_integers or str(array.dtype) in (variable.dtype, variable.wider)
         if array.shape != wanted or not known:
@@ -177,12 +173,13 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copy whose coordinates show that its pixels are not those of the layouts.
+    """Refuse a copy whose coordinates show that rows or columns of pixels were removed or reordered.
 
-    Positions in the store, such as the transforms of the scans, are counted from the first pixel.
+    Positions in the store, such as the transforms of the scans, refer to the first pixel, so rows and columns
+    may be removed only at the end.
 
     Raises:
-        InputError: rows or columns were left out or reversed.
+        InputError: rows or columns were removed elsewhere, or reversed.
     """
     for name, count in (
         (f"{axis}{unit}", n) for axis, n in zip("yx", shape, strict=True) for unit in ("_um", "")
@@ -191,17 +188,18 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
             found, wanted = values_of(root, name), pixel_centres_um(count, pitch_um)
             if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-6, atol=0):
                 got, shown = (f"{', '.join(f'{one:g}' for one in line[:3])}, …" for line in (found, wanted))
-                hint = "a copy may hold fewer scans, and fewer of the last rows and columns"
+                hint = "a copy may omit scans and be cropped at the end, but not elsewhere"
                 raise InputError(f"{name} of {path}", got=got, wanted=shown, hint=hint)
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """Return ``scan`` (the ids), ``print``, ``order`` and all optional columns; None and "" if nothing is
-    stated.
+    """Return ``scan`` (the ids), ``print``, ``order`` and all optional columns of a store.
+
+    Missing numbers are None, and missing texts "".
 
     Raises:
-        InputError: no scan, an id that repeats or holds a path, columns of other lengths, or an impossible
-            number.
+        InputError: there is no scan, an id repeats or contains a path, a column has another length, or a
+            number is impossible.
     """
     columns: dict[str, list[Any]] = {
         name: [require_plain_name(f"{name} of {path}", str(value)) for value in values_of(root, name)]
@@ -236,9 +234,7 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return (ny, nx) of every scan without padding; raise InputError if one does not fit into the padded
-    field.
-    """
+    """Return the shape (ny, nx) of every scan without padding; refuse one that exceeds the padded field."""
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
     quality = group_of(root, "quality")
@@ -247,16 +243,16 @@ def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...
         if len(side) != count or not Range(1, most).holds(side):
             got = ", ".join(map(str, side.tolist()[:3]))
             raise InputError(
-                f"sizes of the layouts of {path}", got=got, wanted=f"{count} from 1 to {most} px"
+                f"sizes of the layouts of {path}", got=got, wanted=f"{count} sizes from 1 to {most} px"
             )
     return [(int(ny), int(nx)) for ny, nx in zip(*sides, strict=True)]
 
 
 def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> None:
-    """Refuse the arrays of a scan that show no print: impossible levels, or nothing measured.
+    """Refuse a scan with impossible levels, heights or transform, or without any measured pixel.
 
     Raises:
-        InputError: a level above the highest, an impossible transform or height, or no measured pixel.
+        InputError: a level, a height or the transform is impossible, or no pixel was measured.
     """
     highest = int(samples["mask_level"].max())
     if highest >= levels:
@@ -274,8 +270,9 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 
 
 def require_manifest(manifest: Facts, path: Path) -> None:
-    """Refuse a manifest that lacks what its readers need; a manifest with only a table does not come from a
-    build.
+    """Refuse a manifest that lacks entries that its readers need.
+
+    A manifest that contains only the table of files does not come from a build, and needs fewer entries.
 
     Raises:
         InputError: names the first entry that is missing or of another kind.
@@ -292,4 +289,4 @@ def require_manifest(manifest: Facts, path: Path) -> None:
             if pitch is not None:
                 PITCH_UM.require("pitch_um", [pitch[0], pitch[1]])
         if not all(isinstance(text, str) for text in texts):
-            raise TypeError("a number instead of a text")
+            raise TypeError("a number in place of a text")

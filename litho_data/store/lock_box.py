@@ -1,6 +1,6 @@
-"""Choose the lock box: scans of a dataset that no choice of a model or an effect may use.
+"""Choose the lock box: scans of a dataset that must not influence any choice of a model or an effect.
 
-The choice follows from a hash of the ids, not from a library's random generator, so the same ids always give
+The choice depends on a hash of the ids instead of a library's random generator, so the same ids always give
 the same lock box.
 """
 
@@ -26,14 +26,16 @@ def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """Choose a sixth of the scans, at least one, from different prints if possible; choose none of two or
-    fewer.
+    """Choose a sixth of the scans, but at least one, from different prints if possible.
+
+    If there are only one or two scans, none is chosen.
 
     Args:
-        ids: scan ids; ``print_ids``: the print of each, same length.
+        ids: ids of the scans.
+        print_ids: the print of each scan, in the same order.
 
     Raises:
-        InputError: ids that repeat, or lists of different length.
+        InputError: an id repeats, or the lists have different lengths.
     """
     require_unique(ids)
     if len(print_ids) != len(ids):
@@ -50,9 +52,7 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
 
 
 def drawing_key(name: str, seed: int) -> str:
-    """Return a key by which to sort names; the order is the same on every machine and differs between
-    seeds.
-    """
+    """Return a key by which to sort names, in an order that depends only on the seed, not on the machine."""
     return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
 
@@ -68,5 +68,5 @@ def require_unique(ids: Sequence[str]) -> None:
 
 
 def ids_sha256(ids: Sequence[str]) -> str:
-    """Return the hex SHA-256 of a set of ids: sorted, one per line."""
+    """Return the hex SHA-256 of a set of ids, sorted and written one per line."""
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()

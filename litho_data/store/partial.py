@@ -1,8 +1,8 @@
-"""A store under construction, which keeps finished scans so that an interrupted build resumes.
+"""Keep the finished scans of a store under construction, so that an interrupted build can resume.
 
-Its folder ``.<name>.partial`` lies beside the store, and becomes the store by being renamed. A scan is
-finished when its record exists, which is written last. A scan is reused only if its files, parameters and
-code are the same and its arrays still have the recorded hashes.
+The folder ``.<name>.partial`` lies beside the store. When the store is complete, it is moved to its path. The
+record of a scan is written last, so a scan is finished if its record exists. A finished scan is reused only
+if its files, parameters and code are the same and its arrays still have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """One finished scan: its arrays by name, and a record of plain data with ``id``, ``key``, ``steps``, …"""
+    """One finished scan: its arrays by name, and a record of plain data (``id``, ``key``, ``steps``, …)."""
 
     record: Facts
     arrays: Mapping[str, Array]
 
 
 def outputs_of(record: Facts) -> list[Facts]:
-    """Return the outputs of the steps of a scan's record: name, hash, shape, …"""
+    """Return all outputs of the steps in a scan's record, each with name, hash, shape, …"""
     return [output for step in record["steps"] for output in step["outputs"]]
 
 
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
-    """Yield the unfinished store of ``out``, which only one process at a time may use.
+    """Yield the unfinished store of ``out``, which only one build at a time may use.
 
     Raises:
-        InputError: ``out`` exists and is not a dataset store, cannot be written, or is being built already.
+        InputError: ``out`` exists but is not a dataset store, cannot be written, or is already being built.
     """
     _require_replaceable(out)
     with unfinished(out) as folder:
@@ -63,13 +63,13 @@ class PartialStore:
         self._pieces = self.folder / "pieces"
 
     def open(self) -> zarr.Group:
-        """Return the growing root group, after removing everything except finished scans."""
+        """Return the root group to which scans are added, after removing everything except scans."""
         import zarr
 
         self._pieces.mkdir(exist_ok=True)
         if self.store.exists():
             others = [one for one in self.store.iterdir() if one.name != "scans"]
-            # If Zarr is stopped while it writes, it leaves a temporary file.
+            # If Zarr is interrupted while it writes, it leaves a temporary file.
             others += [one for one in (self.store / "scans").glob("*") if one.is_file()]
             for child in others:
                 shutil.rmtree(child) if child.is_dir() else child.unlink()
@@ -82,8 +82,8 @@ class PartialStore:
         """Return the records of the scans that need not be computed again.
 
         Args:
-            root: the growing group.
-            keys: for each id to build, a function that returns its key; other ids are removed.
+            root: the root group to which scans are added.
+            keys: for each id to build, a function that returns its key. Scans with other ids are removed.
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):
@@ -149,5 +149,7 @@ def _require_replaceable(out: Path) -> None:
         schema = None
     if schema != STORE_SCHEMA or not out.is_dir():
         raise InputError(
-            "output", got=f"{out}, which is no dataset store", wanted="a new path, or a store to replace"
+            "output path",
+            got=f"{out}, which exists but is no dataset store",
+            wanted="a new path, or a dataset store to replace",
         )

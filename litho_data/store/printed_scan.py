@@ -1,4 +1,4 @@
-"""One printed field as the whole project uses it, and the key of all its content."""
+"""Define one printed field as the whole project uses it, and the hash of its content."""
 
 import math
 from collections.abc import Mapping
@@ -16,28 +16,30 @@ class PrintedScan:
     """One printed field: the layout sent to the printer and the height measured on the layout's grid.
 
     Args:
-        id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
+        id: name of the scan; ``print_id``: the block of fields with which it was printed; ``order``: its
+            position in the writing order.
         mask_level: layout levels, uint8 (beyond 256 levels uint16), (ny, nx).
         height_um: float32 (ny, nx), µm, NaN where not measured.
-        valid: bool (ny, nx), measured and inside the scan.
+        valid: bool (ny, nx), True where the pixel was measured and lies inside the scan.
         pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
-        levels: number of levels the layout may use.
+        levels: number of levels that the layout may use.
         scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
-        write: the card's ``[write]`` table; None if it has none.
-        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
+        write: the card's ``[write]`` table; None if the card has none.
+        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose. Each is
             None if the card does not state it.
         turned_deg: rotation of the scan relative to the others; ``direction``: 1 trace, -1 retrace; ``tip``:
-            number of the tip; ``pixel_size``: pixel size of the scan relative to the others; None as above.
+            number of the tip; ``pixel_size``: pixel size of the scan relative to the others. Each is None if
+            the card does not state it.
         bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
-        tip_radius_um: radius of the microscope's tip, or its upper bound; None if the store does not say.
+        tip_radius_um: radius of the microscope's tip, or its upper bound; None if the store has neither.
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um`` apart from the scan's
-            offset; NaN where not valid, None if the store has none.
-        groups: what the card's pattern of ids says in addition to the print, such as the field; by name.
+            offset; NaN where not valid. None if the store has none.
+        groups: named groups of the card's id pattern other than the print, such as the field, with values.
         instrument: name of the instrument, if the card's table gives it; ``seen_by``: its kind, which says
             what the heights are (``Instrument``).
         surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 in the layout
-            shows), ``continues`` (more of the print, so that the outermost pixels are not valid) or
-            ``unknown``, which is also the default.
+            shows), ``continues`` (more of the print, so the outermost pixels are not valid) or ``unknown``
+            (the default).
     """
 
     id: str
@@ -80,9 +82,7 @@ class PrintedScan:
 
     @property
     def quarter_turns(self) -> int:
-        """Return the number of ``rot90`` turns, 0 to 3, from the layout's grid to the scan's, by its
-        registration.
-        """
+        """Return how often ``rot90`` rotates the layout's grid to the scan's, 0 to 3, by the registration."""
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
@@ -103,7 +103,7 @@ class PrintedScan:
 
 
 def scan_sha256(scan: PrintedScan) -> str:
-    """Return the one key of a scan, for caches, resumed work and dataset ids: the hash of all its fields."""
+    """Return the hash of all fields of a scan, which is its key in caches, resumed work and dataset ids."""
     return record_sha256(_hashed(scan))
 
 

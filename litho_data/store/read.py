@@ -1,4 +1,4 @@
-"""Read a dataset store: it is checked once when it is opened, then read one scan at a time."""
+"""Read a dataset store, which is checked once when it is opened and then read one scan at a time."""
 
 from __future__ import annotations
 
@@ -55,12 +55,11 @@ _SHOWN_SCANS = 12
 
 
 def open_store(path: str | Path) -> Store:
-    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading. All data are read once to check
-    them.
+    """Open a dataset store, which is a folder or a ``.zarr.zip`` file, and check it by reading all data once.
 
     Raises:
-        InputError: no such path, not a Zarr v3 group, a declared file that is missing or damaged, or arrays
-            and attributes that break the store's contract.
+        InputError: the path does not exist or is not a Zarr v3 group, a declared file is missing or damaged,
+            or arrays or attributes violate the store's contract.
     """
     root = open_root(path)
     require_complete(Path(path))
@@ -107,7 +106,7 @@ class Store:
         """Return one scan without padding.
 
         Raises:
-            InputError: no such id, or a stored chunk that does not decode.
+            InputError: there is no such id, or a stored chunk cannot be decoded.
         """
         row = self._row.get(scan_id)
         if row is None:
@@ -135,11 +134,9 @@ class Store:
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
-        """Return the named groups of the card's pattern for ids, except ``print``, with their values for one
-        id.
+        """Return the named groups of the card's id pattern, except ``print``, with their values for one id.
 
-        A pattern with repetitions is not applied, because a pattern in a store from elsewhere might never
-        finish.
+        A pattern with repetitions is not applied, because in a store from elsewhere it might never finish.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -153,14 +150,14 @@ class Store:
         return {name: value for name, value in found.items() if name != "print" and value is not None}
 
     def scans(self) -> list[PrintedScan]:
-        """Return all scans in stored order, in memory."""
+        """Read all scans into memory and return them in stored order."""
         return [self.scan(scan_id) for scan_id in self.ids]
 
     def sample(self, name: str, row: int) -> Array:
-        """Return one scan's slice of one array in the scan's true shape.
+        """Return one scan's part of an array over all scans, without padding.
 
         Raises:
-            InputError: a stored chunk that does not decode.
+            InputError: a stored chunk cannot be decoded.
         """
         what = f"{name} of scan {self.ids[row]} in {self.path}"
         values = decoded(self._arrays[name], row, what)
@@ -171,24 +168,23 @@ class Store:
         return values[:ny, :nx]
 
     def scan_frame(self, scan_id: str, name: str) -> Array:
-        """Return an array of a scan in its own frame: ``raw_height_um``, ``levelled_height_um``,
-        ``removed_um``, …
+        """Return an array in the scan's own frame, such as ``raw_height_um`` or ``levelled_height_um``.
 
         Raises:
-            InputError: no such scan or array, or a stored chunk that does not decode.
+            InputError: there is no such scan or array, or a stored chunk cannot be decoded.
         """
         return values_of(group_of(self.root, f"scans/{scan_id}"), name)
 
     @property
     def locked_ids(self) -> list[str]:
-        """Return the ids of the lock box: a sixth of the scans, from different prints, always the same."""
+        """Return the ids of the lock box, which is always the same sixth of the scans."""
         return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Return the hash of the raw file of each scan, independent of levelling and registration.
+        """Return the hash of each scan's raw file, which does not depend on levelling or registration.
 
-        A scan is left out if the store does not list its file. Layouts are not hashed, because one may be
-        printed twice.
+        A scan is omitted if the store does not list its file. Layouts are not hashed, because a layout may
+        be printed more than once.
         """
         wanted = set(ids)
         rows = [row for row in self.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
@@ -196,8 +192,9 @@ class Store:
         return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
-        """Return the scans outside the dataset: id and use, such as flat; ``scan_frame`` reads their
-        heights.
+        """Return the ids of the reference scans, each with its use, such as ``flat``.
+
+        Reference scans do not belong to the dataset; ``scan_frame`` reads their heights.
         """
         if not has_child(self.root, "scans"):
             return {}
@@ -207,7 +204,7 @@ class Store:
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     def recorded_pitches_um(self) -> dict[str, YX]:
-        """Return the pitch (y, x) of the scans, including references, as their reader recorded it."""
+        """Return the pitch (y, x) that the reader recorded for each scan, including references."""
         pitches = {}
         for row in self.manifest.get("files", []):
             if pitch := _read_facts(row).get("pitch_um"):
@@ -216,9 +213,7 @@ class Store:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """Return card, build record and one row per raw file; empty for a store that was not built from a
-        card.
-        """
+        """Return the card, the build record and one row per raw file; empty if the store has no manifest."""
         if not has_child(self.root, "manifest"):
             return {}
         group = group_of(self.root, "manifest")
@@ -228,8 +223,9 @@ class Store:
 
     @cached_property
     def quality(self) -> pd.DataFrame:
-        """Return one row per scan with registration, levelling and noise figures; only the ids if none are
-        stored.
+        """Return one row per scan with its registration, levelling and noise figures.
+
+        If the store has no such figures, the rows contain only the ids.
         """
         import pandas as pd
 
@@ -239,16 +235,16 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Return the hash of the dataset as it was read, independent of chunking."""
+        """Return the hash of the dataset as it was first read, which does not depend on chunking."""
         return self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:
-        """Return name and hash, for results made from this dataset."""
+        """Return name and hash of the dataset, for results that are made from it."""
         return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:
-        """Compute the hash of the dataset from the arrays as they are now."""
+        """Compute the hash of the dataset from its current arrays."""
         facts = dataset_facts(self, self.instrument, self.write)
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
 
@@ -269,7 +265,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """Return the bend of a scan in its own frame; None if none is stored."""
+        """Return the bend of a scan in its own frame, or None if none is stored."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

@@ -1,4 +1,4 @@
-"""The dataset store at a glance: arrays (``variables.toml``), columns, and the hash of a dataset."""
+"""Define the arrays (``variables.toml``) and columns of a dataset store, and the hash of a dataset."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ WRITE = "write_"
 
 @dataclass(frozen=True)
 class Variable:
-    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name.
+    """One array of the store: name, dimensions, type, unit (UDUNITS spelling) and CF long name.
 
-    ``wider`` is the type used if ``dtype`` cannot hold all values.
+    ``wider`` is the type that is used if ``dtype`` cannot represent all values.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Variable:
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
-        """Return the dimensions of one scan's slice."""
+        """Return the dimensions of one scan's part of the array."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
     def stored_as(self, sample: Array) -> str:
@@ -39,9 +39,7 @@ class Variable:
         return self.wider if str(sample.dtype) == self.wider else self.dtype
 
     def sample_sha256(self, sample: Array) -> str:
-        """Return the hash of one scan's slice in its true shape, so that padding and chunking do not
-        matter.
-        """
+        """Return the hash of one scan's part of the array, given without padding."""
         return array_sha256(np.asarray(sample, dtype=self.stored_as(sample)), self.unit, self.sample_dims)
 
 
@@ -59,7 +57,7 @@ SAMPLE_VARIABLES, (SIGMA,), SCAN_VARIABLES = (
 """The arrays over all scans, their uncertainty, and the arrays of single scans; see ``variables.toml``."""
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layouts' grid."""
-# The array as a whole has no unit; hashes use 1.
+# An array with mixed units has no unit as a whole; hashes use 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = {
@@ -71,20 +69,23 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Numbers per scan from the card's table with their ranges; coordinates, NaN where a row has none."""
+"""Optional numbers per scan from the card's table, with their ranges; NaN where a row has none."""
 Instrument = Literal["afm", "profilometer", "confocal", "sem"]
-"""What heights are: measured by a probe (``afm``, ``profilometer``), by light (``confocal``), or a film's
-height times its coverage of a pixel, from the edges in an electron micrograph (``sem``)."""
+"""Kind of instrument. Heights are measured by a probe (``afm``, ``profilometer``) or by light
+(``confocal``). With ``sem``, they are a film's height times the share of a pixel that it covers, from the
+edges in an electron micrograph."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
-"""Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
+"""Optional words per scan from the card's table; empty where a row has none."""
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:
-    """Return facts about all scans, as part of the dataset's hash.
+    """Return the facts about all scans that enter the dataset's hash.
 
     Args:
-        geometry: has ``pitch_um``, ``level_height_um`` and ``levels``; ``write``: the card's table.
+        geometry: an object with ``pitch_um``, ``level_height_um`` and ``levels``.
+        instrument: kind of instrument.
+        write: the card's ``[write]`` table.
     """
     facts = {name: getattr(geometry, name) for name in ("pitch_um", "level_height_um", "levels")}
     kind = {} if instrument == "afm" else {"instrument": instrument}
@@ -92,12 +93,13 @@ def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[s
 
 
 def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
-    """Return the hash of all data of a dataset that a model can use, independent of chunking, padding and
-    metadata texts.
+    """Return the hash of all data of a dataset that a model can use.
+
+    The hash does not depend on chunking, padding and metadata texts.
 
     Args:
         facts: see ``dataset_facts``.
-        scans: per scan in stored order: ``id``, ``print``, ``order``, the optional columns that are not NaN,
-            and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
+        scans: for each scan, in stored order: ``id``, ``print``, ``order``, the optional columns that are not
+            NaN, and ``arrays``, a dict that maps variable names to :meth:`Variable.sample_sha256`.
     """
     return record_sha256({"facts": dict(facts), "scans": [dict(scan) for scan in scans]})

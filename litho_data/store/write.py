@@ -1,4 +1,4 @@
-"""Write a dataset store: one scan per chunk, which suits copies by other tools, and a checksum per chunk."""
+"""Write a dataset store with one scan per chunk, which suits other tools, and a checksum for each chunk."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import zarr
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
-"""Fill values beyond the edge of a layout that is smaller than the largest."""
-# The arrays that can be the image of a scan.
+"""Values that pad the arrays of a layout that is smaller than the largest layout."""
+# The arrays that can serve as the OME-Zarr image of a scan, in order of preference.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 
@@ -34,14 +34,14 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write the group ``scans/<id>``, one scan in its own frame, which is also an image of OME-Zarr.
+    """Write one scan in its own frame as the group ``scans/<id>``, which is also an OME-Zarr image.
 
     Args:
         root: an open group.
         scan_id: name of the scan.
-        arrays: arrays in its own frame, by name; others are ignored.
-        use: as in the card's table.
-        pitch_um: (y, x) of the scan.
+        arrays: arrays by name; those that are not in the scan's own frame are ignored.
+        use: use of the scan, as in the card's table.
+        pitch_um: (y, x) pitch of the scan.
     """
     shown = next(name for name in SHOWN if name in arrays)
     attributes = {"use": use, "ome": _ome(scan_id, shown, pitch_um)}
@@ -54,9 +54,7 @@ def write_scan_group(
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
-    """Describe an image by OME-NGFF 0.5: heights, pixel size, and axes named as the dimensions of the
-    array.
-    """
+    """Return the OME-NGFF 0.5 description of an image; its axes are named as the array's dimensions."""
     axes = [{"name": _OWN_FRAME[axis], "type": "space", "unit": "micrometer"} for axis in "yx"]
     scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
     dataset = {"path": path, "coordinateTransformations": scale}
@@ -73,9 +71,9 @@ def write_samples(
 
     Args:
         root: an open group.
-        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers and
-            words) and ``arrays`` (names of the arrays made from it).
-        load: gives the sample arrays of an id.
+        scans: for each scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers
+            and words) and ``arrays`` (names of the arrays that were made from it).
+        load: function that returns the arrays of an id on the layout grid.
         pitch_um: pitch of the layout grid, µm.
     """
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
@@ -108,7 +106,7 @@ def write_samples(
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "units": "um"}
         centres = pixel_centres_um(count, pitch_um)
         write_numbers(root, f"{axis}_um", centres, axis, attributes=described)
-        # The CF conventions allow only one coordinate of an array to name an axis.
+        # The CF conventions allow only one of an array's coordinates to name an axis.
         write_numbers(root, axis, centres, axis, attributes={**described, "axis": axis.upper()})
 
 
@@ -120,9 +118,7 @@ def pixel_centres_um(count: int, pitch_um: float) -> Array:
 def write_table(
     root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict[str, Any] | None = None
 ) -> None:
-    """Write a table as a group of one-dimensional arrays over ``dim``; text is UTF-8, and no text is
-    missing.
-    """
+    """Write a table as a group of one-dimensional arrays over ``dim``, with all texts in UTF-8."""
     group = root.create_group(name, attributes=attributes or {})
     for column in table.columns:
         values = table[column].to_numpy()
@@ -151,9 +147,10 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
 
 
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
-    """Create an array: Zstandard on shuffled bytes, then a checksum, so that no flipped byte goes unnoticed.
+    """Create an array, compressed by Zstandard after a byte shuffle, with a checksum that reveals damage.
 
-    By default a chunk that contains only fill values has no file, and would look like a lost chunk.
+    Chunks that contain only fill values are written too. By default they would have no file, which would look
+    like a lost chunk.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -162,11 +159,11 @@ def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
 
 
 def consolidate(root: zarr.Group) -> None:
-    """Copy all metadata into the root's document, so that xarray opens the store with one read."""
+    """Copy all metadata into the root's document, so that xarray can open the store with one read."""
     import zarr
 
     with warnings.catch_warnings():
-        # zarr-python warns that other readers may not know the copy; such readers use the single documents.
+        # zarr-python warns that other readers may not support the copy. They use the separate documents.
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(root.store)
 
@@ -177,7 +174,7 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
     attributes = {**unit, "long_name": variable.long_name}
     if variable.dims[:2] == ("scan", "y"):
         attributes["coordinates"] = "print order y_um x_um"
-    # A scan's own frame has other sizes than the layouts, so within one tree its axes need other names.
+    # A scan's own frame and the layouts differ in size, so their axes need different names within one tree.
     frame = {} if variable.dims[0] == "scan" else _OWN_FRAME
     names = tuple(frame.get(dim, dim) for dim in variable.dims)
     return _array(

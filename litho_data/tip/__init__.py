@@ -1,4 +1,4 @@
-"""Estimate the tip of the microscope from its scans: its radius, and where it did not touch."""
+"""Estimate the radius of the microscope's tip from its scans, and find where the tip did not touch."""
 
 from litho_data.tip.certainty import reconstructed, tip_certain
 from litho_data.tip.estimate import TipEstimate, estimate_tip

@@ -1,9 +1,9 @@
-"""Find which pixels of a surface the tip touched, and the surface behind the image.
+"""Find which pixels of a surface the tip touched, and reconstruct the surface from the image.
 
-The point where the tip touches determines the image. Where the surface curves upward more sharply than the
-tip, the contact jumps from one side of a valley to the other. The surface between was not touched, and the
-image shows it as a single pixel: a valley whose curvature exceeds that of the tip. The untouched pixels are
-those whose highest possible height is set by such a valley (Villarrubia 1997, section 5).
+The point of contact determines the height in the image. If a valley is more sharply curved than the tip, the
+contact jumps from one side of the valley to the other. The surface in between is not touched, and appears in
+the image as a single pixel, a valley more sharply curved than the tip. Pixels are untouched if such a valley
+sets their highest possible height (Villarrubia 1997, section 5).
 """
 
 import numpy as np
@@ -20,13 +20,13 @@ from litho_data.tip.curvature import (
 )
 from litho_data.tip.morphology import paraboloid_erosion
 
-# Curvature of a valley in units of the tip's curvature. Above the first value the valley may be a jump, and
-# above the second value it is one. The image of a valley of curvature k has k / (1 − kR), so 0.6 of the tip's
-# curvature means 0.375 in the surface. If noise requires a disc as wide as the valley, the disc
-# underestimates the curvature; noise alone reaches 0.6 at 3.5 sd.
+# Curvature of a valley in the image, in units of the tip's curvature. Above the first value, the contact may
+# jump there; above the second value, it does. A valley of curvature k has k / (1 − kR) in the image, so 0.6
+# of the tip's curvature in the image means 0.375 in the surface. If noise requires a disc as wide as the
+# valley, the disc underestimates the curvature. Noise alone reaches 0.6 at 3.5 sd.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
-# A disc shows a jump, weakened, up to its radius away; the jump is where the signal exceeds this share of its
-# peak.
+# A jump also affects discs around it, up to their radius away, but less. The jump is where the signal exceeds
+# this share of its peak.
 _CORE = 0.55
 _SMOOTHING = 0.25
 
@@ -34,16 +34,16 @@ _SMOOTHING = 0.25
 def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
     """Return the pixels of the surface that the tip touched, bool (ny, nx), with a margin of one pixel.
 
-    If the radius is only an upper bound, more pixels than necessary count as uncertain. Unmeasured pixels are
+    If the radius is only an upper bound, more pixels than necessary count as untouched. Unmeasured pixels are
     False.
 
     Args:
         height_um: image (ny, nx), µm, NaN where not measured.
-        pitch_um: (y, x).
-        radius_um: radius of the end of the tip, taken as a paraboloid.
+        pitch_um: (y, x) pitch.
+        radius_um: radius of the end of the tip, which is assumed to be a paraboloid.
 
     Raises:
-        InputError: a radius that is not a positive number.
+        InputError: the radius is not a positive number.
     """
     from scipy.ndimage import binary_dilation, label, maximum_filter
 
@@ -65,16 +65,17 @@ def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
 
 
 def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Return the highest surface that gives this image, (ny, nx) µm: the image eroded by the tip.
+    """Return the highest surface (ny, nx), µm, that gives this image, by eroding the image by the tip.
 
-    This surface equals the true one where the tip touched, and lies above it elsewhere. Noise is treated as
-    surface: its valleys widen to the width of the tip, which lowers the result by up to the noise.
+    The result equals the true surface where the tip touched, and lies above it elsewhere. Noise is treated as
+    part of the surface. Its valleys widen to the width of the tip, which lowers the result by up to the
+    noise.
 
     Args:
         height_um, pitch_um, radius_um: as for ``tip_certain``.
 
     Raises:
-        InputError: a radius that is not a positive number.
+        InputError: the radius is not a positive number.
     """
     return paraboloid_erosion(_checked(height_um, radius_um), pitch_um, radius_um).surface
 

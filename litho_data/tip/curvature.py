@@ -1,4 +1,4 @@
-"""Estimate the noise of a scan, and the curvatures over small discs with their noise."""
+"""Estimate the noise of a scan, its curvatures over small discs, and the noise of these curvatures."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,7 +8,7 @@ import numpy as np
 from litho_data.foundation import YX, Array
 from litho_data.roughness.noise import fine_differences, robust_sd
 
-# Radii in pixels; each adds pixels to the disc before it.
+# Radii in pixels; each disc has more pixels than the one before.
 DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 # Largest acceptable noise of a curvature, as a share of the curvature of the tip.
 QUIET = 0.17
@@ -16,7 +16,7 @@ QUIET = 0.17
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviation of white noise, and of one offset per row or per column, µm."""
+    """Standard deviations, in µm, of white pixel noise and of one offset per row or per column."""
 
     pixel_um: float
     line_um: float
@@ -24,11 +24,10 @@ class Noise:
 
 
 def noise_of(height_um: Array) -> Noise:
-    """Estimate the noise of a scan (ny, nx), µm, from fourth differences, which vanish on the parabolas that
-    a tip leaves.
+    """Estimate the noise of a scan (ny, nx), µm, from fourth differences.
 
-    If the variation down the columns exceeds that along the rows, the excess is an offset of whole rows, and
-    vice versa.
+    Fourth differences vanish on the parabolas that a tip leaves in the image. If the noise along the columns
+    exceeds that along the rows, the excess is attributed to offsets of whole rows, and vice versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
@@ -36,14 +35,14 @@ def noise_of(height_um: Array) -> Noise:
 
 
 def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
-    """Return the highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
+    """Return the highest principal curvature (ny, nx), 1/µm, of a quadratic fit on a disc at each pixel.
 
     The result is exact for a quadratic surface, and has the least noise of all linear estimates on the disc.
-    NaN where the disc leaves the scan or contains an unmeasured pixel.
+    It is NaN where the disc extends beyond the scan or contains an unmeasured pixel.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
-        pitch_um: (y, x).
+        pitch_um: (y, x) pitch.
         radius_px: radius of the disc, pixels.
     """
     from scipy.ndimage import binary_dilation
@@ -62,8 +61,9 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Return the standard deviation of the curvature of a flat scan with this noise, 1/µm; the larger of both
-    axes.
+    """Return the standard deviation, 1/µm, of the curvature of a flat scan with this noise.
+
+    The result is the larger value of the two axes.
     """
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
@@ -75,8 +75,9 @@ def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
 
 @lru_cache(maxsize=64)
 def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
-    """Return the weights (3, n, n) of the second derivatives xx, xy, yy, 1/µm², of a quadratic fit on a
-    disc.
+    """Return the weights (3, n, n), 1/µm², that give the second derivatives of a quadratic fit on a disc.
+
+    The order of the derivatives is xx, xy, yy.
     """
     inside = disc(radius_px)
     y_px, x_px = (places - int(radius_px) for places in np.nonzero(inside))
@@ -89,7 +90,7 @@ def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
 
 
 def disc(radius_px: float) -> Array:
-    """Return the pixels (n, n) of a disc, bool, n odd."""
+    """Return a mask, bool (n, n) with n odd, of the pixels in a disc."""
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9

@@ -1,4 +1,4 @@
-"""Estimate the tip of one or more scans: its radius or an upper bound, and where it did not touch."""
+"""Estimate the radius of the tip of one or more scans, or an upper bound, and where the tip did not touch."""
 
 import math
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ _SAME_PITCH = 1e-3
 
 
 class ScanUnderTip(Record):
-    """One scan: the share of pixels that the tip touched, and the wavelength below which the scan may show
-    the tip.
+    """The effect of the tip on one scan.
 
-    Both values are None if the image sets no bound on the tip; ``resolution_um`` is also None if the tip does
-    not limit it.
+    ``certain_fraction`` is the share of pixels that the tip touched. ``resolution_um`` is the wavelength
+    below which the scan may show the tip. Both are None if the scans set no bound on the tip;
+    ``resolution_um`` is also None if the tip does not limit the resolution.
     """
 
     name: str
@@ -35,15 +35,15 @@ class TipEstimate(RunFacts, Result):
     """The tip as estimated from its scans.
 
     Args:
-        kind: ``estimate`` if many places show the same end of the tip, else ``upper bound``.
+        kind: ``estimate`` if many places in the scans show the same end of the tip, else ``upper bound``.
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of an estimate; None for a bound.
-        reason: why it is only a bound; empty for an estimate.
-        depth_um: range of heights, without tilt and bow, of the scan from which the radius comes.
-        reach_px: √(2 R depth) in pixels: how far the image of a spike reaches.
+        reason: why the radius is only a bound; empty for an estimate.
+        depth_um: range of heights, without tilt and bow, of the scan that determines the radius.
+        reach_px: √(2 R depth) in pixels, which is the radius of the image of a spike.
         pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
         window_px: side of the windows in which curvatures were measured; None without a bound.
-        share: share of the sharp places that are as sharp as the sharpest; high if the tip limits them.
+        share: share of the sharp places that are about as sharp as the sharpest; high if the tip limits them.
         pitch_um: (y, x) of the scans.
         scans: results for each scan.
     """
@@ -68,15 +68,16 @@ class TipEstimate(RunFacts, Result):
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     """Estimate the tip that made one or more scans, such as those of one day.
 
-    The radius comes from the sharpest tops, because an image is nowhere more sharply curved than the end of
-    its tip. The radius is an estimate only if many tops share the largest curvature and valleys exceed it.
-    Otherwise the tip may be sharper than anything that it scanned.
+    The radius comes from the sharpest tops, because no top of an image is more sharply curved than the end of
+    the tip. The result is an estimate only if many tops share the largest curvature and valleys exceed it.
+    Otherwise, the tip may be sharper than anything that it scanned.
 
     Args:
-        scans: scans with a pitch, the same for all. Levelling has little influence.
+        scans: scans that all have the same pitch. Levelling has little influence.
 
     Raises:
-        InputError: no scan, a scan without pitch, different pitches, or a scan of fewer than 64 × 64 pixels.
+        InputError: there is no scan, a scan has no pitch, the pitches differ, or a scan has fewer than 64 ×
+            64 pixels.
     """
     pitch_um = _common_pitch(scans)
     heights = [scan.height_um for scan in scans]
@@ -123,7 +124,7 @@ def _common_pitch(scans: Sequence[Scan]) -> YX:
     for scan, pitch in zip(scans, pitches, strict=True):
         if min(scan.shape) < 64:
             raise InputError(
-                f"scan {scan.source or scan.name}", got=scan.shape, wanted="64 x 64 pixels or more"
+                f"size of scan {scan.source or scan.name}", got=scan.shape, wanted="at least 64 x 64 pixels"
             )
         if not np.allclose(pitch, pitches[0], rtol=_SAME_PITCH):
             what = f"pitch of {scan.source or scan.name}"

@@ -1,5 +1,4 @@
-"""Find the surface behind an image: a tip dilates what it scans, and eroding the image by the tip restores
-the surface.
+"""Reconstruct a surface from its image: the tip dilates the surface, and eroding the image restores it.
 
 Unmeasured pixels (NaN) are ignored.
 """
@@ -12,8 +11,9 @@ from litho_data.foundation import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A surface (ny, nx), and row and column (int32) of the pixel that sets each height. NaN pixels set no
-    height.
+    """A surface (ny, nx), and the row and column (int32) of the image pixel that sets each height.
+
+    Unmeasured (NaN) pixels set no height.
     """
 
     surface: Array
@@ -22,10 +22,10 @@ class Eroded(NamedTuple):
 
 
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
-    """Return the highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
+    """Return the highest surface that explains an image (ny, nx), µm, scanned by a paraboloid tip.
 
-    A paraboloid is the sum of two parabolas, so the minimum is taken along one axis after the other. NaN
-    stays NaN.
+    ``radius_um`` is the radius of the tip. A paraboloid is the sum of two parabolas, so the minimum is taken
+    along one axis after the other. Pixels that are NaN in the image stay NaN.
     """
     rows = np.broadcast_to(np.arange(image.shape[0], dtype=np.int32)[:, None], image.shape)
     measured = np.isfinite(image)
@@ -41,11 +41,9 @@ def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
 def _erode_rows(
     heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
 ) -> tuple[Array, Array]:
-    """Return the lowest value of height + distance²/2R along rows, and the position of the pixel that gives
-    it.
-    """
+    """Return the lowest value of height + distance²/2R along each row, and the position of its pixel."""
     lowest, owner = heights.copy(), places.copy()
-    # Farther away the tip is higher than the whole image.
+    # Beyond this distance, the tip has risen by more than the range of the image.
     reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)
     for step in range(1, reach + 1):
         rise = (step * pitch_um) ** 2 / (2 * radius_um)

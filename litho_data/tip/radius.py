@@ -1,9 +1,10 @@
 """Estimate the radius of the end of a tip from the sharpest tops of its images.
 
-Under a paraboloid tip the image plus x²/2R is convex along every line. No top is curved more sharply than
-1/R, and every corner and spike sharper than the tip appears with exactly this curvature. The distribution of
-an image's curvatures therefore ends in an edge: a clear edge if the tip sets it, a thin tail if the surface
-does. Curvatures are measured along the lines of the scan, where offsets of lines do not matter.
+With a paraboloid tip, the image plus x²/2R is convex along every line. No top has a curvature above 1/R, and
+every corner and spike that is sharper than the tip appears with exactly this curvature. The distribution of
+an image's curvatures therefore has an upper edge. The edge is clear if the tip sets it; if the surface sets
+it, the distribution ends in a thin tail. Curvatures are measured along the lines of the scan, where the
+offsets of lines do not matter.
 """
 
 from collections.abc import Sequence
@@ -17,38 +18,40 @@ from litho_data.tip.curvature import QUIET, noise_of
 
 # Half sides of the square windows in which a parabola is fitted, pixels.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# Windows with half sides of a third of the reach average most and still fit on the image of an edge; up to
-# 0.45 is allowed.
+# A window with a half side of a third of the reach averages over as many pixels as still fit on the image of
+# an edge. Half sides of up to 0.45 of the reach are allowed.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The edge is placed so that 98 % of the curvatures above half of it lie below it; noise adds 1.4 of its
-# standard deviations there.
+# The edge is placed so that 98 % of the curvatures that exceed half of it lie below it. Noise raises it by
+# 1.4 standard deviations of the noise.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
-# Share of a line, at each end, that is not used: near the scanner's turning points it is unreliable.
+# Share of a line that is excluded at each end, because the scan is unreliable near the turning points.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Share of the tops above 0.4 of the edge that exceed 0.8 of it; it is up to 0.16 on surfaces that no tip
-# limits.
+# Smallest share, among the tops above 0.4 of the edge, of those above 0.8 of it. On surfaces that no tip
+# limits, the share is at most 0.16.
 _TIP_SHARE = 0.25
-# A tip is the same all over a scan, but the few sharpest tops of a surface are not. This share is therefore
-# multiplied by the share of the scan's 5 x 5 parts whose own edge reaches 0.9 of the whole scan's. Of the
-# estimates that are more than 10 % too blunt, most on rounded bumps lie below this limit, but only one in
-# twenty on steep walls and spikes.
+# The tip is the same everywhere in a scan, but the sharpest tops of a surface are in a few places. The share
+# is therefore multiplied by the share of the scan's 5 x 5 parts whose own edge exceeds 0.9 of the whole
+# scan's edge, and the product must reach 0.13. Of the estimates that are more than 10 % too blunt, this limit
+# rejects most on rounded bumps, but only one in twenty on steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# Under a tip, valleys are sharper than tops; on other surfaces, and in most noise, they are not.
+# If the tip limits the image, valleys are sharper than tops. On other surfaces and in most noise, they are
+# not.
 _SHARPER_VALLEYS = 1.2
-# Scatter of estimates of known tips in excess of the scatter among the parts of a scan.
+# Relative scatter of the estimates for known tips, beyond the scatter among the parts of a scan, and number
+# of standard uncertainties that are added for a bound.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 
 
 @dataclass(frozen=True)
 class PeakRadius:
-    """A radius, µm, or None without any bound; ``reason`` says why it is only a bound, and is empty for an
-    estimate.
+    """The radius of a tip, µm, as an estimate or an upper bound; None if there is no bound.
 
-    ``sd_um`` is the standard uncertainty; a bound lies twice this value above the radius found. ``depth_um``
-    is the range of heights; for ``window_px`` and ``share`` see ``TipEstimate``.
+    ``reason`` says why the radius is only a bound, and is empty for an estimate. ``sd_um`` is the standard
+    uncertainty; a bound exceeds the radius found by twice this value. ``depth_um`` is the range of heights.
+    For ``window_px`` and ``share``, see ``TipEstimate``.
     """
 
     radius_um: float | None
@@ -60,12 +63,11 @@ class PeakRadius:
 
 
 def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
-    """Estimate the radius of the tip from one scan, or an upper bound with the reason why no estimate is
-    possible.
+    """Estimate the radius of the tip from one scan, or give an upper bound with the reason for it.
 
     Args:
-        height_um: (ny, nx), µm, NaN where not measured. Tilt and bow count as depth only.
-        pitch_um: (y, x).
+        height_um: (ny, nx), µm, NaN where not measured. Tilt and bow have little influence.
+        pitch_um: (y, x) pitch.
     """
     depth_um = float(np.subtract(*np.nanpercentile(remove_bow(height_um), _SPAN[::-1])))
     noise = noise_of(height_um)
@@ -96,8 +98,8 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
     """Combine scans of one tip: return the mean estimate, or the lowest bound if there is no estimate.
 
-    Estimates well above the lowest come from rounded surfaces and are dropped. A bound from one scan refutes
-    estimates well above it from others.
+    Estimates far above the lowest estimate come from rounded surfaces and are discarded. If the lowest bound
+    lies clearly below the mean estimate, the bound is returned instead.
     """
     known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
     estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
@@ -116,7 +118,7 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 
 @dataclass(frozen=True)
 class _Tops:
-    """Curvatures (ny, nx), 1/µm, of windows of one size: positive at tops, NaN without a window."""
+    """Curvatures (ny, nx), 1/µm, in windows of one size: positive at tops, NaN where there is no window."""
 
     half_px: int
     noise: float
@@ -129,7 +131,7 @@ class _Tops:
         return near / max(sharp, 1)
 
     def edges(self, count: int) -> list[float]:
-        """Return the edge in each of count x count parts of the scan."""
+        """Return the edge of the curvatures in each of count x count parts of the scan."""
         return [
             _edge(part, self.noise)
             for rows in np.array_split(self.curvature, count, axis=0)
@@ -140,20 +142,29 @@ class _Tops:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
     def doubt(self, depth_um: float, pitch_um: YX) -> str:
-        """Say why the edge may not come from the tip; return an empty text if there is no doubt."""
+        """Return the reason why the edge may not come from the tip, or an empty text if there is none."""
         reach = self.reach_px(depth_um, pitch_um)
         if reach < _SMALLEST_REACH_PX:
-            return f"such a tip reaches over {reach:.1f} pixels, fewer than {_SMALLEST_REACH_PX:.0f}"
+            return (
+                f"with a tip of this radius, the image of a spike would reach only {reach:.1f} pixels, fewer "
+                f"than {_SMALLEST_REACH_PX:.0f}"
+            )
         if self.half_px > _LARGEST_OF_REACH * reach:
             size = 2 * self.half_px + 1
-            return f"the noise requires windows of {size} pixels, and the tip reaches over {reach:.1f}"
+            return (
+                f"the noise requires windows of {size} pixels, too wide for the image of a spike, which "
+                f"reaches only {reach:.1f} pixels"
+            )
         if self.share < _TIP_SHARE:
-            return f"{self.share:.0%} of the sharp tops are as sharp as the sharpest: the surface limits them"
+            return (
+                f"only {self.share:.0%} of the sharp tops are about as sharp as the sharpest, so the surface "
+                "limits them, not the tip"
+            )
         agreeing = sum(edge > _AGREEMENT * self.edge for edge in self.edges(_PARTS))
         if self.share * agreeing < _EVERYWHERE * _PARTS**2:
             return (
-                f"{agreeing} of {_PARTS**2} parts of the scan have tops as sharp as the sharpest, and "
-                f"{self.share:.0%} of the sharp tops are: the surface may limit them"
+                f"only {agreeing} of {_PARTS**2} parts of the scan have tops about as sharp as the sharpest, "
+                f"and only {self.share:.0%} of the sharp tops are, so the surface may limit them"
             )
         valleys = _edge(-self.curvature, self.noise)
         if valleys < _SHARPER_VALLEYS * self.edge:
@@ -164,7 +175,7 @@ class _Tops:
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     from scipy.signal import savgol_coeffs
 
-    # These are the weights of the second derivative of the best parabola through a window.
+    # These weights give the second derivative of the parabola that fits the window best.
     weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
@@ -172,8 +183,9 @@ def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops
 
 
 def _along_lines(lines: Array, weights: Array) -> Array:
-    """Return the second derivative along the lines, averaged over the lines of a window; NaN without a whole
-    window.
+    """Return the second derivative along the lines, averaged over the lines of a window.
+
+    The result is NaN where the window contains an unmeasured pixel.
     """
     from scipy.ndimage import correlate1d, uniform_filter1d
 
@@ -189,8 +201,9 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Return the edge at which the distribution of the curvatures ends, minus the part that noise adds. The
-    result is 0 or less if there is only noise.
+    """Return the upper edge of the distribution of the curvatures, minus the part that noise adds.
+
+    The result is 0 or less if there is only noise.
     """
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:

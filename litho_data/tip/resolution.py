@@ -4,25 +4,26 @@ import numpy as np
 
 from litho_data.foundation import YX, Array
 
-# Sanner et al. 2022: artefacts set in where peaks reach half of the tip's curvature.
+# Artefacts begin where peaks reach half of the tip's curvature (Sanner et al. 2022).
 _SHARE = 0.5
 
 
 def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
     """Return the wavelength below which the scan may show the tip instead of the surface, µm.
 
-    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is taken at distance
-    λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result is the largest λ at
-    which this curvature reaches half of 1/R: Sanner et al., Scale-dependent roughness parameters for
-    topography analysis, arXiv:2106.16103. Noise counts as peaks, so the result is an upper bound.
+    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is computed at the
+    distance λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result is the largest
+    λ at which this curvature reaches half of 1/R (Sanner et al., Scale-dependent roughness parameters for
+    topography analysis, arXiv:2106.16103). Noise counts as peaks, so the result is an upper bound.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured.
-        pitch_um: (y, x).
+        pitch_um: (y, x) pitch.
         radius_um: radius of the tip.
 
     Returns:
-        None if no peak is that sharp at any distance: the tip does not limit the scan.
+        The wavelength, or None if no peak is that sharp at any distance, so that the tip does not limit the
+        scan.
     """
     found = [
         _along(np.moveaxis(height_um, axis, 0), pitch, _SHARE / radius_um)

@@ -1,4 +1,4 @@
-"""A printer and an AFM simulated from physics; they share no code with the models that are tested on them."""
+"""Simulate a printer and an AFM from physics, without any code of the models that are tested on them."""
 
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import jobs_of_card

@@ -1,4 +1,4 @@
-"""Simulate the microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
+"""Simulate the microscope: tip, feedback, drift, line offsets, tilt, bow, datum and quantisation."""
 
 import numpy as np
 import scipy.ndimage
@@ -21,15 +21,15 @@ def scan_surface(
     job: Job,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the height that the microscope reports for a surface given at its pixels, µm.
+    """Return the height, in µm, that the microscope reports for a surface given at its pixels.
 
-    Lines are scanned from left to right (fast axis x; from right to left in retrace), the first line on top.
-    With smaller pixels the tip moves more slowly, so a lag in time becomes a shorter length.
+    The fast axis is x, and the top line is scanned first. Lines run from left to right, or from right to left
+    in retrace. With smaller pixels, the tip moves more slowly, so the same lag in time is a shorter length.
 
     Args:
         surface_um: true height at the pixels of the scan, µm.
         job: what is scanned, in which direction and with which tip.
-        rng: generator of the default noise of this scan.
+        rng: random generator for the default noise of this scan.
     """
     height, scan_index = surface_um, job.index
     if strength := (job.tip == 1) * knobs["tip-dilation"]:
@@ -59,10 +59,11 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Return the path of a paraboloid tip with radii along y and x: ``max_u h(x − u) − u²/2R``. The tip may
-    touch the surface between two pixels.
+    """Return the path of a paraboloid tip with radii along y and x, ``max_u h(x − u) − u²/2R``.
+
+    The tip may touch the surface between two pixels.
     """
-    # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
+    # A paraboloid is a sum of two parabolas, so the maximum can be computed one axis at a time.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
     return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
 
@@ -86,7 +87,7 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
 
 
 def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
-    """Apply first-order feedback along the lines; it follows falling edges more slowly than rising ones."""
+    """Apply first-order feedback along the lines; it follows falling edges more slowly than rising edges."""
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
     at = height[:, 0].copy()
@@ -101,7 +102,7 @@ def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> Array:
-    """Sum all contributions that do not depend on the surface, nm."""
+    """Return the sum, in nm, of all contributions that do not depend on the surface."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)
@@ -128,7 +129,7 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Add scars along the fast axis and single-pixel spikes, of either sign."""
+    """Add scars along the fast axis and single-pixel spikes; both have either sign."""
     scarred = height.copy()
     ny, nx = height.shape
     for _ in range(rng.poisson(scars_per_row * ny)):

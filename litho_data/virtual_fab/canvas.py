@@ -1,4 +1,4 @@
-"""The area that is simulated around one layout, and spectral blurs on this area."""
+"""Define the area that is simulated around one layout, and spectral blurs on this area."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class Canvas:
     """A layout with a guard frame, and its position in the write field.
 
     Args:
-        level: uint8, (ny + 2·GUARD_PX, nx + 2·GUARD_PX); the layout sits in the middle.
+        level: uint8, (ny + 2·GUARD_PX, nx + 2·GUARD_PX); the layout lies in the middle.
         pitch_um: pixel pitch, µm.
         field_um: (y, x) centre of the layout in its write field, µm from the field's centre.
         write_field_um: side of the write field, µm.
@@ -38,7 +38,7 @@ class Canvas:
 
     @property
     def size_um(self) -> YX:
-        """Return (y, x) extent of the layout, µm."""
+        """Return the (y, x) extent of the layout, µm."""
         ny, nx = self.level.shape
         return (ny - 2 * GUARD_PX) * self.pitch_um, (nx - 2 * GUARD_PX) * self.pitch_um
 
@@ -49,7 +49,7 @@ class Canvas:
 
 
 def frame_layout(level: Array) -> Array:
-    """Add the guard frame: the outermost levels of the layout continue outwards."""
+    """Add the guard frame, into which the outermost levels of the layout continue."""
     return np.pad(level, GUARD_PX, mode="edge")
 
 
@@ -59,14 +59,14 @@ def cut_layout(array: Array) -> Array:
 
 
 def set_layout(array: Array, inner: Array) -> Array:
-    """Copy a canvas array with another middle part."""
+    """Return a copy of a canvas array in which ``inner`` replaces the part of the layout."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed
 
 
 def frequencies_per_um(shape: Shape, pitch_um: float) -> tuple[Array, Array]:
-    """Return (fy, fx) of the half-plane transform, cycles per µm, broadcastable."""
+    """Return the frequencies (fy, fx) of the half-plane transform, cycles/µm, as broadcastable arrays."""
     return np.fft.fftfreq(shape[0], pitch_um)[:, None], np.fft.rfftfreq(shape[1], pitch_um)[None, :]
 
 
@@ -76,11 +76,11 @@ def apply_transfer(field: Array, transfer: Array) -> Array:
 
 
 def gaussian_transfer(shape: Shape, pitch_um: float, sigma_um: float) -> Array:
-    """Return the transfer function of an isotropic Gaussian of sd ``sigma_um``."""
+    """Return the transfer function of an isotropic Gaussian with the standard deviation ``sigma_um``."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     return np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
 
 
 def blur(field: Array, pitch_um: float, sigma_um: float) -> Array:
-    """Return the Gaussian blur of sd ``sigma_um``."""
+    """Return the field, blurred by a Gaussian with the standard deviation ``sigma_um``."""
     return apply_transfer(field, gaussian_transfer(field.shape, pitch_um, sigma_um))

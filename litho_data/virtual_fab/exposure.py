@@ -1,6 +1,4 @@
-"""Simulate the exposure: hatch lines, slices and two-photon dose, with the effects of beam, galvo and
-field.
-"""
+"""Simulate the exposure (hatch lines, slices, two-photon dose) with the effects of beam, galvo and field."""
 
 import numpy as np
 import scipy.ndimage
@@ -33,19 +31,19 @@ def accumulate_dose(
     order: float = 0.0,
     scan_index: int = 0,
 ) -> Array:
-    """Return the two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
+    """Return the two-photon dose on a written canvas.
 
-    Each row of the canvas is one hatch line. In slice k the laser is on wherever the level is at least k.
-    Absorption is proportional to the squared intensity of the spot, so the slices add up to ``level *
-    (squared spot)``.
+    The dose is 1 in the middle of a wide block of the highest level. Each row of the canvas is one hatch
+    line. In slice k, the laser is on where the level is at least k. Absorption is proportional to the squared
+    intensity of the spot, so the sum over the slices is ``level``, convolved with the squared spot.
 
     Args:
-        canvas: what is written.
+        canvas: the canvas that is written.
         printer: spot and slicing.
         knobs: effects on the dose.
         relative_dose: two-photon dose of this print relative to the recipe's.
-        order: place in the print order, −0.5 (first) to 0.5 (last).
-        scan_index: number of the scan, for random draws that differ from scan to scan.
+        order: position in the print order, from −0.5 (first) to 0.5 (last).
+        scan_index: number of the scan, used for random draws that differ from scan to scan.
     """
     nominal = canvas.level / (printer.levels - 1)
     if strength := knobs["unseen-neighbours"]:
@@ -79,7 +77,7 @@ def accumulate_dose(
     if strength := knobs["write-order-memory"]:
         decay_um = knobs.machine_rng("write-order-memory").uniform(1.0, 4.0)
         dose = dose - strength * _earlier_lines(dose, canvas.pitch_um, decay_um)
-    # Rounding in spectral filters falls below zero, but no dose is negative.
+    # No dose is negative, but rounding in spectral filters can give values below zero.
     dose = np.maximum(dose, 0.0)
     if strength := knobs["dose-exponent"]:
         dose = dose ** (1 + strength)
@@ -87,34 +85,37 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Expose every point x of a hatch line at x + strength·x(1 − x/L), with 0 ≤ x ≤ L in the write field."""
+    """Write every point x of a hatch line at x + strength·x(1 − x/L), with 0 ≤ x ≤ L in the write field."""
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point x that is written at ``at`` solves x + strength·x(1 − x/L) = at; of the two roots, it is the
+    # The point x that is written at ``at`` solves x + strength·x(1 − x/L) = at. Of the two roots, it is the
     # one that is 0 for at = 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
     rows, columns = np.indices(nominal.shape, dtype=float)
     meant = columns + (meant_um - inside) / canvas.pitch_um
-    # The cubic interpolation overshoots at the edges of levels. The spot smooths this overshoot.
+    # Cubic interpolation overshoots at the edges of levels. The spot smooths this overshoot.
     return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:
-    """Return the first canvas pixel of each write field along one axis; the outermost fields include the
-    guard frame.
+    """Return the first canvas pixel of each write field along one axis.
+
+    The outermost fields include the guard frame.
     """
     return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Expose (ny, nx) field by field, with each field displaced; doses add up where fields overlap.
+    """Write a canvas (ny, nx) field by field, with a displacement for each field.
+
+    Doses add up where fields overlap.
 
     Args:
-        starts: first row, and first column, of every field.
-        offset_px: (y, x) displacement of every field, (fields along y, along x, 2). The dose of a displaced
-            pixel is divided among the four pixels that it covers.
+        starts: the first row of every row of fields, and the first column of every column of fields.
+        offset_px: (y, x) displacement of every field, shape (fields along y, fields along x, 2). The dose of
+            a displaced pixel is divided among the four pixels that it covers.
     """
     written = np.zeros_like(nominal)
     ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
@@ -136,11 +137,9 @@ def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
 
 
 def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the transfer function of the squared spot, with its ellipticity, its ghost and the lag of the
-    galvo.
-    """
+    """Return the transfer function of the squared spot, including ellipticity, ghost spot and galvo lag."""
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
-    # The square of a Gaussian intensity is a Gaussian narrower by √2.
+    # The square of a Gaussian intensity is a Gaussian that is narrower by a factor of √2.
     sigma_um = printer.spot_sigma_um / 2**0.5
     transfer = np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
     if strength := knobs["elliptical-psf"]:
@@ -158,7 +157,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Compute the effective dose if every slice has to pass the threshold by itself."""
+    """Return the effective dose if each slice must pass the threshold separately."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):
@@ -169,12 +168,12 @@ def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, pri
 
 
 def _soft_step(dose: Array) -> Array:
-    """Apply a logistic step that maps 0 to 0 and 1 to 1 exactly."""
+    """Apply a logistic step that maps 0 exactly to 0, and 1 exactly to 1."""
     low, high = (1 / (1 + np.exp(-_SLICE_STEEPNESS * (edge - _SLICE_THRESHOLD))) for edge in (0.0, 1.0))
     return (1 / (1 + np.exp(-_SLICE_STEEPNESS * (dose - _SLICE_THRESHOLD))) - low) / (high - low)
 
 
 def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
-    """Return the exponentially fading mean of the lines above, which were written before."""
+    """Return an exponentially weighted mean of the lines above, which were written earlier."""
     memory = np.exp(-pitch_um / decay_um)
     return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

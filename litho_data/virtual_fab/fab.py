@@ -1,4 +1,4 @@
-"""The fab: a printer and a microscope with their knobs and noise, which make a scan from a field."""
+"""Define the fab, a printer and a microscope with knobs and noise, and print and scan one field with it."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs and noise, and optionally an effect that is not a knob."""
+    """A printer and a microscope with their knobs and noise, and an optional effect that is not a knob."""
 
     printer: Printer
     microscope: Microscope
@@ -30,11 +30,12 @@ class FabScan:
     """One simulated scan.
 
     Args:
-        job: what was printed.
-        frame: where the scan lies on the layout.
-        height_um: what the microscope reports, float64 (ny, nx) of the scan.
-        noiseless_um: the same without default noise.
-        clean_um: the print without noise on the layout grid, µm; ``surface_um``: with its roughness.
+        job: the field that was printed and scanned.
+        frame: the position of the scan on the layout.
+        height_um: heights that the microscope reports, float64 (ny, nx) of the scan.
+        noiseless_um: the same heights without the default noise.
+        clean_um: the print without roughness, on the layout grid, µm.
+        surface_um: the print with its roughness, on the layout grid, µm.
     """
 
     job: Job
@@ -46,7 +47,7 @@ class FabScan:
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
-    """Print and scan one field; the result depends only on the fab and the job, not on other fields."""
+    """Print and scan one field; the result depends only on the fab and the job, and not on other fields."""
     geometry_seed, _, instrument_seed = _seeds(fab, job.index)
     roughness_seed = _seeds(fab, job.printed)[1]
     frame = place_scan(
@@ -78,5 +79,5 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Return the seeds of the scan's position, of the surface's roughness and of the microscope's noise."""
+    """Return the seeds for the scan's position, the surface's roughness and the microscope's noise."""
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

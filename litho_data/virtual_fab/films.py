@@ -1,8 +1,7 @@
-"""A fab for films that are written by an electron beam or through a lens, etched, and seen in an electron
-microscope.
+"""Simulate films that are written by an electron beam or through a lens, etched and imaged by SEM.
 
-The fab shares no code with the models: scattering is a product of spectra, a lens sums the images of the
-points of its source, and etching shifts the distance from an edge.
+The simulation shares no code with the models. Scattering is a product of spectra. A lens sums the images from
+all points of the light source. Etching shifts the distance from the edge.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# Pixels per layout pixel of the image in which edges are located, and of the micrograph.
+# Pixels per layout pixel, along each axis, of the micrograph and of the image in which edges are located, and
+# the padding of this image.
 _FINER, _AROUND = 4, 64
-# Rim of a random layout without film, px.
+# Width of the rim of a random layout that has no film, px.
 _RIM_PX = 12
 _RESIST = 30.0
-# Number of points along each side of the source. With 9 points, edges are displaced by 1.5 nm, and with 21
-# points by 0.5 nm.
+# Number of points across the source. With 9 points, edges are displaced by 1.5 nm; with 21 points, by 0.5 nm.
 _SOURCE_POINTS = 21
 _CARD = """name = "virtual-{process}"
 title = "Simulated films of the process {process}, with simulated micrographs"
@@ -53,14 +52,15 @@ surround = "unknown"
 
 @dataclass(frozen=True)
 class FilmKnobs:
-    """Effects of a process beyond plain printing; lengths are in µm.
+    """Effects of a film process beyond plain printing; lengths are in µm.
 
     Attributes:
-        backscatter: electrons (or stray light) scattered back, relative to the dose; ``backscatter_um``:
-            their range.
-        diffusion_um: sd of the diffusion of the exposed species.
-        etch_bias_um: shift of every edge, outward.
-        defocus_um: defocus of the lens; ``dose_error``: relative error of the dose.
+        backscatter: backscattered electrons (or stray light), relative to the dose.
+        backscatter_um: range of the backscattered electrons.
+        diffusion_um: standard deviation of the diffusion of the exposed species.
+        etch_bias_um: outward shift of every edge.
+        defocus_um: defocus of the lens.
+        dose_error: relative error of the dose.
         charging: relative change of brightness across a micrograph.
     """
 
@@ -75,7 +75,7 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine: process, sampling, film, beam (sd) or lens, and relative resist threshold."""
+    """A machine that prints films: process, pixel pitch, beam (sd) or lens, film and resist threshold."""
 
     process: Literal["e-beam", "projection"]
     pitch_um: float
@@ -99,8 +99,9 @@ FILM_PRINTERS = {
 
 
 class FilmTruth(Result):
-    """The record ``films.json``; the distances of the edges of each film are beside it in ``<id>.npy``,
-    layout pixels.
+    """The record ``films.json``.
+
+    Beside it, ``<id>.npy`` contains the distances from the edge of each film, in layout pixels.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
@@ -117,7 +118,7 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
     """Make knobs from words ``name=value``.
 
     Raises:
-        InputError: an unknown name, or a value that is no number.
+        InputError: a name is unknown, or a value is not a number.
     """
     values = {}
     for name, value in (word.split("=", 1) if "=" in word else (word, "") for word in words):
@@ -125,15 +126,14 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
         try:
             values[name] = float(value)
         except ValueError:
-            raise InputError(f"knob {name}", got=repr(value), wanted="a number") from None
+            raise InputError(f"value of film knob {name}", got=repr(value), wanted="a number") from None
     return FilmKnobs(**values)
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Return the distance from the film's edge, positive on the film, at 4 × 4 places per pixel of a binary
-    layout.
+    """Return the distance from the film's edge at 4 × 4 points per pixel of a binary layout.
 
-    The layout is periodic; distances are in pixels of the layout.
+    Distances are in layout pixels and positive on the film. The layout is periodic.
     """
     pitch = printer.pitch_um
     written = np.asarray(level, float)
@@ -157,7 +157,7 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
 
 
 def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
-    """Return what an electron microscope shows of an edge, uint8: bright rims, charging along x, noise."""
+    """Return the electron micrograph of a film, uint8, with bright rims, charging along x, and noise."""
     film = 1 / (1 + np.exp(-_FINER * distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(_FINER * distance_px, 0) / 12))
     grey = grey * (1 + knobs.charging * np.linspace(-1, 1, distance_px.shape[1]))
@@ -173,13 +173,13 @@ def simulate_films(
     seed: int = 0,
     knobs: FilmKnobs = FilmKnobs(),
 ) -> Path:
-    """Print films of random layouts and take their micrographs; return the path of the card.
+    """Simulate films of random layouts and their micrographs; return the path of the card.
 
-    ``out/raw`` contains what a laboratory would deliver; ``out/truth`` contains knobs and distances of the
-    edges.
+    ``out/raw`` contains what a laboratory would deliver; ``out/truth`` contains the knobs and the distances
+    from the edges.
 
     Raises:
-        InputError: no such process, or a folder that contains files of another kind.
+        InputError: the process is unknown, or the folder contains files of another kind.
     """
     import cv2
 
@@ -191,7 +191,7 @@ def simulate_films(
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)
-        # A field lies alone on bare ground; its copies in the periodic canvas are too far away to matter.
+        # Each field lies alone on bare ground. Its periodic copies are too far away to matter.
         longest_um = max(8 * printer.resolved_um, 3 * knobs.backscatter_um * (knobs.backscatter > 0))
         bare_px = math.ceil(longest_um / 2 / printer.pitch_um)
         inner = (slice(_FINER * bare_px, -_FINER * bare_px),) * 2
@@ -212,8 +212,9 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """Make a random layout with a bare rim, uint8 (ny, nx) of 0 and 1. The process resolves its features;
-    ``finer`` makes them finer, and the films of a run use 0, 1 and 2 in turn.
+    """Make a random layout with a bare rim, uint8 (ny, nx) of 0 and 1, whose features the process resolves.
+
+    A higher ``finer`` makes the features smaller; the films of a run use 0, 1 and 2 in turn.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)
@@ -224,9 +225,7 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
-    """Return the intensity behind a mask, 1 if it is open: the mean of the images from the points of a round
-    source.
-    """
+    """Return the intensity behind a mask, averaged over the points of a round source; 1 for an open mask."""
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)
     sides = np.linspace(-1, 1, _SOURCE_POINTS)

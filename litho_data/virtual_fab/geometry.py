@@ -20,7 +20,7 @@ class ScanFrame:
     Args:
         shape: (ny, nx) of the scan.
         pitch_um: nominal pixel pitch, µm.
-        scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
+        scan_to_layout: 3×3 matrix that maps (x_um, y_um, 1) of the scan to the layout.
         layout_pitch_um: pitch of the layout and of the canvas around it, µm.
     """
 
@@ -31,12 +31,12 @@ class ScanFrame:
 
     @property
     def size_um(self) -> YX:
-        """Return (y, x) nominal extent, µm."""
+        """Return the nominal (y, x) extent of the scan, µm."""
         return self.shape[0] * self.pitch_um, self.shape[1] * self.pitch_um
 
     @property
     def unit_axes(self) -> tuple[Array, Array]:
-        """Return (y, x) coordinates from −1 to 1 over the scan, broadcastable."""
+        """Return (y, x) coordinates from −1 to 1 over the scan, as broadcastable arrays."""
         return np.linspace(-1, 1, self.shape[0])[:, None], np.linspace(-1, 1, self.shape[1])[None, :]
 
 
@@ -48,10 +48,10 @@ def place_scan(
     turned_deg: float = 0.0,
     pixel_size: float = 1.0,
 ) -> ScanFrame:
-    """Place a scan centred on the layout, up to a small random shift, rotation, shear and anisotropic scale.
+    """Centre a scan on the layout, then add a small random shift, rotation, shear and anisotropic scale.
 
-    ``turned_deg`` is the rotation of the print under the microscope, in addition to the small rotation;
-    ``pixel_size`` is the pixel size of the scan, in pixels of the layout.
+    ``turned_deg`` is the rotation of the print under the microscope, in addition to the small random
+    rotation. ``pixel_size`` is the pixel size of the scan, in pixels of the layout.
     """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
@@ -74,10 +74,10 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """Sample the surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
+    """Sample a surface, given on the canvas, at the pixels of the scan; the result has ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
-    # In retrace a piezo bends the other way.
+    # In retrace, the nonlinearity of the piezo has the opposite sign.
     if strength := direction * knobs["piezo-nonlinearity"]:
         x_um = x_um + strength * x_um * (1 - x_um / frame.size_um[1])
     (xx, xy, x0), (yx, yy, y0) = frame.scan_to_layout[:2]
@@ -93,9 +93,9 @@ def sample_surface(
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
-    """Draw a random second-order polynomial without its affine part, with unit rms on average."""
+    """Draw a random second-order polynomial without its affine part, whose rms is 1 on average."""
     y, x = frame.unit_axes
     c = rng.standard_normal(3)
-    # Legendre terms and the product have variances 1/5, 1/5 and 1/9 over the square.
+    # Over the square, the two Legendre terms have a variance of 1/5 each, and the product one of 1/9.
     terms = (c[0] * (1.5 * x**2 - 0.5) * 5**0.5, c[1] * (1.5 * y**2 - 0.5) * 5**0.5, c[2] * 3 * x * y)
     return (terms[0] + terms[1] + terms[2]) / 3**0.5

@@ -1,4 +1,4 @@
-"""The fields of a run: random layouts in print blocks, and the reference scans of a noise analysis."""
+"""Define the fields of a run: random layouts in print blocks, and reference scans for a noise analysis."""
 
 import re
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from litho_data.virtual_fab.settings import Printer
 SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
-# Cut-offs of random layouts; the prints use them in turn.
+# Cut-offs of the random layouts, which successive prints use in turn.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 
 
@@ -31,10 +31,10 @@ class Plan:
     Args:
         count: number of fields.
         size_px: (ny, nx) of a layout.
-        fields_per_print: fields of one print block.
-        write_field_um: side of a write field shared by all fields of a print; None gives each
-            field its own write field, centred on it.
-        references: add a bare substrate, a flat print and a five-step print (print 0).
+        fields_per_print: number of fields in one print block.
+        write_field_um: side of the write field that all fields of a print share. If None, each field has its
+            own write field, centred on it.
+        references: whether to add print 0: a bare substrate, a flat print and a five-step print.
     """
 
     count: int = 12
@@ -47,14 +47,14 @@ class Plan:
         if self.count < 1 or self.fields_per_print < 1:
             raise InputError(
                 "plan of a virtual-fab run",
-                got=f"{self.count} fields, {self.fields_per_print} per print",
-                wanted="at least one of each",
+                got=f"{self.count} fields in total and {self.fields_per_print} per print",
+                wanted="at least one field in total and at least one per print",
             )
         if min(self.size_px) < 32:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
 
     def scan_id(self, block: int, field: int) -> str:
-        """Return the name of a field, padded so that the sorted names are in print order."""
+        """Return the name of a field, padded with zeros so that sorted names are in print order."""
         blocks = -(-self.count // self.fields_per_print)
         return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
 
@@ -65,7 +65,7 @@ class Plan:
 
 
 def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
-    """Yield the fields of a plan in print order; each depends only on the seed and its own number."""
+    """Yield the fields of a plan in print order; each field depends only on the seed and its own number."""
     for index in range(plan.count):
         block, field = divmod(index, plan.fields_per_print)
         yield Job(
@@ -87,7 +87,7 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
 
 
 def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
-    """Return (y, x) centre of a field in the shared write field: a square block, row by row."""
+    """Return the (y, x) centre of a field in the shared write field, which is filled row by row."""
     if plan.write_field_um is None:
         return 0.0, 0.0
     side = int(np.ceil(plan.fields_per_print**0.5))
@@ -95,7 +95,7 @@ def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
     steps_um = [plan.write_field_um / side] * 2
     if not all(size * printer.pitch_um <= step for size, step in zip(plan.size_px, steps_um, strict=True)):
         raise InputError(
-            "write field",
+            "side of the write field",
             got=f"{plan.write_field_um:g} µm",
             wanted=f"room for {side} x {side} fields of {max(plan.size_px) * printer.pitch_um:g} µm",
         )
@@ -114,19 +114,19 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Make jobs for the layouts of a dataset card, printed and scanned as its table says.
+    """Make jobs that print and scan the layouts of a dataset card as the card's table says.
 
-    If the table says how a scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``), rows of
-    one print with the same layout are scans of one printed field.
+    If the table says how a scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``), rows that
+    have the same print and layout are scans of the same printed field.
 
     Args:
-        path: the card.
+        path: path of the card.
         first: number of the first scan; the random draws for a scan or print depend on its number.
-        printer: the printer that prints them; the default printer if None.
+        printer: the printer to use; the default printer if None.
 
     Raises:
-        InputError: a bad card, no layout files, or layouts with a pitch or level height that the printer
-            cannot write.
+        InputError: the card is invalid or has no layout files, or the printer has another pitch or level
+            height than the layouts.
     """
     card = load_card(path)
     printer = printer or Printer()
@@ -134,14 +134,14 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     if geometry != (printer.pitch_um, printer.level_height_um):
         raise InputError(
             f"card {path}: pitch and level height",
-            got=geometry,
-            wanted=(printer.pitch_um, printer.level_height_um),
+            got=f"{geometry} µm",
+            wanted=f"those of the printer, {(printer.pitch_um, printer.level_height_um)} µm",
         )
     folder = Path(path).parent
     table = read_table(folder / card.ids.table) if card.ids.table else {}
     files = files_by_id(folder, card.layout.files)
     if not files:
-        raise InputError(f"layouts of card {path}", got="none", wanted=card.layout.files)
+        raise InputError(f"layouts of card {path}", got="none", wanted=f"files {card.layout.files}")
     ids = sorted(files, key=lambda one: files[one][0])
     rank = {scan_id: table.get(scan_id, {}).get("order", place) for place, scan_id in enumerate(ids)}
     spread = max(1, len(ids) - 1)

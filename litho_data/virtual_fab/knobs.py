@@ -1,4 +1,4 @@
-"""Every effect beyond plain printing: its name, unit, range, and name in the catalogue of effects."""
+"""Define all knobs (effects beyond plain printing) with their units, ranges and names in the catalogue."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ OFF_CATALOGUE = "off-catalogue"
 
 @dataclass(frozen=True)
 class Knob:
-    """One effect that the fab can add; strength 0 leaves every bit unchanged.
+    """One effect that the fab can add; with strength 0, every bit of the result is unchanged.
 
     Args:
-        name: on the command line and in the truth file.
+        name: name on the command line and in the truth file.
         effect: identifier in the effects catalogue, or `off-catalogue`.
-        stage: the step at which it acts.
-        role: whether it is part of the print, the microscope, or chance.
+        stage: the stage at which the effect acts.
+        role: whether the effect belongs to the print, to the microscope, or to chance.
         unit: unit of the strength.
         limit: largest meaningful strength.
-        meaning: what a strength of one unit does, and what the seed draws.
+        meaning: what a strength of one unit does, and what is drawn with the seed.
         nuisance_span: True if offset, gain, plane and bow of each scan absorb nearly all of the effect.
         refit_absorbs: True if other parameters of the plain printing model imitate most of the effect.
     """
@@ -45,13 +45,13 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """Return the largest strength as text, without the unit if the unit is 1."""
+        """Return the largest strength as text, followed by its unit unless the unit is 1."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob set to a strength; if it has no seed, it uses that of the run."""
+    """A knob set to a strength; without a seed of its own, it uses the seed of the run."""
 
     name: str
     strength: float
@@ -62,7 +62,7 @@ class KnobSetting:
         """Parse ``name=strength`` or ``name=strength@seed``.
 
         Raises:
-            InputError: another form, an unknown name, or a strength outside the knob's range.
+            InputError: the text has another form, the name is unknown, or the strength is out of range.
         """
         name, equals, value = text.partition("=")
         strength, at, seed = value.partition("@")
@@ -77,10 +77,10 @@ class KnobSetting:
 
 
 def checked(setting: KnobSetting) -> KnobSetting:
-    """Return the setting itself, if its knob exists and its strength is within range."""
+    """Return the setting unchanged; raise InputError for an unknown knob or a value out of range."""
     knob = KNOBS.get(setting.name)
     if knob is None:
-        raise unknown_name("knob", setting.name, KNOBS, "`litho-data simulate --list-knobs` explains them")
+        raise unknown_name("knob", setting.name, KNOBS, "`litho-data simulate --list-knobs` explains all")
     if not 0 <= setting.strength <= knob.limit:
         raise InputError(
             f"strength of knob {knob.name}", got=setting.strength, wanted=f"0 to {knob.limit_with_unit}"
@@ -104,15 +104,15 @@ class KnobBoard:
         return self._strength.get(KNOBS[name].name, 0.0)
 
     def any(self, *names: str) -> bool:
-        """Return whether one of the knobs is not at zero."""
+        """Return whether any of these knobs has a strength other than zero."""
         return any(self[name] for name in names)
 
     def machine_rng(self, name: str) -> np.random.Generator:
-        """Return the random generator of a knob for the machine, which is the same for every scan."""
+        """Return the knob's random generator for properties of the machine, the same for every scan."""
         return self._rng(name, 0)
 
     def scan_rng(self, name: str, scan_index: int) -> np.random.Generator:
-        """Return the random generator of a knob for one scan, which is new for every scan."""
+        """Return the knob's random generator for one scan, different for every scan."""
         return self._rng(name, scan_index + 1)
 
     def _rng(self, name: str, stream: int) -> np.random.Generator:
@@ -120,4 +120,4 @@ class KnobBoard:
 
 
 KNOBS: dict[str, Knob] = {one["name"]: Knob(**one) for one in table_beside(__file__, "knobs.toml")["knob"]}
-"""All knobs by name, in the order of the listing; the table is in ``knobs.toml``."""
+"""All knobs by name, in the order in which they are listed; they are defined in ``knobs.toml``."""

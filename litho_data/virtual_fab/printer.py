@@ -1,4 +1,4 @@
-"""Print one field, from layout to dry surface."""
+"""Simulate the print of one field, from the layout to the dry surface."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from litho_data.virtual_fab.resist import develop
 from litho_data.virtual_fab.settings import Noise, Printer
 
 _SUBSTRATE_GRAIN_UM = 0.3
-# A calibration grating of square profile: height, and width of its flanks.
+# Height of a calibration grating with a square profile, and width of its flanks.
 _GRATING_UM, _FLANK_UM = 0.5, 0.2
 
 
@@ -26,18 +26,19 @@ class Job:
     Args:
         id: name of the scan.
         level: uint8 layout, shape (ny, nx).
-        index: number of the scan in its set; it decides the random draws.
-        order: place in the print order, −0.5 (first) to 0.5 (last).
+        index: number of the scan in its set; the random draws depend on it.
+        order: position in the print order, from −0.5 (first) to 0.5 (last).
         dose: two-photon dose relative to the recipe's.
         field_um: (y, x) centre of the layout in its write field, µm.
         write_field_um: side of the write field, µm; None for a field as large as the layout.
-        use: what the scan is for; nothing is printed for ``substrate``, nor for ``grating``, a standard.
-        grating_um: period of that standard, µm.
-        print_index: number of the print in its set, if a print is scanned more than once; ``index`` if None.
+        use: purpose of the scan. Nothing is printed for ``substrate``, nor for ``grating``, which is a
+            calibration standard.
+        grating_um: period of the grating, µm.
+        print_index: number of the print in its set, if prints are scanned more than once; None: ``index``.
         turned_deg: rotation of the print under the microscope, a multiple of 90.
         direction: 1 for trace, -1 for retrace.
-        tip: number of the tip; every one after the first is new and sharp.
-        pixel_size: pixel size of the scan, in pixels of the layout; the time per pixel stays the same.
+        tip: number of the tip; every tip after the first is new and sharp.
+        pixel_size: pixel size of the scan, in pixels of the layout; the time per pixel does not change.
     """
 
     id: str
@@ -57,39 +58,40 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Return the number of the print, which decides its random draws; those of the scan depend on
-        ``index``.
+        """Return the number of the print.
+
+        The random draws of the print depend on this number, and those of the scan on ``index``.
         """
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Return the framed layout in its write field."""
+        """Return the layout with its guard frame, placed in its write field."""
         side_um = self.write_field_um or max(self.level.shape) * pitch_um
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
 
 
 class Cause:
-    """An effect that is not a knob, for your own experiments; this base class changes nothing.
+    """Base class for an effect of your own that is not a knob; the base class changes nothing.
 
-    A subclass overrides one or more stages. A stage may depend only on its arguments, because a field is
+    A subclass overrides one or more stages. A stage may depend only on its arguments, because a field may be
     printed and scanned more than once.
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
-        """Change the two-photon dose on the canvas, 1 = full, never negative."""
+        """Change the two-photon dose on the canvas; 1 is the full dose, and no dose is negative."""
         return dose
 
     def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
-        """Change the dry surface on the canvas, without roughness, µm."""
+        """Change the dry surface without roughness, on the canvas, µm."""
         return surface_um
 
     def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
-        """Change the true surface at the pixels of the scan, before the microscope's own errors, µm."""
+        """Change the true surface at the pixels of the scan, µm, before the microscope adds its errors."""
         return height_um
 
 
 def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> Array:
-    """Return the surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
+    """Return the surface of one print without roughness, on the canvas, µm; a bare substrate is 0."""
     cause = cause or Cause()
     canvas = job.canvas(printer.pitch_um)
     if job.use == "substrate":
@@ -111,7 +113,7 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
 
 
 def _bars(at_um: Array, period_um: float) -> Array:
-    """Return 1 on bars of half a period and 0 between them, with straight flanks."""
+    """Return 1 on bars that are half a period wide, 0 between them, and straight flanks in between."""
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
 

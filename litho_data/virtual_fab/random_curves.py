@@ -1,28 +1,28 @@
-"""Make random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
+"""Draw random shapes: Perlin curves, smooth maps, and roughness with a given spectrum."""
 
 import numpy as np
 
 from litho_data.foundation import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
-# The spectrum of the measured prints' fine residual: a band of line-shaped features 0.45 µm apart across the
-# hatch direction, and a slower part. Both parts are long along the hatch lines.
+# The spectrum of the fine residual of the measured prints. It consists of a band, whose line-shaped features
+# are 0.45 µm apart across the hatch lines, and a slower part. Both parts vary slowly along the hatch lines.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# A 0.2 µm spot writes no structure along the line that is smaller than this.
+# A spot of 0.2 µm writes no structure along the line that is smaller than this.
 _SMOOTH_UM = 0.06
 
 
 def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
-    """Draw line-shaped roughness along x with unit variance on average, shape (ny, nx)."""
+    """Draw line-shaped roughness (ny, nx) along x, whose variance is 1 on average."""
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
 
 def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
-    """Return the power spectrum of `line_roughness` on the half plane, arbitrary units."""
+    """Return the power spectrum of `line_roughness` on the half plane, in arbitrary units."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     band = np.exp(-((np.abs(frequency_y) - _BAND_PER_UM) ** 2) / (2 * _BAND_WIDTH_PER_UM**2))
     slow = np.exp(-(frequency_y**2) / (2 * _SLOW_WIDTH_PER_UM**2))
@@ -34,10 +34,11 @@ def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
 
 
 def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
-    """Draw a Gaussian random field with a power spectrum given on the half plane; unit variance on
-    average.
+    """Draw a Gaussian random field with a power spectrum given on the half plane.
+
+    The variance of the field is 1 on average.
     """
-    # All columns but 0 and the Nyquist column stand for two frequencies of the full plane.
+    # Except for column 0 and the Nyquist column, each column represents two frequencies of the full plane.
     doubled = np.full(psd.shape[1], 2.0)
     doubled[0] = 1.0
     if shape[1] % 2 == 0:
@@ -47,18 +48,18 @@ def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
 
 
 def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw one-dimensional Perlin noise within ±1, same shape as ``position_um``."""
+    """Draw one-dimensional Perlin noise within ±1, with the shape of ``position_um``."""
     slopes = rng.uniform(-1, 1, 1024)
     cell, inside = np.divmod(position_um / period_um, 1.0)
     left = cell.astype(int) % slopes.size
     right = (left + 1) % slopes.size
     fade = inside**3 * (inside * (6 * inside - 15) + 10)
-    # A unit slope reaches half a cell's height, hence the factor 2.
+    # With slopes up to 1, the noise reaches at most 0.5, hence the factor 2.
     return 2 * ((1 - fade) * slopes[left] * inside + fade * slopes[right] * (inside - 1))
 
 
 def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw a random sum of eight plane waves of about one period each, unit variance on average."""
+    """Draw a random sum of eight plane waves with about this period, whose variance is 1 on average."""
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)
     phase = rng.uniform(0, 2 * np.pi, waves)

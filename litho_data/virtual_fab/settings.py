@@ -1,4 +1,4 @@
-"""Settings of the plain fab: printer, microscope and default noise, with units, and named runs."""
+"""Define the settings of the plain fab (printer, microscope, default noise) and the named presets of runs."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ class Printer:
         pitch_um: hatch pitch, which is also the pitch of the layout, µm.
         level_height_um: slice height, µm.
         levels: number of levels; the tallest column has ``levels - 1`` slices.
-        spot_sigma_um: sd of the focal *intensity*, µm. Two-photon absorption goes with its square,
-            whose sd is smaller by √2: 0.2 µm.
-        threshold_dose: dose at which conversion rises fastest, share of the full column's dose.
+        spot_sigma_um: sd of the focal *intensity*, µm. Two-photon absorption is proportional to the square
+            of the intensity, whose sd is smaller by a factor of √2 (0.2 µm).
+        threshold_dose: dose at which conversion rises fastest, as a share of the full column's dose.
         threshold_steepness: slope parameter of the logistic conversion curve, per full dose.
         network_reach_um: sd of the neighbourhood whose conversion determines how much a column shrinks, µm.
-        loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps it all.
+        loose_retention: share of its height that an isolated, loose network keeps; a dense network keeps its
+            whole height.
         base_um: height of the base layer's surface above the zero of the scans, µm.
-        stitch_field_um: side of the fields in which a larger layout is written one after the other, µm; the
-            knob ``stitching`` displaces them.
+        stitch_field_um: side of the fields into which a larger layout is divided for writing, µm; the knob
+            ``stitching`` displaces these fields.
     """
 
     pitch_um: float = 0.1
@@ -46,15 +47,17 @@ class Printer:
 
 @dataclass(frozen=True)
 class Microscope:
-    """How a scan lies on the print: a margin, and a small affine error drawn for each scan.
+    """A microscope: the margin of its scans, and a small affine error that is drawn for each scan.
 
     Args:
-        margin_px: pixels that a scan shows beyond the layout on each side, per 512 px of layout.
+        margin_px: number of pixels by which a scan extends beyond the layout on each side, per 512 px of
+            layout.
         rotation_deg: largest rotation, degrees.
         scale: largest relative error of each lateral scale.
         shear: largest shear.
         shift_um: largest shift along each axis, µm.
-        files: format of its files: ``text-matrix``, heights in metres only, or ``gsf``, with size and unit.
+        files: format of the scan files: ``text-matrix`` (only heights, in metres) or ``gsf`` (with size and
+            unit).
     """
 
     margin_px: float = 14.0
@@ -66,18 +69,16 @@ class Microscope:
 
     @classmethod
     def aligned(cls) -> Microscope:
-        """Return a microscope whose scan pixels coincide with layout pixels: no warp, a margin of whole
-        pixels.
-        """
+        """Return a microscope without warp, whose scan pixels coincide with layout pixels."""
         return cls(rotation_deg=0.0, scale=0.0, shear=0.0, shift_um=0.0)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Default noise, standard deviations in nm.
+    """The default noise, as standard deviations in nm.
 
-    A flat print shows the quadrature sum of all but the datum; a bare substrate shows that of
-    ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
+    A flat print shows the quadrature sum of ``roughness_nm``, ``line_nm`` and ``pixel_nm``; a bare substrate
+    shows that of ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
 
     Args:
         roughness_nm: line-shaped roughness of printed surfaces.
@@ -95,20 +96,20 @@ class Noise:
 
     @classmethod
     def off(cls) -> Noise:
-        """Return settings without any noise."""
+        """Return noise settings that are all zero."""
         return cls(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Count, size, knobs and machines of a run; arguments of the caller override them.
+    """Named settings of a run, which arguments of the caller override.
 
     Args:
         count: number of scans.
         size_px: side of the layouts, pixels (one number, or ny and nx).
-        fields_per_print: fields of one print block.
-        knobs: ``name=strength[@seed]``.
-        printer, microscope, noise: the machines.
+        fields_per_print: number of fields in one print block.
+        knobs: settings of the form ``name=strength[@seed]``.
+        printer, microscope, noise: settings of the machines.
     """
 
     count: int
@@ -135,10 +136,10 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """Return the preset of that name.
+    """Return the preset of this name.
 
     Raises:
-        InputError: no such preset.
+        InputError: there is no preset of this name.
     """
     require_known("preset", name, PRESETS)
     return PRESETS[name]

@@ -1,4 +1,4 @@
-"""Run the virtual fab: write raw files as a laboratory would deliver them, and the truth separately."""
+"""Run the virtual fab, and write raw files as a laboratory would deliver them and, separately, the truth."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -46,9 +46,9 @@ def simulate(
 ) -> Path:
     """Print and scan a set of fields; return the path of the card, ``out/raw/card.toml``.
 
-    ``out/raw`` contains what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` contains
-    what only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are made one
-    at a time, so memory does not grow with their number, and no scan depends on that number.
+    ``out/raw`` contains what a laboratory would deliver: card, table, layouts and scans. ``out/truth``
+    contains what only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are
+    made one at a time, so the memory used does not grow with their number.
 
     Args:
         count: number of scans with random layouts.
@@ -58,22 +58,21 @@ def simulate(
         cause: an effect of your own that is not a knob; the truth file does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
         microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or your own values.
-        fields_per_print: fields that share a print block.
-        write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
-        references: add scans of a bare substrate, a flat print and a five-step print.
-        jobs: your own layouts instead of random ones; the arguments about random layouts are then unused.
-        plan_of: hash of the dataset that the layouts were planned from, ``print_pattern``: which print an id
-            belongs to, for the card.
+        fields_per_print: number of fields in one print block.
+        write_field_um: side of the write field that the fields of a print share, µm; None: each has its own.
+        references: whether to add scans of a bare substrate, a flat print and a five-step print.
+        jobs: your own layouts instead of random ones; arguments about random layouts are then ignored.
+        plan_of: hash of the dataset from which the layouts were planned, for the card.
+        print_pattern: pattern of ids that says to which print a scan belongs, for the card.
 
     Raises:
-        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder that holds a run
-            with other settings or something else.
+        InputError: a knob is unknown or its strength is out of range, the plan is impossible, or the folder
+            contains a run with other settings or something else.
     """
     if references and jobs is not None:
         raise InputError(
-            "references",
-            got="own layouts",
-            wanted="reference scans whose use is stated in the table of the layouts",
+            "references cannot be added to your own layouts",
+            wanted="layouts of your own for the references, with their use in the card's table",
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -134,7 +133,7 @@ def simulate(
             levels=fab.printer.levels,
             scan_size_um=scan.frame.size_um,
             scan_format=fab.microscope.files,
-            # Levelling would remove tilt and bow, which are among the simulated effects.
+            # A build must not level the scans, because tilt and bow are among the simulated effects.
             levelled=True,
             **tables,
         )
@@ -143,7 +142,7 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """Write one scan in the file format of its microscope."""
+    """Write one scan in the file format of the microscope."""
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
         write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
@@ -168,7 +167,7 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
 
 
 def _described(job: Job) -> dict[str, Any]:
-    """Return all fields of a job, with the hash in place of its layout."""
+    """Return all fields of a job, with a hash in place of the layout."""
     return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
@@ -176,13 +175,13 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
     if not jobs:
         raise InputError("layouts to print", got="none", wanted="at least one")
     if len({job.id for job in jobs}) != len(jobs):
-        raise InputError("ids of the layouts to print", got=[job.id for job in jobs], wanted="each once")
+        raise InputError("ids of the layouts to print", got=[job.id for job in jobs], wanted="unique ids")
     if len({job.level.shape for job in jobs}) > 1:
         raise InputError(
             "layouts to print",
             got=sorted({job.level.shape for job in jobs}),
-            wanted="one size",
-            hint="split the set",
+            wanted="layouts of one size",
+            hint="split the set by size",
         )
     highest = max(int(job.level.max()) for job in jobs)
     if highest >= printer.levels:
@@ -190,7 +189,7 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """Write the card's table, which says how scans were made if any was made in an unusual way."""
+    """Write the card's table, with columns on how scans were made if any scan has unusual values."""
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
     write_table(raw, columns, [row[: len(columns)] for row in rows])
@@ -212,25 +211,26 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
     """Print and scan a plan in the fab of an earlier run; return the path of the new card.
 
-    The machine is the same: printer, microscope, noise and knobs with their seeds. The run is new: single
-    prints and scans are drawn afresh.
+    The machine is the same: printer, microscope, noise, and knobs with their seeds. Everything that varies
+    from print to print or from scan to scan is drawn anew.
 
     Args:
         plan: folder with ``card.toml``, layouts and ``scans.csv``, as `litho-models next-print` writes it.
-        fab: folder of the earlier run, with its ``truth``.
-        out: where ``raw`` and ``truth`` of the new run go.
-        seed: seed of the new draws; must differ from the earlier run's.
+        fab: folder of the earlier run, which contains ``truth``.
+        out: folder for ``raw`` and ``truth`` of the new run.
+        seed: seed of the new draws; it must differ from that of the earlier run.
 
     Raises:
-        InputError: no plan, no truth, the seed of the earlier run, or layouts that its printer cannot write.
+        InputError: the plan or the truth is missing, the seed is that of the earlier run, or the printer
+            cannot write the layouts.
     """
     card = Path(plan) / CARD_NAME
     truth = Truth.read(Path(fab) / "truth")
     if seed == truth.seed:
         raise InputError(
-            "seed",
-            got=seed,
-            wanted="a seed that differs from that of the earlier run, because the prints are new",
+            "seed of the new run",
+            got=f"{seed}, as in the earlier run",
+            wanted="another seed, because the prints are new",
         )
     about = load_card(card)
     return simulate(

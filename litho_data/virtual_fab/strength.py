@@ -1,4 +1,4 @@
-"""Measure the size of an effect in the data, and find the strength for a given size."""
+"""Measure how much a knob changes the scans, and find the strength for a given change."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
-# Knobs that are noise: no noise-free scan shows them, and their strength is their rms.
+# The knob that is noise: no noise-free scan shows it, and its strength is its rms.
 NOISE_KNOB = "line-roughness"
 _RELATIVE_PRECISION = 0.01
 _MAX_STEPS = 40
@@ -20,8 +20,9 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """A knob's strength and the rms ``rms_nm`` that it causes. The rms is smaller than requested if the
-    knob's range is too small.
+    """The strength of a knob, and the rms change ``rms_nm`` that it causes.
+
+    The rms is smaller than requested if the knob's range is too small.
     """
 
     setting: KnobSetting
@@ -37,18 +38,18 @@ def strength_for_rms(
 ) -> KnobStrength:
     """Find the strength at which a knob changes the noise-free scans by ``rms_nm``.
 
-    The rms is that of `knob_rms_nm`. This rms grows with the strength, so the strength is found by interval
-    search within the knob's range.
+    The rms is that of `knob_rms_nm`. It grows with the strength, so an interval search within the knob's
+    range finds the strength.
 
     Args:
-        name: knob.
-        rms_nm: wanted rms, nm.
-        jobs: fields to measure it on; by default four of 256 × 256 px, two of each cut-off.
+        name: name of the knob.
+        rms_nm: desired rms, nm.
+        jobs: fields on which the rms is measured; by default four of 256 × 256 px, two of each cut-off.
         seed: seed of the knob.
 
     Raises:
-        InputError: an unknown knob, an rms that is not positive, or a knob that offset, gain, plane and bow
-            of single scans absorb completely.
+        InputError: the knob is unknown, the rms is not positive, or offset, gain, plane and bow of each scan
+            absorb the effect completely.
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
@@ -66,7 +67,9 @@ def strength_for_rms(
     # Residuals of the size of float32 rounding do not count as an effect.
     if at_limit < 1e-3:
         raise InputError(
-            f"knob {name}", got="no change beyond offset, gain, plane and bow", wanted="another knob"
+            f"effect of knob {name} on the scans",
+            got="no change beyond offset, gain, plane and bow",
+            wanted="another knob",
         )
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)
@@ -82,16 +85,17 @@ def search_strength(
     at_highest: float,
     precision: float = _RELATIVE_PRECISION,
 ) -> tuple[float, float]:
-    """Find the strength below ``highest`` at which a measure that grows with the strength reaches ``wanted``;
-    also return the measure there.
+    """Find the strength below ``highest`` at which a measure reaches ``wanted``; return strength and measure.
 
     Args:
-        measured: gives the measure at a strength; ``at_highest``: the measure at ``highest``, above
-            ``wanted``.
-        precision: largest relative distance from ``wanted``.
+        measured: function that returns the measure at a strength; the measure grows with the strength.
+        wanted: desired value of the measure.
+        highest: upper limit of the strength.
+        at_highest: the measure at ``highest``, which must exceed ``wanted``.
+        precision: largest accepted relative distance from ``wanted``.
     """
     low, high = 0.0, highest
-    # Most effects grow about linearly, some quadratically, so the first guess assumes linear growth.
+    # Most effects grow about linearly and only some quadratically, so the first guess assumes linear growth.
     strength = highest * wanted / at_highest
     for _ in range(_MAX_STEPS):
         found = measured(strength)
@@ -104,11 +108,11 @@ def search_strength(
 
 
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
-    """Return the rms over the scans of (noise-free scan with the knob) − (without), after the per-scan terms
-    are removed, nm.
+    """Return the rms change, in nm, that a knob causes in noise-free scans, without per-scan terms.
 
-    Scans are aligned with the layout, so a warp counts by the heights that it changes. The least-squares fit
-    of {1, P, x, y, x², xy, y²} is removed from each scan, where P is the scan without the knob.
+    Scans are aligned with the layout, so a warp counts through the heights that it changes. The per-scan
+    terms are the least-squares fit of {1, P, x, y, x², xy, y²} to each scan's change, where P is the scan
+    without the knob.
     """
     mean_squares = []
     for job in jobs:
@@ -119,9 +123,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Return ``change`` minus its least-squares fit by the prediction and a quadratic surface, in the same
-    shape.
-    """
+    """Return ``change`` minus its least-squares fit by the prediction and a quadratic surface."""
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )
@@ -132,9 +134,7 @@ def _free_of_nuisances(change: Array, prediction: Array) -> Array:
 
 
 def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
-    """Return four fields of 256 × 256 px, two of each cut-off: the first, two middle ones and the last of a
-    print order.
-    """
+    """Return four fields of 256 × 256 px, two of each cut-off, evenly spaced in the print order."""
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 
 

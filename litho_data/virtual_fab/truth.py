@@ -1,6 +1,4 @@
-"""The record of everything that the build of a simulated run must not know: knobs, warps, clean prints and
-the noise floor.
-"""
+"""Record what the build of a simulated run must not know: knobs, warps, clean prints and noise floors."""
 
 from __future__ import annotations
 
@@ -42,14 +40,12 @@ class KnobTruth(Record):
 
     @property
     def setting(self) -> KnobSetting:
-        """Return the setting with the seed that was used, to repeat it."""
+        """Return the setting with the seed that was used, so that the effect can be repeated."""
         return KnobSetting(self.name, self.strength, self.seed)
 
 
 class ScanTruth(Record):
-    """One scan: its position, its datum, and the error that remains with perfect models of print and
-    microscope.
-    """
+    """One scan: its position, its datum, and the error that even perfect models of printer and AFM leave."""
 
     id: str
     use: str
@@ -66,10 +62,10 @@ class ScanTruth(Record):
 
 
 class Truth(Result):
-    """The record `truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as
-    ``surfaces/<id>.npy``.
+    """The record `truth.json` of a simulated run.
 
-    Both are heights in µm on the layout grid. ``settings`` contains further settings of the run.
+    Beside it, ``prints/<id>.npy`` is each print without roughness and ``surfaces/<id>.npy`` with roughness,
+    as heights in µm on the layout grid. ``settings`` contains further settings of the run.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -85,9 +81,7 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Return the size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow,
-    nm.
-    """
+    """Return the offset and the size of one scan's noise, nm; ``floor_full`` also excludes tilt and bow."""
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
     return {

@@ -1,4 +1,4 @@
-"""`litho-design`: thin commands over the public functions."""
+"""The commands of `litho-design`; each of them calls one public function."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from litho_design.images.measurements import MeasuredSource, PhotoSource
 if TYPE_CHECKING:
     from litho_design.judging.score import ScoreResult
 
-app = new_app("Design diffractive optics through a frozen model of the printer, score and export them.")
+app = new_app(
+    "Design diffractive optics through a frozen model of the printer, score and export the designs."
+)
 app.command()(first)
 app.command()(hoe)
 app.command()(lens)
@@ -38,26 +40,26 @@ def score(
     judge: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable. "
-            "Without judge, scan and photograph, models of the zoo for the same printer are the judges"
+            help="judge: NAME=MODEL, MODEL or `none`; MODEL may be the truth/ folder of a virtual fab; "
+            "repeatable. Without a judge, scan or photograph, the zoo's models of the same printer judge"
         ),
     ] = None,
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="optics of the judges: thin, or thick (wave propagation method). By default that "
-            "of the design"
+            help="how the judges treat the element: thin, or thick (wave propagation method); by default, "
+            "as in the design"
         ),
     ] = None,
     stream: Annotated[
         bool,
-        typer.Option("--stream", help="for a large hologram: print and score it band by band"),
+        typer.Option("--stream", help="print and score a large hologram band by band"),
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design as printed by models, as measured by an AFM, or as seen by a camera.
+    """Score a design as models predict its print, as an AFM measures it, or as a camera sees it.
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
@@ -85,15 +87,17 @@ def _print_scores(result: ScoreResult, out: Path) -> None:
 @app.command()
 @takes_settings(PrintJob())
 def export(
-    design: Annotated[Path, typer.Argument(help="folder of a design, or NAME.npy: levels, or heights in µm")],
+    design: Annotated[
+        Path, typer.Argument(help="folder of a design, or file NAME.npy of levels or heights in µm")
+    ],
     out: Out,
     given: Given,
-    format: Annotated[Format, typer.Option(help="file for the printer")] = "png16",
-    pitch_um: Annotated[float, typer.Option(help="pixel of NAME.npy, µm")] = 0.1,
-    level_height_um: Annotated[float, typer.Option(help="level of NAME.npy, µm")] = 0.1,
+    format: Annotated[Format, typer.Option(help="format of the file for the printer")] = "png16",
+    pitch_um: Annotated[float, typer.Option(help="side of a pixel of NAME.npy, µm")] = 0.1,
+    level_height_um: Annotated[float, typer.Option(help="height of a level of NAME.npy, µm")] = 0.1,
     dose_curve: Annotated[
         Path | None,
-        typer.Option(help="CSV with the printed height_um of each grey; by default grey is linear in height"),
+        typer.Option(help="CSV of the printed height_um of each grey; by default, grey is linear in height"),
     ] = None,
     marks: Annotated[
         bool,
@@ -103,7 +107,7 @@ def export(
         ),
     ] = False,
 ) -> None:
-    """Write a file of the layout for the printer, with a sidecar that states heights and size.
+    """Write a layout as a file for the printer, with a sidecar file that states heights and size.
 
     Example: litho-design export hologram --format stl --out files
     """

@@ -1,4 +1,6 @@
-"""Commands that design, and `settings`: parse options, call one function, print the result."""
+"""The commands that design, and `settings`; each parses its options, calls one function and prints the
+result.
+"""
 
 from __future__ import annotations
 
@@ -35,18 +37,18 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=DesignSettings)
 
-# A variant or a task among the changes replaces the ones given here.
+# A variant or task among the changes overrides the one given here.
 _hologram = partial(hologram_settings, "default")
 _lens = partial(lens_settings, "direct", "default")
 
 _TARGET_HELP = "an image file, or a drawing: text, ring, chart, spots, letters"
 Model = Annotated[str, typer.Option(help="folder of a frozen model, zoo:NAME, or `none` for nominal heights")]
-Target = Annotated[str, typer.Option(help=f"wanted image: {_TARGET_HELP}")]
+Target = Annotated[str, typer.Option(help=f"target image: {_TARGET_HELP}")]
 SpreadOf = Annotated[
     Path | None,
     typer.Option(
-        help="dataset store: take the spread of gain and offset from its measured prints, without the "
-        "locked scans",
+        help="dataset store whose measured prints, except the locked scans, give the spread of gain and "
+        "offset",
         hidden=True,
     ),
 ]
@@ -54,13 +56,13 @@ Judges = Annotated[
     list[str] | None,
     typer.Option(
         "--judge",
-        help="NAME=MODEL or MODEL that predicts the print of the finished layout; repeatable. By default the "
-        "zoo's models of the same printer",
+        help="model that predicts the print of the finished layout: NAME=MODEL or MODEL; repeatable. By "
+        "default, the zoo's models of the same printer are used",
     ),
 ]
 Robust = Annotated[
     bool,
-    typer.Option(help="search for the layout whose worst loss, over the model and its judges, is smallest"),
+    typer.Option(help="search for the layout that has the lowest loss over the model and all its judges"),
 ]
 Objects = Annotated[
     list[Path] | None,
@@ -71,8 +73,8 @@ Objects = Annotated[
 HeldOutObjects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: picture or folder of pictures used only for scores; repeatable. By default "
-        "the last quarter of --objects by name, at least two",
+        help="computational lens: picture or folder of pictures used only for scores; repeatable. By "
+        "default, the last quarter of --objects in order of name, but at least two",
         hidden=True,
     ),
 ]
@@ -83,8 +85,7 @@ def first(
     target: Target = "text",
     device: Device = "cpu",
 ) -> None:
-    """Design one small hologram with and without a printer's model, and show both prints; this takes a
-    minute.
+    """Design a small hologram with and without a printer model, and show both prints (takes about a minute).
 
     Example: litho-design first --target ring
     """
@@ -106,8 +107,8 @@ def hoe(
         bool,
         typer.Option(
             "--large",
-            help="work in bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
-            "shares them among processes",
+            help="work in bands of rows, for elements too large for the memory of one process; `torchrun "
+            "--no-python` shares the bands among processes",
             hidden=True,
         ),
     ] = False,
@@ -115,7 +116,7 @@ def hoe(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design a holographic element; an interrupted run in OUT is continued.
+    """Design a holographic element; an interrupted run in OUT resumes.
 
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
@@ -136,7 +137,9 @@ def hoe(
 def correct(
     relief: Annotated[
         str,
-        typer.Argument(help="grey picture, float TIFF in µm, or a drawing: lens, blaze, staircase"),
+        typer.Argument(
+            help="grey picture, float TIFF of heights in µm, or a drawing: lens, blaze, staircase"
+        ),
     ],
     model: Model,
     out: Out,
@@ -145,8 +148,8 @@ def correct(
     after: Annotated[
         Path | None,
         typer.Option(
-            help="folder of a first correction that was printed and measured; the measured error "
-            "of its print is subtracted"
+            help="folder of a first correction that was printed and measured; the measured error of its "
+            "print is subtracted from the target"
         ),
     ] = None,
     spread_of: SpreadOf = None,
@@ -155,7 +158,7 @@ def correct(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Find the layout whose print comes closest to the wanted relief; an interrupted run in OUT is continued.
+    """Find the layout whose print comes closest to the target relief; an interrupted run in OUT resumes.
 
     Example: litho-design correct blaze --model zoo:pbl --out blaze
     Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
@@ -187,7 +190,7 @@ def lens(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design a multi-level diffractive lens; an interrupted run in OUT is continued.
+    """Design a multi-level diffractive lens; an interrupted run in OUT resumes.
 
     Example: litho-design lens --model zoo:pbl --distance-um 200 --out lens
     """
@@ -212,16 +215,18 @@ def compare(
     given: Given,
     judge: Annotated[
         list[str] | None,
-        typer.Option(help="further judges, NAME=MODEL or MODEL (or truth/ of a virtual fab); repeatable"),
+        typer.Option(
+            help="further judge: NAME=MODEL or MODEL (or the truth/ folder of a virtual fab); repeatable"
+        ),
     ] = None,
     task: Annotated[
-        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="what is designed")
+        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="what to design")
     ] = "hoe",
     target: Annotated[str, typer.Option(help=f"for hoe: {_TARGET_HELP}")] = "text",
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
-    seeds: Annotated[int, typer.Option(help="number of seeds: 0, 1, 2 …")] = 3,
+    seeds: Annotated[int, typer.Option(help="number of seeds, which are 0, 1, 2 …")] = 3,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     device: Device = "cpu",
@@ -249,10 +254,10 @@ def compare(
 
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
 def settings(
-    element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="what would be designed")],
+    element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="kind of element")],
     given: Given,
 ) -> None:
-    """Print all settings with their meaning, as a file for --config; nothing is designed.
+    """Print all settings with their meanings as a file for --config, without designing anything.
 
     Example: litho-design settings hoe > hoe.toml
     """
@@ -267,7 +272,7 @@ def _settings(
     task: str,
     spread_of: Path | None = None,
 ) -> S:
-    """Merge preset, settings file, measured spreads and command line; each overrides those before it."""
+    """Merge preset, settings file, measured spreads and command line; later ones override earlier ones."""
     made = make(given.over(make({}), task))
     if spread_of is None:
         return made
@@ -285,8 +290,8 @@ def _print_comparison(result: GapResult, out: Path) -> None:
     figure = registered_task(result.task).headline[0]
     for judge in result.judges:
         found = [item for item in result.summary if (item.judge, item.figure) == (judge, figure)]
-        told = ", ".join(f"{called(item.arm)} {item.judged_mean:.3f}" for item in found)
-        print(f"{named(figure)}, printed by {called(judge)}: designed with {told}")
+        told = ", ".join(f"{item.judged_mean:.3f} if designed with {called(item.arm)}" for item in found)
+        print(f"{named(figure)} as printed by {called(judge)}: {told}")
     print(out / "report.html")
 
 
@@ -308,4 +313,5 @@ def _print_design(design: Design, out: Path) -> None:
     if design.baselines:
         print(baseline_line(design.baselines))
     page = out / "report.html"
-    print(f"{page if page.exists() else out}: {headline(design.predicted)} (judged by its own model)")
+    told = f"{headline(design.predicted)} (predicted by the model of the design)"
+    print(f"{page if page.exists() else out}: {told}")

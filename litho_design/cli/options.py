@@ -18,7 +18,7 @@ from litho_data.commands.app import keyword, takes, takes_more, with_further_opt
 from litho_data.commands.settings import Leaf, assigned, flattened, leaf_of, leaves, read_settings, refused
 from litho_data.foundation.errors import InputError
 
-Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
+Out = Annotated[Path, typer.Option(help="folder of the result; a folder that holds anything else is refused")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
 Extrapolate = Annotated[
     bool,
@@ -39,7 +39,8 @@ BandPx = Annotated[
 _Config = Annotated[
     Path | None,
     typer.Option(
-        "--config", help="TOML or JSON file of settings, as `litho-design settings` prints it; options win"
+        "--config",
+        help="TOML or JSON file of settings, as `litho-design settings` prints it; options override it",
     ),
 ]
 _Set = Annotated[
@@ -47,7 +48,7 @@ _Set = Annotated[
     typer.Option(
         "--set",
         help="PATH=VALUE for any setting, such as loss.efficiency_weight=0.2; repeatable. "
-        "`litho-design settings` lists all of them",
+        "`litho-design settings` lists all settings",
     ),
 ]
 
@@ -57,9 +58,9 @@ class Given:
     """The settings given on a command line.
 
     Attributes:
-        options: values by path, of options and of ``--set``.
-        names: how each value was given, for messages.
-        config: settings file.
+        options: values given by options and by ``--set``, by path.
+        names: option by which each value was given, for messages.
+        config: path of the settings file, if one was given.
     """
 
     options: Mapping[str, Any]
@@ -67,26 +68,26 @@ class Given:
     config: Path | None
 
     def over(self, preset: BaseModel, task: str) -> dict[str, Any]:
-        """Return the values by path: those of the file, overridden by those of the command line.
+        """Return the values by path; values from the command line override those from the file.
 
         Args:
             preset: settings that define the paths.
             task: what is designed, for messages.
 
         Raises:
-            InputError: an option of another task, or an unknown name in the file.
+            InputError: an option does not belong to this task, or the file contains an unknown name.
         """
         known = {leaf.path for leaf in leaves(preset)}
         for path, name in self.names.items():
             if name != "--set" and path not in known:
                 raise InputError(
-                    name, got=f"an option of the {task} task", wanted="an option of this command's task"
+                    name, got="an option of another task", wanted=f"an option of the {task} task"
                 )
         content = {} if self.config is None else read_settings(self.config)
         return flattened(preset, content, f"setting of {self.config}") | flattened(preset, self.options)
 
 
-# The settings whose options a command shows first; the others are behind --help-all.
+# A command's help shows the options of these settings; --help-all shows the others too.
 _FIRST = {
     *("variant", "task", "layout.size_px", "layout.cell_um", "optics.wavelength_um", "optics.distance_um"),
     *("search.iterations", "search.seed", "height_um"),
@@ -100,13 +101,13 @@ _FIRST = {
 def takes_settings(
     *presets: BaseModel, leave_out: Collection[str] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings that define one, plus ``--set`` and ``--config``.
+    """Give a command an option for each setting that defines one, plus ``--set`` and ``--config``.
 
     The command receives these settings as its argument ``given``, a ``Given``.
 
     Args:
         presets: settings, one record per task; the help shows their values as defaults.
-        leave_out: paths that get no option.
+        leave_out: paths of settings that get no option.
     """
     found: dict[str, list[Leaf]] = {}
     for leaf in (leaf for preset in presets for leaf in leaves(preset)):
@@ -127,11 +128,14 @@ def takes_settings(
             twice = sorted(set(options) & set(words))
             if twice:
                 raise InputError(
-                    "--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two"
+                    "--set",
+                    got=f"{twice[0]}, which another option sets too",
+                    wanted="only one of the two options",
                 )
             unused = sorted(set(leave_out) & set(words))
             if unused:
-                raise InputError("--set", got=unused[0], wanted="a setting that this command does not fix")
+                got = f"{unused[0]}, which this command sets itself"
+                raise InputError("--set", got=got, wanted="another setting")
             names = {path: found[path][0].options[0] for path in options} | dict.fromkeys(words, "--set")
             command(**values, given=Given({**options, **words}, names, config))
 
@@ -141,8 +145,8 @@ def takes_settings(
 
 
 def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all fields of some record classes, and pass it one record of each class
-    by name.
+    """Give a command the options of all fields of record classes, and pass it one record of each class by
+    name.
 
     The command gets None for a record if none of its options was given.
     """
@@ -187,7 +191,9 @@ def _made(kind: type[Any], leaves: Mapping[str, Leaf], values: Mapping[str, Any]
 
 
 def as_toml(settings: BaseModel) -> str:
-    """Return settings as a file for ``--config``: each with its meaning, unit, choices and option."""
+    """Return the text of a settings file for ``--config``, with each setting's meaning, unit, choices and
+    option.
+    """
     lines: list[str] = []
     # Each table is written once, even if its settings are not adjacent.
     tables: dict[str, list[Leaf]] = {"": []}
@@ -207,7 +213,7 @@ def as_toml(settings: BaseModel) -> str:
 
 
 def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
-    """Make one option for a setting of one or several presets."""
+    """Make one option for a setting that one or several presets have."""
     leaf, kind = same[0], same[0].kind
     if get_origin(kind) is UnionType:
         kind = get_args(kind)[0]
@@ -223,7 +229,7 @@ def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
 
 
 def _listed(leaf: Leaf, value: Any) -> Any:
-    """Format the values of an option; several numbers are separated by commas."""
+    """Return the value of an option; if the setting takes several numbers, split the text at its commas."""
     if get_origin(leaf.kind) is not tuple:
         return value
     try:
@@ -233,7 +239,7 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """Describe a setting: in lower case for an option, capitalised in a file of settings."""
+    """Describe a setting for the help of its option, beginning in lower case."""
     return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
 
 

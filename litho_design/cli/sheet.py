@@ -1,4 +1,6 @@
-"""`litho-design sheet new` and `read`: make one sheet of prints for a lab, and read its scans."""
+"""The commands `litho-design sheet new` and `read`, which make one sheet of prints for a lab and read its
+scans.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +20,19 @@ sheet = typer.Typer(help="Make one sheet of prints for a lab, and evaluate its s
 def new(
     out: Out,
     model: Annotated[
-        str, typer.Option(help="folder of a frozen model, or zoo:NAME: one hologram is designed through it")
+        str, typer.Option(help="frozen model, a folder or zoo:NAME, through which one hologram is designed")
     ] = "zoo:pbl",
     format: Annotated[
         Format, typer.Option(help="format of the files for the printer, see docs/export.md")
     ] = "stl",
     target: Target = "text",
     layouts: Annotated[
-        int, typer.Option(min=6, help="number of random layouts to which the printer model is fitted")
+        int, typer.Option(min=6, help="number of random layouts whose prints the printer model is fitted to")
     ] = 12,
     seed: Annotated[int, typer.Option(min=0, help="seed of the random layouts")] = 0,
     device: Device = "cpu",
 ) -> None:
-    """Write the files for a lab to print and scan one sheet; an interrupted run in OUT is continued.
+    """Write the files that a lab needs to print and scan one sheet; an interrupted run in OUT resumes.
 
     Example: litho-design sheet new --format gwl --out sheet
     """
@@ -39,16 +41,18 @@ def new(
     made = new_sheet(
         out, model=model, format=format, target=target, layouts=layouts, seed=seed, device=device
     )
-    typer.echo(f"{len(made.fields)} fields of {made.side_um:g} µm; what to do: {out / PAGE}")
+    typer.echo(f"{len(made.fields)} fields of {made.side_um:g} µm; instructions: {out / PAGE}")
 
 
 @sheet.command("read")
 def read(
-    folder: Annotated[Path, typer.Argument(help="folder of `sheet new`, with the scans", metavar="SHEET")],
+    folder: Annotated[
+        Path, typer.Argument(help="folder written by `sheet new`, with the scans in it", metavar="SHEET")
+    ],
     out: Out,
     device: Device = "cpu",
 ) -> None:
-    """Learn a model of the printer from the scans of a sheet, find what the model lacks, and compare both
+    """Fit a printer model to the scans of a sheet, find what the model lacks, and compare the sheet's two
     holograms.
 
     Example: litho-design sheet read sheet --out answer

@@ -32,18 +32,19 @@ class Element(nn.Module):
     element.
 
     The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and kept
-    within the layout's range, with a straight-through gradient. A frozen model prints the levels with its
-    guard ring. The printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The
-    wave therefore always belongs to a printable layout. ``whole = False`` leaves the levels unrounded, for
-    the first steps of a search.
+    within the layout's range, with a straight-through gradient. A frozen model prints the levels, surrounded
+    by its guard ring. The printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h /
+    wavelength. The wave therefore always belongs to a printable layout. ``whole = False`` leaves the levels
+    unrounded, for the first steps of a search.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
-        layout: geometry and levels, or changes of the default ones, such as ``{"size_px": 256}``.
+        layout: geometry and levels, or changes to the defaults, such as ``{"size_px": 256}``.
         resin: name of a resin, or a function from the wavelength in µm to its refractive index.
         surroundings: refractive index above the relief.
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
-        kind: ``thin``, or ``thick`` for the wave propagation method through the relief, in air.
+        kind: ``thin``, or ``thick`` to compute the wave through the relief, in air, by the wave propagation
+            method.
         tile_px: elements larger than this are printed in overlapping tiles. The backward pass
             recomputes the tiles, so memory grows with the tile, not with the element. None prints in one
             piece.
@@ -88,7 +89,8 @@ class Element(nn.Module):
         Args:
             field: the wave on the pixels of the layout, complex (..., size, size).
             wavelength_um: wavelength in vacuum.
-            height_um: a known print (size, size), such as a measured one, instead of the print of the levels.
+            height_um: a known print (size, size), such as a measured one, to use instead of the print of the
+                levels.
         """
         height = self.height_um() if height_um is None else height_um
         self._check_map("field", field)
@@ -108,7 +110,7 @@ class Element(nn.Module):
         return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
 
     def height_um(self) -> Tensor:
-        """Return the printed height (size, size), µm, with a gradient to the free levels."""
+        """Return the printed height (size, size), µm; gradients flow to the free levels."""
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
@@ -122,28 +124,28 @@ class Element(nn.Module):
         return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
 
     def optics(self, wavelength_um: float) -> Optics:
-        """Return the wavelength, index step and kind of the element at this wavelength."""
+        """Return the optics of the element at this wavelength: wavelength, index step and kind."""
         if not SHORTEST_UM < wavelength_um < LONGEST_UM:
             wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
-            hint = "are nm or metres meant? as_torchoptics(unit_um=1e6) counts in metres"
+            hint = "convert nm or metres to µm, or use as_torchoptics(unit_um=1e6) for metres"
             raise InputError("wavelength", got=f"{wavelength_um:g} µm", wanted=wanted, hint=hint)
         index, around = self._index(wavelength_um), self.surroundings
         if not index > around:
             raise InputError(
                 "resin",
                 got=f"an index of {index:g}",
-                wanted=f"more than that of its surroundings, {around:g}",
+                wanted=f"an index above that of the surroundings, {around:g}",
             )
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
-        """Set the free levels to those of a layout (size, size), whole or real."""
+        """Set the free levels to those of a layout (size, size), whose levels may be fractions."""
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
-        """Start from the levels that print a wanted phase (size, size), radian, up to a constant phase."""
+        """Start from the levels that print a target phase (size, size), in radian, up to a constant phase."""
         self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
         wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
@@ -154,11 +156,12 @@ class Element(nn.Module):
         ``torchoptics``).
 
         Args:
-            z, offset: position of the element, in your program's unit of length.
-            unit_um: that unit in µm; 1e6 for metres.
+            z, offset: position of the element, in the unit of length of your program.
+            unit_um: this unit of length in µm; 1e6 for metres.
 
         Raises:
-            InputError: torchoptics is not installed, or the element is thick and so is no complex factor.
+            InputError: torchoptics is not installed, or the element is thick, so that no complex factor
+                describes it.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement
@@ -180,13 +183,17 @@ class Element(nn.Module):
 
     def _check(self) -> None:
         if self.printer.only_judges:
-            raise InputError("printer of an element", got="a virtual fab", wanted="a frozen model, or none")
+            raise InputError(
+                "printer of an element",
+                got="a virtual fab",
+                wanted="a frozen model, or none for nominal heights",
+            )
         if self.kind == "thick" and self.surroundings != 1:
-            raise InputError("thick element", got=f"surroundings of {self.surroundings:g}", wanted="air")
+            raise InputError("thick element", got=f"surroundings of {self.surroundings:g}", wanted="air, 1")
         large = self.tile_px is not None and self.layout.size_px > self.tile_px
         if large and self.printer.depends_on_position:
             raise InputError(
                 "tile_px",
                 got="a model whose print depends on the position",
-                wanted="None, to print in one piece",
+                wanted="None, which prints in one piece",
             )

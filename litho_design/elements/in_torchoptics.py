@@ -20,7 +20,7 @@ class PrintedElement(PolychromaticModulationElement):
 
     def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
         size, pitch = element.layout.size_px, element.layout.pitch_um
-        # Fields fit only if their spacing is equal to the last bit, and 0.1 / 1e6 is not 1e-7.
+        # A field fits only if its spacing agrees to the last bit, but 0.1 / 1e6 is not exactly 1e-7.
         super().__init__((size, size), z, float(f"{pitch / unit_um:.12g}"), offset)
         self.element, self.unit_um = element, unit_um
 

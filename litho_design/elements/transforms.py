@@ -1,4 +1,6 @@
-"""Make prints work in ``torch.func`` and ``torch.compile``, which cannot trace the models' own gradients."""
+"""Make printing work in ``torch.func`` and ``torch.compile``, which cannot trace the models' own
+gradients.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
         return printed
 
 
-# ``torch.compiler.disable`` sets this attribute; to import that function would take two seconds.
+# ``torch.compiler.disable`` sets this attribute; importing that function would take two seconds.
 printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
 
 
@@ -59,7 +61,7 @@ class _Slope(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        """Save nothing: second derivatives through a model are not supported."""
+        """Save nothing, because second derivatives through a model are not supported."""
 
     @staticmethod
     def vmap(

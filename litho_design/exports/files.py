@@ -1,4 +1,4 @@
-"""Export a layout in one of the formats, and import exported files exactly."""
+"""Export a layout in one of several formats, and import exported files without loss."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _SUFFIX: dict[str, str] = {
 }  # fmt: skip
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
-# Beyond this size the other formats would need some 3 GiB of memory (images) or more (solids).
+# Beyond this size, the other formats would need about 3 GiB of memory (images) or more (solids).
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
@@ -75,29 +75,30 @@ def export(
     marks: bool = False,
     **job: Any,
 ) -> Path:
-    """Write a layout for the printer, with the sidecar ``<file>.json``.
+    """Write a layout as a file for the printer, with the sidecar ``<file>.json``.
 
-    The file is read back before the export counts as done. ``tiff`` and ``gds`` are written and read a band
-    of rows at a time, so that memory does not grow with the height of an element.
+    Before the export finishes, the file is read back and compared with the layout. ``tiff`` and ``gds`` are
+    written and read one band of rows at a time, so memory does not grow with the height of an element.
 
     Args:
-        design: a design, as its folder or from ``load_design``; an ``Element``; or an array (ny, nx) or its
-            file NAME.npy, whose whole numbers are levels, and other numbers heights in µm, rounded to the
-            nearest level.
+        design: a design (its folder, or the result of ``load_design``), an ``Element``, an array (ny, nx), or
+            a file NAME.npy with an array. Arrays of integers are levels. Arrays of floats are heights in µm,
+            which are rounded to the nearest level.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
-        out: folder of the export; exports of the same layout in other formats stay in it.
-        pitch_um, level_height_um: pixel and level of an array; designs and elements have their own.
-        dose_curve: CSV of ``grey,height_um``, the printed height of each grey value, for the grey formats
-            bmp, png16 and dxf; without it, grey is linear in height.
-        marks: add a mark of orientation and a flat witness beside the element (see ``with_marks``).
-        job: changes of ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
+        out: folder of the export; it may already hold exports of the same layout in other formats.
+        pitch_um, level_height_um: side of a pixel and height of a level of an array; designs and elements
+            have their own.
+        dose_curve: CSV with the columns ``grey,height_um``, which gives the printed height of each grey
+            value, for the grey formats bmp, png16 and dxf. Without it, grey is linear in height.
+        marks: add an orientation mark and a flat witness area beside the element (see ``with_marks``).
+        job: changes to ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
 
     Returns:
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, a format that cannot hold it or would need too much memory, a job
-            that no printer has, an element too small for marks, or a folder that holds something else.
+        InputError: the design is incomplete, the format cannot hold it or would need too much memory, no
+            printer can do the job, the element is too small for marks, or the folder holds something else.
     """
     require_known("format", format, _SUFFIX)
     made = changed(PrintJob(), job)
@@ -107,7 +108,9 @@ def export(
     layout, levels = source.layout, source.levels
     if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:
         got = f"{format} of {levels.shape[0]} x {levels.shape[1]} px"
-        raise InputError("format of a large element", got=got, wanted="tiff or gds, written in pieces")
+        raise InputError(
+            "format of a large element", got=got, wanted="tiff or gds, which are written in pieces"
+        )
     found: Marks | None = None
     if marks:
         if source.design is None:
@@ -145,17 +148,17 @@ def export(
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
-        # The sidecar is written last, because a file without it, or with an older one, is refused.
+        # The sidecar comes last: until then, the file has no sidecar or an outdated one, and is refused.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
     return place / name
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """Return the level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
+    """Return the level map of an exported file, uint8 (ny, nx) with row 0 on top, and the file's sidecar.
 
     Raises:
-        InputError: there is no sidecar, or the file was changed.
+        InputError: there is no sidecar, or the file was changed after the export.
     """
     path = Path(file)
     sidecar = read_sidecar(path)
@@ -187,7 +190,7 @@ def _loaded(file: str | Path) -> Any:
 
 
 def _levels(array: Any, level_height_um: float) -> np.ndarray:
-    """Convert an array of levels, or of heights in µm, to levels, uint8 (ny, nx)."""
+    """Convert an array of levels, or of heights in µm, to uint8 levels (ny, nx)."""
     if not isinstance(array, np.ndarray):
         wanted = "a design's folder, an Element, or an array of levels or heights in µm"
         raise InputError("layout to export", got=type(array).__name__, wanted=wanted)
@@ -197,7 +200,9 @@ def _levels(array: Any, level_height_um: float) -> np.ndarray:
     levels = np.rint(array / level_height_um) if array.dtype.kind == "f" else array
     if levels.min() < 0 or levels.max() > 255:
         got = f"levels from {levels.min():g} to {levels.max():g}"
-        raise InputError("array to export", got=got, wanted="0 to 255", hint="another --level-height-um")
+        raise InputError(
+            "array to export", got=got, wanted="0 to 255", hint="choose another --level-height-um"
+        )
     return np.ascontiguousarray(levels, np.uint8)
 
 
@@ -207,7 +212,7 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
             raise InputError(
                 "output",
                 got=f"{older}, an export of another layout",
-                wanted="a folder for this layout only",
+                wanted="a folder without exports of other layouts",
             )
 
 

@@ -1,4 +1,6 @@
-"""Write layouts as GDSII, one band of rows at a time: one layer per level, in cells that repeat."""
+"""Write layouts as GDSII, one band of rows at a time, with one layer per level and one cell per distinct
+block.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from litho_design.exports.rows import LevelRows
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9
 
-# Side of the blocks that a part is cut into.
+# Side of the blocks into which a part is cut.
 _BLOCK_PX = 128
 Box = tuple[int, int, int, int]
 
@@ -28,7 +30,7 @@ def write_gds(
     layers: GdsLayers,
     parts: Mapping[str, Box] | None = None,
 ) -> int:
-    """Write rectangles, unit 1 µm, grid 1 nm, y up; return the number of rectangles in the file.
+    """Write rectangles (unit 1 µm, grid 1 nm, y up); return the number of rectangles in the file.
 
     Layer k contains {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0). Runs
     along a row are merged with equal runs in the rows below, so every shape is a rectangle. The cell LAYOUT
@@ -36,15 +38,15 @@ def write_gds(
     blocks of 128 pixels. Equal blocks share a cell. Only the shapes of one block are in memory at a time.
 
     Args:
-        parts: first and last row, first and last column of each part, by name. By default, the only part is
-            ELEMENT, the whole map.
+        parts: first and last row, and first and last column, of each part, by name. By default, the only part
+            is ELEMENT, the whole map.
     """
     import gdstk
 
     known: dict[bytes, gdstk.Cell] = {}
     height, width = levels.shape
     drawn, layout = 0, gdstk.Cell("LAYOUT")
-    # A fixed time, so that equal layouts give equal files.
+    # The time stamp is fixed, so that equal layouts give equal files.
     writer = gdstk.GdsWriter(path, unit=_UNIT_M, precision=_PRECISION_M, timestamp=datetime(1970, 1, 1))
     for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, width)}).items():
         part = gdstk.Cell(name)
@@ -86,15 +88,15 @@ def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]
 
 
 def rectangles(masks: np.ndarray) -> np.ndarray:
-    """Return disjoint rectangles that cover boolean masks (n, ny, nx): mask, top, bottom, left, right (m, 5).
+    """Return disjoint rectangles that cover boolean masks (n, ny, nx), as mask, top, bottom, left, right (m,
+    5).
 
-    Ends are excluded.
+    The rectangles exclude the row ``bottom`` and the column ``right``.
     """
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)
     right = np.nonzero(edges < 0)[2]
-    # Equal runs of one mask are sorted from top to bottom: a rectangle continues as long as no row is
-    # missing.
+    # Equal runs of one mask are sorted from top to bottom, and a rectangle continues until a row is missing.
     order = np.lexsort([row, right, left, mask])
     mask, row, left, right = (one[order] for one in (mask, row, left, right))
     new = np.ones(len(row) + 1, bool)

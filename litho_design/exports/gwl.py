@@ -1,4 +1,4 @@
-"""Write layouts as GWL for Nanoscribe printers: one line of resist for each run of pixels in a row and
+"""Write layouts as GWL for Nanoscribe printers, with a line of resist for each run of pixels in a row and
 slice.
 """
 
@@ -18,26 +18,28 @@ _PIEZO_UM = 300.0
 
 
 def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
-    """Write the slices from the pedestal up, field by field; return the number of lines.
+    """Write the slices of each field from the pedestal upwards, field by field; return the number of lines.
 
     A slice is written at the middle of its thickness, and a row at the middle of its hatching distance. A
     line of resist runs along x from edge to edge of the pixels that reach the slice. Coordinates x and y are
-    those of the element, y up; in galvo mode they are relative to the middle of the field, to which the stage
-    moves.
+    those of the element, with y up; in galvo mode, they are relative to the middle of the field, to which the
+    stage moves.
 
     Raises:
-        InputError: a level height or pedestal that is not a whole number of slices, a pitch that is not a
-            whole number of hatching distances, powers for another number of levels, or an element beyond the
-            range of the piezo.
+        InputError: the level height or pedestal is not a whole number of slices, the pitch is not a whole
+            number of hatching distances, the laser powers do not match the number of levels, or the element
+            exceeds the range of the piezo.
     """
     height, width = levels.shape
     gwl, slicing_um, hatching_um = job.gwl, job.slicing_um, job.hatching_um
-    thick = _whole("slices of a level", level_height_um / slicing_um)
-    base = _whole("slices of the pedestal, pedestal_um over slicing_um", job.pedestal_um / slicing_um)
-    rows_per_px = _whole("hatching distances of a pixel", pitch_um / hatching_um)
+    thick = _whole("slices per level, level_height_um over slicing_um", level_height_um / slicing_um)
+    base = _whole("slices in the pedestal, pedestal_um over slicing_um", job.pedestal_um / slicing_um)
+    rows_per_px = _whole("hatching distances per pixel, pitch_um over hatching_um", pitch_um / hatching_um)
     if gwl.mode == "piezo" and max(height, width) * pitch_um > _PIEZO_UM:
         size = f"an element of {max(height, width) * pitch_um:g} µm"
-        raise InputError("piezo mode", got=size, wanted=f"at most {_PIEZO_UM:g} µm", hint="--gwl-mode galvo")
+        raise InputError(
+            "piezo mode", got=size, wanted=f"at most {_PIEZO_UM:g} µm", hint="use --gwl-mode galvo"
+        )
     field_px = max(1, round(gwl.field_um / pitch_um)) if gwl.mode == "galvo" else max(height, width)
     lines, at_um = 0, np.zeros(2)
     with open(path, "w", encoding="ascii") as stream:
@@ -90,7 +92,7 @@ def _powers(job: Gwl, highest: int) -> tuple[float, ...]:
         raise InputError(
             "laser power",
             got=f"{len(powers)} numbers",
-            wanted=f"one number, or one for the pedestal and each of {highest} levels",
+            wanted=f"one number, or one for the pedestal and one for each of {highest} levels",
         )
     return powers
 

@@ -1,4 +1,4 @@
-"""Write layouts as grey images: grey is linear in height, or follows a dose curve."""
+"""Write layouts as images whose grey is linear in height or follows a dose curve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CLASSIC_BYTES = 2**32 - 2**24
 
 
 def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
-    """Return the grey of each level: linear in height, with as many grey values per level as ``bits`` allow.
+    """Return the grey of each level, linear in height, with as many grey values per level as ``bits`` allow.
 
     Raises:
         InputError: there are more levels than grey values.
@@ -33,14 +33,14 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
-    """Return the greys whose measured heights equal those of the levels, up to a constant height.
+    """Return the grey values whose measured heights equal those of the levels, up to a constant height.
 
     Args:
-        curve: CSV with the columns ``grey`` and ``height_um``, both rising, such as from a dose matrix.
+        curve: CSV with the columns ``grey`` and ``height_um``, both rising, for example from a dose matrix.
 
     Raises:
-        InputError: there is no such table, a level lies beyond the measured heights, or two levels have the
-            same grey.
+        InputError: the file is not such a table, a level lies beyond the measured heights, or two levels have
+            the same grey.
     """
     try:
         table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))
@@ -54,8 +54,8 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
     heights = height_um[0] + np.arange(layout.levels) * layout.level_height_um
     found = np.rint(np.interp(heights, height_um, grey)).astype(int).tolist()
     if heights[-1] > height_um[-1] + 1e-9 or len(set(found)) < layout.levels:
-        got = f"{np.ptp(height_um):.3g} µm for levels up to {heights[-1] - heights[0]:.3g} µm"
-        raise InputError("dose curve", got=got, wanted="a different grey for every level")
+        got = f"{np.ptp(height_um):.3g} µm of heights for {heights[-1] - heights[0]:.3g} µm of levels"
+        raise InputError("dose curve", got=got, wanted="a curve with a different grey for every level")
     if found[0] < 0 or found[-1] >= 2**bits:
         raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
     return found
@@ -75,10 +75,10 @@ def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_heig
 
 
 def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float) -> None:
-    """Write a TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with the resolution.
+    """Write a TIFF with its resolution and two pages: 16-bit levels, and float32 nominal heights in µm.
 
-    The file is written strip by strip, and as a BigTIFF compressed by deflate if a TIFF cannot hold the
-    pages.
+    The file is written strip by strip. If a TIFF cannot hold the pages, it is a BigTIFF compressed by
+    deflate.
     """
     import tifffile
 

@@ -1,4 +1,4 @@
-"""Settings of a print job in addition to the layout: format, base, slices and lines."""
+"""Settings of a print job beyond the layout: format, base, slices and lines."""
 
 from __future__ import annotations
 
@@ -29,9 +29,13 @@ class Gwl(Record):
 
 
 class PrintJob(Record):
-    """STL and GWL print the base; the sidecar of every format records base, slicing and hatching."""
+    """Settings of a print job: only STL and GWL print the base, but every sidecar records base, slicing and
+    hatching.
+    """
 
-    pedestal_um: float = setting(1.0, "Base under level 0", unit="µm", option="--pedestal-um", ge=0, le=_MOST)
+    pedestal_um: float = setting(
+        1.0, "Height of the base under level 0", unit="µm", option="--pedestal-um", ge=0, le=_MOST
+    )
     slicing_um: float = setting(0.1, "Slicing distance", unit="µm", option="--slicing-um", gt=0, le=_MOST)
     hatching_um: float = setting(0.1, "Hatching distance", unit="µm", option="--hatching-um", gt=0, le=_MOST)
     gds_layers: GdsLayers = setting(

@@ -1,4 +1,6 @@
-"""Print two marks beside an element: an F that shows its orientation, and a flat witness of its height."""
+"""Print two marks beside an element: an F that shows its orientation, and a flat witness area for its
+height.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ _FLAT_UM = 4.0
 
 
 class Marks(Record):
-    """Positions of element, mark and witness in an exported map: first and last row, first and last column,
-    in pixels.
+    """Positions of element, mark and witness in an exported map, in pixels: first and last row, first and
+    last column.
 
     ``witness_height_um`` is the height above the ground that the design's model predicts for the middle of
     the witness.
@@ -44,18 +46,18 @@ def with_marks(
 ) -> tuple[np.ndarray, Marks]:
     """Add an F and a square of the highest level to the right of a level map (size, size).
 
-    F and square are at least the printer's reach away from the element and from each other, so that none
-    changes the print of another. Everything lies on whole cells.
+    F and square are at least the printer's reach away from the element and from each other, so that none of
+    the three changes the print of another. All of them consist of whole cells.
 
     Args:
         guard_um: reach of the printer, µm.
-        level_heights_um: printed height of wide fields of each level.
+        level_heights_um: printed height of a wide field of each level.
 
     Returns:
-        Levels uint8 (size, wider), and the positions of the parts.
+        The wider map, uint8 (size, width), and the positions of the parts.
 
     Raises:
-        InputError: the element is less high in the map than mark and witness together.
+        InputError: the element has fewer rows than mark and witness need together.
     """
     cell = 1 if layout.symmetry == "radial" else layout.cell_px
 
@@ -70,7 +72,7 @@ def with_marks(
         raise InputError(
             "marks",
             got=f"an element of {size * layout.pitch_um:g} µm",
-            wanted=f"at least {high * layout.pitch_um:g} µm, the height of mark and witness",
+            wanted=f"at least {high * layout.pitch_um:g} µm, which mark and witness need",
         )
     left, top_level = size + gap, layout.levels - 1
     beside = np.zeros((size, gap + max(side, letter.shape[1])), np.uint8)

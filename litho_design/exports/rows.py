@@ -13,7 +13,7 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx), row 0 on top, in memory or on disk; its rows are sliced like those of an
+    """A level map (ny, nx) in memory or on disk, with row 0 on top; its rows are sliced like those of an
     array.
     """
 
@@ -22,15 +22,15 @@ class LevelRows(Protocol):
         """Return (ny, nx)."""
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Return these rows, all columns."""
+        """Return all columns of these rows."""
 
 
 @dataclass(frozen=True)
 class RingRows:
-    """The plane of a lens of rings, of which only the requested rows are computed.
+    """The level map of a lens of rings; only the requested rows are computed.
 
     Args:
-        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture take the last level.
+        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture have the last level.
     """
 
     ring_level: np.ndarray
@@ -62,6 +62,6 @@ def layout_rows(folder: str | Path) -> LevelRows:
 
 
 def bands_of(levels: LevelRows, band_px: int) -> Iterator[slice]:
-    """Yield the rows of a map, ``band_px`` at a time; the last band may have fewer."""
+    """Yield the rows of a map in bands of ``band_px`` rows; the last band may have fewer."""
     height = levels.shape[0]
     return (slice(top, min(top + band_px, height)) for top in range(0, height, band_px))

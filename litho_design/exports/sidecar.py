@@ -21,8 +21,8 @@ _OF_DESIGN = ("printer", "stroke", "out_of_distribution", "predicted", "settings
 
 
 class Sidecar(Result):
-    """The contents of <file>.json, stored with an exported file; without a design, the design's own fields
-    are missing.
+    """The contents of <file>.json beside an exported file; fields about a design are None if there is no
+    design.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/export/2"
@@ -68,7 +68,9 @@ class Sidecar(Result):
 
 
 def cell_of(layout: LayoutSettings) -> int:
-    """Return the side, in pixels, of the square cells of a layout; a ring layout has none."""
+    """Return the side, in pixels, of the square cells of a layout; it is 1 for a ring layout, which has
+    none.
+    """
     return 1 if layout.symmetry == "radial" else layout.cell_px
 
 
@@ -96,7 +98,7 @@ def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
 
 
 def of_design(folder: Path | None, design: Design | None) -> dict[str, Any]:
-    """Return the fields of the sidecar that come from a design; without a design, return none."""
+    """Return the fields of the sidecar that come from a design, or no fields if there is no design."""
     if folder is None or design is None:
         return {}
     shared = {name: getattr(design, name) for name in _OF_DESIGN}
@@ -117,6 +119,8 @@ def read_sidecar(file: Path) -> Sidecar:
     sidecar = Sidecar.read(sidecar_path(file))
     if file_sha256(file) != sidecar.file_sha256:
         raise InputError(
-            f"file {file}", got="content that changed after the export", wanted=sidecar.file_sha256[:12]
+            f"file {file}",
+            got="content that changed after the export",
+            wanted=f"content with the SHA-256 {sidecar.file_sha256[:12]}…",
         )
     return sidecar

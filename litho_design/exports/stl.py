@@ -1,4 +1,6 @@
-"""Write layouts as a closed solid (binary STL, µm): two triangles per top; walls meet corner to corner."""
+"""Write layouts as a closed solid (binary STL, µm), with two triangles per cell and walls that meet at
+corners.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +28,16 @@ def write_stl(
     Every edge belongs to two faces, even where columns touch only along an edge; see ``step_solid``.
 
     Args:
-        levels: integer levels per cell (ny, nx), row 0 on top; y grows up in the file.
+        levels: integer levels per cell (ny, nx), with row 0 on top; in the file, y points up.
         cell_um: side of one cell.
-        pedestal_um: base under level 0, above 0.
+        pedestal_um: height of the base under level 0; must be positive.
 
     Raises:
         InputError: there is no pedestal, so level 0 would have no volume.
     """
     if pedestal_um <= 0:
         raise InputError(
-            "pedestal_um", got=pedestal_um, wanted="a positive height of the base, for a closed solid"
+            "pedestal_um", got=pedestal_um, wanted="a positive height, because a closed solid needs a base"
         )
     triangles = step_solid(levels[::-1])
     height_um = triangles[..., 2] * level_height_um + pedestal_um
@@ -53,13 +55,13 @@ def write_stl(
 
 
 def step_solid(levels: np.ndarray) -> np.ndarray:
-    """Return triangles (m, 3, 3), x y z, float32, of the solid that has one column per cell.
+    """Return the triangles (m, 3, 3) of the solid that has one column per cell, as x y z, float32.
 
-    Every edge belongs to two faces, which traverse it in opposite directions: a wall has a corner at the
-    height of each top among the four columns around its ends.
+    Every edge belongs to two faces, which traverse it in opposite directions. For this, a wall has a corner
+    at the height of each top among the four columns around each of its ends.
 
     Args:
-        levels: integers (ny, nx) of 0 or more; y grows with the row.
+        levels: non-negative integers (ny, nx); y increases with the row.
 
     Returns:
         x and y are in cells and z in levels, -1 for the underside; triangles run counter-clockwise as seen
@@ -86,13 +88,15 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Return positions (n, 3) at points (n, 2), row and column; some points are moved towards a cell."""
+    """Return positions (n, 3) of points (n, 2), given as row and column; some points are moved towards a
+    cell.
+    """
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)
 
 
 def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """Return two triangles for each cell."""
+    """Return the two triangles of the top of each cell."""
     cell = np.argwhere(around[:-1, :-1, 3] >= 0)
     z = around[cell[:, 0], cell[:, 1], 3]
     # The loop starts at the cell's south-west point, from which the cell lies north-east, and goes around the
@@ -128,7 +132,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     strips += [(west[i], east[3], west[i + 1]) for i in range(3)]
     found = []
     for a, b, c in strips:
-        # Counter-clockwise as seen from the south; a wall faces its lower cell.
+        # Triangles run counter-clockwise as seen from the south; a wall faces its lower cell.
         faces = np.where((south > north)[:, None, None], np.stack([c, b, a], 1), np.stack([a, b, c], 1))
         corners_apart = (a != b).any(1) & (b != c).any(1) & (c != a).any(1)
         found.append(faces[corners_apart])
@@ -136,7 +140,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
 
 
 def _underside(shape: tuple[int, ...]) -> np.ndarray:
-    """Return a fan from the middle to all points of the rim."""
+    """Return the underside as a fan of triangles from the middle to all points of the rim."""
     ny, nx = shape
     south, east = [(0, x) for x in range(nx)], [(y, nx) for y in range(ny)]
     north, west = [(ny, x) for x in range(nx, 0, -1)], [(y, 0) for y in range(ny, 0, -1)]

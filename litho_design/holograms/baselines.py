@@ -1,4 +1,4 @@
-"""Score a black image and ideal elements on the grid of a hologram, as baselines."""
+"""Compute baselines of a hologram: the scores of a black image and of ideal elements on the same grid."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from litho_design.optimisation.phases import gerchberg_saxton
 _ITERATIONS = 40
 _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
-# Figures that make sense for any image.
+# Figures that are defined for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
 
 
 def hologram_baselines(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
 ) -> dict[str, dict[str, float]]:
-    """Return the scores of a black image and of ideal elements in the optics of ``bench``, by name.
+    """Return by name the scores of a black image and of ideal elements in the optics of ``bench``.
 
-    ``diffraction-limited``: an element of free amplitude and phase, found by forty Gerchberg-Saxton steps,
-    whose image has a flat phase. ``continuous phase``: one phase per cell, without printer and levels. The
-    search starts from Gerchberg-Saxton and takes a hundred steps down the design's own loss, which is among
-    the scores. ``weighted GS``: forty weighted Gerchberg-Saxton steps on the same phases.
+    ``diffraction-limited`` is an element with free amplitude and phase, found by forty Gerchberg-Saxton
+    steps, whose image has a flat phase. ``continuous phase`` has one phase per cell, without printer and
+    levels. Its search starts from Gerchberg-Saxton and takes a hundred descent steps on the design's own
+    loss, which is among the scores. ``weighted GS`` has one phase per cell from forty weighted
+    Gerchberg-Saxton steps.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -55,7 +56,8 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Return the largest power on the signal {T > 0.5} that a search over phases finds from a print.
+    """Return the largest power on the signal {T > 0.5} that a search over phases finds, starting from a
+    print.
 
     Each step is u <- exp(j arg P^H S P u), where S selects the signal; every pixel has its own phase. P^H S P
     is positive, so no step reduces the power, and the result is never below that of the print.
@@ -95,7 +97,7 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
-    """Return the phases of the cells, radian, with the lowest loss, and that loss."""
+    """Return the phases of the cells, in radian, that have the lowest loss, and this loss."""
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
         counted=counted,

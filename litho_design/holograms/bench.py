@@ -1,4 +1,4 @@
-"""The optics of a holographic element: from a printed height map to an image and its score."""
+"""The optics of a holographic element, which turn a printed height map into an image and its score."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from litho_design.images.similarity import (
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
-# A 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its camera.
+# These values are for a 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its camera.
 _CAMERA_PITCH_UM, _CAMERA_NA = 0.345, 0.3
 
 Waves = Sequence[tuple[float, Tensor]]
@@ -45,12 +45,12 @@ class HologramBench(ElementBench):
 
 
 class HologramScore(Record):
-    """Efficiencies are shares of the power incident on the element."""
+    """The score of a hologram; efficiencies are shares of the power incident on the element."""
 
-    eff_signal: float = Field(description="power on the signal (T > 0.5), share of the incident power")
-    eff_paper: float = Field(description="power where T > 0, share of the incident power")
-    eff_window: float = Field(description="power in the window, share of the incident power")
-    zero_order_share: float = Field(description="zero order, share of the incident power")
+    eff_signal: float = Field(description="share of the incident power on the signal (T > 0.5)")
+    eff_paper: float = Field(description="share of the incident power where T > 0")
+    eff_window: float = Field(description="share of the incident power in the window")
+    zero_order_share: float = Field(description="share of the incident power in the zero order")
     si_psnr_db: float = Field(description="scale-invariant PSNR, dB")
     rmse_paper: float = Field(description="RMSE at the paper's scale")
     ssim: float = Field(description="SSIM")
@@ -58,7 +58,7 @@ class HologramScore(Record):
         description="scale-invariant PSNR relative to the target at the element's resolution, dB"
     )
     ssim_resolved: float = Field(description="SSIM against the target at the element's resolution")
-    clipped_share: float = Field(description="pixels clipped for SSIM, share")
+    clipped_share: float = Field(description="share of pixels clipped for SSIM")
     ssim_camera: float = Field(description="SSIM as the camera sees it")
     speckle_contrast: float = Field(description="speckle contrast on the signal")
     uniformity: float = Field(description="uniformity on the signal")
@@ -66,8 +66,8 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """The score with a signal window: the loss ignores light outside the window, but the other figures
-    count it as an error.
+    """The score with a signal window. The loss ignores light outside the window, but the other figures count
+    such light as an error.
     """
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
@@ -76,15 +76,16 @@ class WindowedHologramScore(HologramScore):
 def hologram_score(
     waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics
 ) -> HologramScore:
-    """Score the summed intensity of the waves in the image plane against the wanted image.
+    """Score the summed intensity of the waves in the image plane against the target image.
 
-    The signal is S = {T > 0.5}. Before comparison the image is scaled by c = sum(I T) / sum(I^2). SSIM uses
-    an 11 px Gaussian window, sigma 1.5 and data range 1, on c I clipped to [0, 1].
+    The signal is S = {T > 0.5}. Before the comparison, the image is scaled by c = sum(I T) / sum(I^2). SSIM
+    uses an 11 px Gaussian window, sigma 1.5 and data range 1, on c I clipped to [0, 1].
 
     Args:
-        waves: shares of the light, and complex (m, m) in the image plane, for unit incident power, 1/µm.
-        element: complex (n, n) just behind the element on the same pixels; its mean gives the
-            zero order, the share of power that goes straight on as a plane wave.
+        waves: share of the light of each wave, and its complex field (m, m) in the image plane for unit
+            incident power, 1/µm.
+        element: complex field (n, n) just behind the element, on the same pixels; its mean gives the zero
+            order, the share of power that goes straight on as a plane wave.
         target: real (m, m) in [0, 1].
         grid: geometry of the waves.
     """
@@ -104,10 +105,10 @@ def hologram_score(
 
 
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
-    """Return a target (m, m) at the resolution of an element of the same size, real (m, m).
+    """Return a real target (m, m) at the resolution of an element of the same size.
 
     The target is convolved with the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
-    where NA is the sine of the angle from the axis to the edge. Beyond the window it is dark.
+    where NA is the sine of the angle from the axis to the edge. The target is dark beyond the window.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
@@ -134,7 +135,7 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM of the waves' light, as a camera records it, against the target on the camera's
+    """Return the SSIM between the waves' light, as a camera records it, and the target on the camera's
     pixels.
     """
     import cv2

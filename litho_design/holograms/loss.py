@@ -14,8 +14,8 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Return the mask (size, size) of the pixels near the wanted light, which count in the error; None for
-    all.
+    """Return the mask (size, size) of the pixels near the target's light, which count in the error; None if
+    all count.
     """
     if not settings.signal_window_um:
         return None
@@ -32,14 +32,14 @@ def hologram_loss(
     counted: Tensor | None = None,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Return the loss of an image and its parts by name.
+    """Return the loss of an image, and the named parts of this loss.
 
     Args:
         share: share of the incident power on each pixel (size, size).
-        target: wanted intensity in [0, 1], (size, size).
+        target: target intensity in [0, 1], (size, size).
         counted: pixels that count in the error, bool (size, size); None for all.
-        total: sums over the pixels of the whole image, if the other arguments are a part of it; otherwise
-            None.
+        total: function that sums over the pixels of the whole image, if the other arguments cover only a part
+            of it; otherwise None.
     """
     total = total or torch.sum
     efficiency = total(share[target > 0])

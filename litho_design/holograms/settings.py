@@ -19,13 +19,13 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class HologramLoss(Record):
-    """RMSE(target, image) + efficiency_weight * (1 - efficiency).
+    """The loss of a hologram, RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
-    With ``signal_window_um``, only pixels within this distance of the wanted light count in the error. The
-    error ignores light beyond them (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
+    With ``signal_window_um``, only pixels within this distance of the target's light count in the error. The
+    error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
     doi:10.1364/OE.16.002176). ``scale`` says how the image is matched to the target: ``paper`` divides by the
-    mean over the wanted light, ``least-squares`` uses the factor with the smallest error. The efficiency is
-    the share of the incident power on pixels whose target is above zero.
+    mean over the target's light, and ``least-squares`` uses the factor with the smallest error. The
+    efficiency is the share of the incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
@@ -35,8 +35,8 @@ class HologramLoss(Record):
         0.1, "Weight of the light that misses the target", option="--efficiency-weight", ge=0
     )
     signal_window_um: float = setting(
-        0.0, "Distance from the target's light beyond which the loss ignores light; 0: none", unit="µm",
-        option="--signal-window-um", ge=0,
+        0.0, "Distance from the target's light beyond which the loss ignores light; 0 ignores none",
+        unit="µm", option="--signal-window-um", ge=0,
     )  # fmt: skip
 
 
@@ -50,9 +50,9 @@ class HologramSettings(DesignSettings):
 def hologram_settings(
     variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> HologramSettings:
-    """Return a preset of the hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
+    """Return a preset for a hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
 
-    ``paper``: as printed in the paper (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
+    ``paper``: as stated in the paper (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
     iterations at 0.1, expected levels). ``authors``: as in the published code, which has 12 levels,
     temperature 1, wavelength 0.633 and index step 0.545. After more than ten iterations without progress the
     rate falls to a tenth. The code's efficiency term is constant and therefore left out.
@@ -60,11 +60,11 @@ def hologram_settings(
     from a Gerchberg-Saxton start, followed by a polish of the printable layout.
 
     Args:
-        variant: the preset; a ``variant`` in the changes replaces it.
-        changes: values by dotted path, or nested as in a settings file.
+        variant: the preset; a ``variant`` among the changes overrides it.
+        changes: values by dotted path, or nested mappings as in a settings file.
 
     Raises:
-        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+        InputError: a change names an unknown setting, or a value that the setting does not accept.
     """
     return preset(_preset, variant, changes)
 

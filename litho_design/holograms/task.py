@@ -1,4 +1,4 @@
-"""The hologram as a task: it turns levels on the pixels into a loss, a score and the saved arrays."""
+"""The task of a hologram, which turns levels on the pixels into a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _START_ITERATIONS = 40
 
 @register_task
 class HologramTask(Task):
-    """A hologram, ready for ``run_design``.
+    """The task of designing a hologram, for ``run_design``.
 
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
         printer: frozen model, or nominal heights.
-        inputs: ``target``, the wanted image of the size of the element, as ``load_target`` gives it, with its
-            record.
+        inputs: ``target``, the target image at the size of the element, as ``load_target`` returns it with
+            its record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
-        InputError: a target of another size or without dark and bright pixels, a start that is for lenses, or
-            spreads beyond the range of the propagator.
+        InputError: the target has another size or lacks dark or bright pixels, the start is for lenses, or
+            the spreads exceed the range of the propagator.
     """
 
     name = "hoe"
@@ -49,7 +49,7 @@ class HologramTask(Task):
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
-    # Sums over the pixels of the whole element; target and cells may be only a part of it.
+    # This function sums over the pixels of the whole element; target and cells may cover only a part of it.
     total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
@@ -72,7 +72,7 @@ class HologramTask(Task):
         self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
 
     def make_bench(self, optics: Optics) -> HologramBench:
-        """Return the bench from the element to the image plane."""
+        """Return the bench, which propagates from the element to the image plane."""
         return HologramBench(self.settings.layout, optics).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
@@ -115,7 +115,9 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Return the signal efficiency of a continuous phase with the most power, found from the print."""
+        """Return the signal efficiency of the continuous phase with the most power, found by a search from
+        the print.
+        """
         return best_signal_efficiency(self.bench, height_um, self.target)
 
     def baselines(self) -> dict[str, dict[str, float]]:
@@ -123,13 +125,13 @@ class HologramTask(Task):
         return hologram_baselines(self.bench, self.cells, self.target, self.settings)
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Return the image scaled to its target."""
+        """Return the image, scaled to match its target."""
         target = self.inputs["target"]
         return (seen * target).sum() / max(float((seen**2).sum()), 1e-30) * seen
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
-    """Return a note if diffraction will blur the strokes of the target, whatever the layout."""
+    """Return a note if diffraction will blur the strokes of the target in any layout."""
     layout, optics = settings.layout, settings.optics
     stroke_um = stroke_width_px(target) * layout.pitch_um
     finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
@@ -140,9 +142,9 @@ def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
     digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
     near_um = math.floor(near_um / digit_um) * digit_um
     return [
-        f"strokes of the target are about {stroke_um:.2g} µm wide, narrower than λz/D = {finest_um:.2g} µm, "
-        f"the finest detail that an element of {layout.size_um:.4g} µm draws at {optics.distance_um:g} µm: "
-        f"the image will be blurred; take --distance-um {near_um:.2g} or less, a larger --size-px, or "
+        f"the strokes of the target are about {stroke_um:.2g} µm wide, but the finest detail that an element "
+        f"of {layout.size_um:.4g} µm can draw at {optics.distance_um:g} µm is λz/D = {finest_um:.2g} µm, so "
+        f"the image will be blurred; use --distance-um {near_um:.2g} or less, a larger --size-px, or "
         "bolder strokes"
     ]
 
@@ -158,7 +160,9 @@ def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
     if target.shape != wanted:
         raise InputError("target", got=f"{target.shape} px", wanted=f"{wanted} px, the size of the element")
     if not np.isfinite(target).all() or target.min() < 0 or target.max() > 1 or target.max() == 0:
-        raise InputError("target", got="values outside [0, 1] or no light", wanted="an image in [0, 1]")
+        raise InputError(
+            "target", got="values outside [0, 1] or no light", wanted="an image in [0, 1] with light"
+        )
     # The scores compare the signal {T > 0.5} with its surroundings.
     share = float((target > 0.5).mean())
     if share in (0.0, 1.0):

@@ -14,17 +14,19 @@ Levelling = Literal["none", "plane", "bow"]
 
 @dataclass(frozen=True)
 class MeasuredSource:
-    """A height map of the printed part; give unit and size (one side, or y and x) if the file does not state
+    """A height map of the printed part. Give unit and size (one side, or y and x) if the file does not state
     them.
 
-    Use ``aligned`` for elements that look alike in several places or orientations, such as a lens cap or a
-    blaze.
+    Use ``aligned`` for elements that look the same at several positions or in several orientations, such as a
+    lens cap or a blaze.
     """
 
-    path: Path = setting(..., "Height map of the printed part, by AFM", option="--scan")
-    unit: str | None = setting(None, "Unit of the scan's heights, if the file has none", option="--scan-unit")
+    path: Path = setting(..., "AFM height map of the printed part", option="--scan")
+    unit: str | None = setting(
+        None, "Unit of the scan's heights, if the file states none", option="--scan-unit"
+    )
     size_um: float | tuple[float, float] | None = setting(
-        None, "Side of the scan, µm, if the file has none", option="--scan-size-um"
+        None, "Side of the scan, µm, if the file states none", option="--scan-size-um"
     )
     levelling: Levelling = setting(
         "bow",
@@ -38,13 +40,13 @@ class MeasuredSource:
     )
     aligned: bool = setting(
         False,
-        "Take the scan as already aligned with the pixels of the element; it is not registered",
+        "Treat the scan as already aligned with the pixels of the element, and do not register it",
         option="--scan-aligned",
     )
     tip_um: float | None = setting(
         None,
-        "Radius of the tip, whose widening of the surface is removed; 0 removes nothing. By "
-        "default estimated from the scan",
+        "Radius of the tip whose widening of the surface is removed (by default, estimated from the scan; "
+        "0 removes nothing)",
         unit="µm",
         option="--scan-tip-um",
     )
@@ -52,13 +54,17 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of a hologram's image, or of an object through a lens; counts grow with the light."""
+    """A photograph of a hologram's image, or of an object through a lens; its counts increase with the
+    light.
+    """
 
     path: Path = setting(
-        ..., "Photograph of the printed hologram's image, or through the printed lens", option="--camera"
+        ...,
+        "Photograph of the printed hologram's image, or of an object through the printed lens",
+        option="--camera",
     )
     pitch_um: float = setting(
-        ..., "Pixel of the photograph in the image plane", unit="µm", option="--camera-pitch-um"
+        ..., "Side of the photograph's pixels in the image plane", unit="µm", option="--camera-pitch-um"
     )
     dark_level: float | None = setting(
         None, "Dark level of the photograph, counts", option="--camera-dark-level"
@@ -71,7 +77,7 @@ class PhotoSource:
     orientation: str = setting(
         "identity",
         "Operation that makes the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
-        "flip-y, transpose or anti-transpose; refused if another one fits better",
+        "flip-y, transpose or anti-transpose; the photograph is refused if another one fits better",
         option="--camera-orientation",
     )
     power_counts: float | None = setting(
@@ -82,7 +88,7 @@ class PhotoSource:
     )
     pitch_sd: float = setting(
         0.0,
-        "Relative standard uncertainty of that pixel, if the magnification is uncertain",
+        "Relative standard uncertainty of the pixel side, if the magnification is uncertain",
         option="--camera-pitch-sd",
     )
     flat: Path | None = setting(

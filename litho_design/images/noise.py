@@ -1,5 +1,5 @@
-"""Estimate the white noise of a measured map, and how a score changes within the uncertainty of a
-measurement.
+"""Estimate the white noise of a measured map, and the uncertainty of a score that the measurement's
+uncertainty causes.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of random draws within a measurement's uncertainty; their rms is known to 25 %.
+# Number of random draws within a measurement's uncertainty; with so many, their rms is known to 25 %.
 DRAWS = 8
-# Beyond this frequency along both axes, cycles/px, neither prints nor images have structure.
+# Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
 
@@ -30,7 +30,7 @@ def white_noise(values: np.ndarray) -> float:
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
     """Return the noise of a photograph (ny, nx): its sd in the dark, and its sd as a share of the light.
 
-    Speckle, for example, is proportional to the light.
+    The second part covers, for example, speckle, which is proportional to the light.
 
     The variance of the highest frequencies is fitted as (sd in the dark)^2 + (share)^2 times the squared
     light.
@@ -53,8 +53,8 @@ def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:
-    """Return the rms change of every figure of ``measured`` over variants of the measurement, as one standard
-    deviation.
+    """Return the standard deviation of every figure of ``measured``: its rms change over variants of the
+    measurement.
     """
     return {name: float(np.sqrt(np.mean(found**2))) for name, found in _changes(score, measured, variants)}
 
@@ -64,10 +64,10 @@ def freed_of_noise(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return figures corrected for the bias from noise, and the standard deviation of each figure.
 
-    The measurement already contains noise, and the variants add as much again; their mean change estimates
-    the change that the measurement's own noise caused (bias correction by bootstrap, Efron and Tibshirani
-    1993, chapter 10). Variants come in pairs of opposite noise, so a figure that is linear in the noise is
-    not changed.
+    The measurement already contains noise, and the variants add as much again. Their mean change therefore
+    estimates the change that the measurement's own noise caused (bias correction by bootstrap, Efron and
+    Tibshirani 1993, chapter 10). Variants come in pairs of opposite noise, so a figure that is linear in the
+    noise is not changed.
     """
     changes = dict(_changes(score, measured, variants))
     figures = {name: getattr(measured, name) - float(found.mean()) for name, found in changes.items()}

@@ -1,4 +1,4 @@
-"""Clean a photograph and register it on the image that a design expects."""
+"""Clean a photograph and register it to the image that a design expects."""
 
 from __future__ import annotations
 
@@ -22,20 +22,23 @@ from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
-# Largest allowed share of saturated or dark-clipped pixels. A larger share would change the similarity.
+# Largest allowed share of pixels clipped at the bright or dark end. A larger share would change the
+# similarity.
 _LARGEST_SATURATED = 0.01
-# Prints close to the expected one give apparent exponents of counts over light of 0.9 to 1.1.
+# For prints close to the expected one, the counts seem to grow as the light to a power of 0.9 to 1.1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
-# Sd of the loss of light in the corners, which depends on the objective.
+# Standard deviation of the loss of light in the corners, which depends on the objective.
 _VIGNETTING_SD = 0.1
-# A tilt is accepted if it reduces the unexplained variance below this share of the value without a tilt.
+# A tilt is accepted if it reduces the unexplained variance to less than this share of the variance without a
+# tilt.
 _NEEDED = 0.93
-# Sd of the plausible tilts of a camera, over half the window.
+# Standard deviation of the plausible tilts of a camera, over half the window.
 _TILT_SD = 0.1
 # Number of tiles along each side of the window.
 _TILES = 6
-# Orientations are compared on images of about this side, px; correlations this close are a tie.
+# Orientations are compared on images with about this side, px; correlations that differ by less than ``_TIE``
+# are a tie.
 _SMALL_PX = 192
 _TIE = 0.03
 
@@ -43,11 +46,11 @@ _TIE = 0.03
 class CameraRecord(Record):
     """Source and processing of a photograph; ``imaged`` is the object in front of a lens.
 
-    ``orientation`` is the operation that turns the photograph onto the image; ``ambiguous`` lists other
-    operations that fit as well. ``noise_counts`` is the noise (sd) in the dark, and ``noise_share`` the
-    additional noise as a share of the light. ``vignetting_sd`` is the possible loss of light in the camera's
-    corners. ``blur_um`` is the fitted blur (sd) beyond that of the expected image, and ``gamma`` the fitted
-    exponent of counts over light.
+    ``orientation`` is the operation that brings the photograph into the orientation of the image;
+    ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the noise (sd) in the
+    dark, and ``noise_share`` the additional noise as a share of the light. ``vignetting_sd`` is the possible
+    loss of light in the camera's corners. ``blur_um`` is the fitted blur (sd) beyond that of the expected
+    image, and ``gamma`` the fitted exponent of the counts as a power of the light.
     """
 
     name: str
@@ -77,7 +80,9 @@ class CameraRecord(Record):
         """Return remarks about the photograph, one phrase each."""
         found = list(self.notes)
         if self.orientation != "identity":
-            found.append(f"the photograph was turned onto the image by {self.orientation}, as requested")
+            found.append(
+                f"the orientation of the photograph was corrected by {self.orientation}, as requested"
+            )
         if self.ambiguous:
             others = ", ".join(self.ambiguous)
             found.append(
@@ -86,16 +91,16 @@ class CameraRecord(Record):
             )
         if self.coverage < 1:
             found.append(
-                f"{100 * (1 - self.coverage):.1f} % of the image lies outside the photograph; "
-                "there the expected image is used"
+                f"{100 * (1 - self.coverage):.1f} % of the image lies outside the photograph and was "
+                "replaced by the expected image"
             )
         if self.vignetting_sd:
             found.append(
-                "without --camera-flat the score may include vignetting; its uncertainty allows for that"
+                "without --camera-flat, the score may include vignetting; its uncertainty allows for this"
             )
         if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
             found.append(
-                f"counts seem proportional to the light to the power {self.gamma:.2f}: is the file raw?"
+                f"counts seem to grow as the light to the power {self.gamma:.2f}; check that the file is raw"
             )
         return found
 
@@ -107,11 +112,11 @@ class Photograph:
     Attributes:
         counts: cleaned, upright counts without the dark level (ny, nx).
         window_to_photo: projective map (3, 3) from window pixels to photograph pixels.
-        side_px: side of the window.
-        pitch_um: pixel of the window.
+        side_px: side of the window, in its pixels.
+        pitch_um: side of a pixel of the window.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
-        expected: counts (m, m) for the pixels that lie beyond the photograph.
+        expected: expected counts (m, m), used for pixels that lie beyond the photograph.
     """
 
     counts: np.ndarray
@@ -123,8 +128,8 @@ class Photograph:
     expected: np.ndarray
 
     def image(self) -> np.ndarray:
-        """Return the photograph resampled on the window (m, m), in counts per camera pixel; noise may make
-        them negative.
+        """Return the photograph resampled on the window (m, m), in counts per camera pixel, which noise may
+        make negative.
         """
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
@@ -132,13 +137,13 @@ class Photograph:
         """Express ``image`` as shares of the light on the element, whose summed counts are
         ``power_counts``.
         """
-        # Pixels of the photograph per pixel in the middle of the window.
+        # The factor is the number of photograph pixels per window pixel, in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Yield equally plausible images with other noise, dark level, position, size and vignetting, in
-        pairs.
+        """Yield pairs of equally plausible images that differ in noise, dark level, position, size and
+        vignetting.
         """
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
@@ -166,8 +171,8 @@ class Photograph:
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
-        # Detail finer than the element's light can form is noise. The remaining detail is corrected for the
-        # averaging over a pixel.
+        # Detail finer than the light from the element can form is noise. The remaining detail is corrected
+        # for the averaging over a pixel.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
         sharp = (frequency <= self.finest_per_um) / np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
         kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(sharp, sharp), norm="ortho")
@@ -177,24 +182,24 @@ class Photograph:
 def photographed_image(
     wanted: np.ndarray, wanted_pitch_um: float, source: PhotoSource, finest_per_um: float
 ) -> Photograph:
-    """Register a photograph on the image that the design expects.
+    """Register a photograph to the image that the design expects.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by their neighbours' median. Then
-    a model of the camera (shifted, turned and, if needed, tilted) is fitted by least squares to the expected
-    image, with free gain and background. The scale follows from the pitch unless the pitch has an
-    uncertainty; otherwise an image that is too large because of the print would be attributed to the camera.
-    All eight orientations are tried, and a photograph that fits another orientation better than
-    ``orientation`` is refused.
+    a model of the camera (shifted, rotated and, if needed, tilted) is fitted by least squares to the expected
+    image, with free gain and background. The scale is free only if the pitch has an uncertainty. A scale that
+    is always free would attribute an image that the print made too large to the camera. All eight
+    orientations are tried, and a photograph that fits another orientation better than ``orientation`` is
+    refused.
 
     Args:
-        wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
-        source: grey image of any bit depth, counts proportional to the light. If the dark level is unknown,
-            it is chosen so that the darkest pixels are as bright as expected.
+        wanted: expected image (m, m), at any scale; ``wanted_pitch_um``: side of its pixels, µm.
+        source: grey image of any bit depth, whose counts are proportional to the light. If the dark level is
+            unknown, it is chosen so that the darkest pixels are as bright as expected.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
 
     Raises:
-        InputError: the file is no image, the pitch is not positive, the orientation is unknown, or the
-            photograph is overexposed, not linear, unlike the expected image, mirrored or turned.
+        InputError: the file is not an image, the pitch is not positive, the orientation is unknown, or the
+            photograph is overexposed, not linear, unlike the expected image, mirrored or rotated.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -210,7 +215,7 @@ def photographed_image(
             f"photograph {photo_file}",
             got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at the lowest or highest value",
             wanted=f"at most {100 * _LARGEST_SATURATED:g} %",
-            hint="a shorter exposure" if saturated > cut_off else "a black level above the noise",
+            hint="use a shorter exposure" if saturated > cut_off else "raise the black level above the noise",
         )
     cleaned, replaced = _replace_outliers(photo)
     if source.flat is not None:
@@ -226,14 +231,14 @@ def photographed_image(
         got = f"{100 * coverage:.0f} % of the image"
         wanted_share = f"at least {100 * _SMALLEST_COVERAGE:.0f} %"
         raise InputError(f"photograph {photo_file}", got=got, wanted=wanted_share)
-    # A print unlike the expected one is bright and dark in other places, which also looks like a gamma.
+    # A print unlike the expected one is bright and dark in other places, which can look like a gamma too.
     open_gamma = _LARGEST_GAMMA_OFF + 2 * (1 - fit.correlation)
     if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
         raise InputError(
             f"photograph {photo_file}",
             got=f"counts proportional to the light to the power {fit.gamma:.2f} ± {fit.gamma_sd:.2f}",
             wanted="counts proportional to the light",
-            hint="take the camera's raw file, or undo its gamma",
+            hint="use the camera's raw file, or undo its gamma",
         )
     dark, dark_sd = (dark_level, 0.0) if dark_level is not None else _dark_level(upright, wanted, fit)
     counts = upright - np.float32(dark)
@@ -269,24 +274,24 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Return the share of pixels at the top of the range: the range of the file, or 12 or 14 bits if counts
-    pile up there.
+    """Return the share of pixels at the top of the file's range, or of 12 or 14 bits if counts pile up
+    there.
     """
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
     at_top = float((raw == top).mean())
-    # If many pixels share a maximum that few others come close to, the maximum is an end of the range.
+    # If many pixels have the maximum and few others come close to it, the maximum is the end of the range.
     beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
     return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
 
 
 def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | None) -> np.ndarray:
-    """Divide a photograph by the brightness of uniform light, scaled to mean 1; the dark level is kept."""
+    """Divide a photograph by that of uniform light, scaled to a mean of 1; the dark level is kept."""
     from scipy.ndimage import gaussian_filter
 
     flat = read_grey(flat_file, "photograph of uniform light")[0].astype(np.float32)
     if flat.shape != photo.shape or dark_level is None or not np.median(flat) > dark_level:
-        wanted = f"{photo.shape} px, and --camera-dark-level"
+        wanted = f"{photo.shape} px, brighter than a given --camera-dark-level"
         raise InputError("photograph of uniform light", got=f"{flat.shape} px", wanted=wanted)
     light = gaussian_filter(flat - dark_level, 2.0)
     even: np.ndarray = (photo - dark_level) * (light.mean() / light.clip(min=0.05 * light.max()))
@@ -311,7 +316,7 @@ def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float
 def _check_orientation(
     photo: np.ndarray, wanted: np.ndarray, scale: float, pitch_sd: float, asked: str, photo_file: str | Path
 ) -> list[str]:
-    """Return other orientations that fit as well as the one asked for.
+    """Return other orientations that fit as well as the requested one.
 
     Raises:
         InputError: another orientation fits better, or none fits.
@@ -321,7 +326,7 @@ def _check_orientation(
     shrink = max(1, wanted.shape[0] // _SMALL_PX)
     side = wanted.shape[0] // shrink
     small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
-    # The photograph is averaged to the pixels of the expected image; otherwise its noise would decide.
+    # The photograph is averaged to the pixels of the expected image, so that its noise does not decide.
     finer = max(1, round(wanted.shape[0] / side / scale))
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]
@@ -338,7 +343,7 @@ def _check_orientation(
             got=f"an image that fits after {best} (correlation {found[best]:.2f}), not after {asked} "
             f"({found[asked]:.2f})",
             wanted="an upright photograph",
-            hint=f"if the camera, not the print, caused that: --camera-orientation {best}",
+            hint=f"if the camera and not the print caused this, use --camera-orientation {best}",
         )
     return [name for name in found if name != asked and found[name] > found[asked] - _TIE]
 
@@ -346,21 +351,23 @@ def _check_orientation(
 def _unlike(photo_file: str | Path, correlation: float) -> InputError:
     return InputError(
         f"photograph {photo_file}",
-        got=f"correlation {correlation:.2f} with the expected image in any orientation",
+        got=f"a correlation of {correlation:.2f} with the expected image in any orientation",
         wanted=f"at least {_SMALLEST_CORRELATION}",
         hint="check the camera pitch; give --camera-pitch-sd if it is uncertain",
     )
 
 
 def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
-    """Replace pixels far from the median of their 3 x 3 neighbourhood, in units of the image's own spread."""
+    """Replace pixels that are far from the median of their 3 x 3 neighbourhood, relative to the image's
+    spread.
+    """
     import cv2
 
     lit = photo - np.percentile(photo, 1)
     median = cv2.medianBlur(lit.astype(np.float32), 3)
     difference = lit - median
     spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
-    # The median, so that no hot pixel decides what is bright.
+    # The median image is used, so that no hot pixel decides what is bright.
     bright = float(median.max())
     outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
     return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())
@@ -368,7 +375,9 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Map (3, 3) from window to photograph pixels, the camera's properties, and standard deviations."""
+    """A fitted camera: the map (3, 3) from window to photograph pixels, properties, and standard
+    deviations.
+    """
 
     window_to_photo: np.ndarray
     correlation: float
@@ -381,8 +390,8 @@ class _Fit:
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
-    """Fit the camera whose photograph of the expected image is closest; with ``further``, fit tilt and light
-    too.
+    """Fit the camera whose photograph of the expected image is closest to ``photo``; with ``further``, also
+    fit tilt and light.
     """
     import cv2
 
@@ -403,7 +412,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     free = [0, 1, 2] + ([3] if pitch_sd else [])
     # A unit of angle (sine), log scale or tilt moves the edge as much as a shift of half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
-    # Residuals of neighbouring pixels are not independent: this many pixels count as one.
+    # Residuals of neighbouring pixels are not independent, so this many pixels count as one.
     alike = 4 * math.pi * blur_px**2
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -414,13 +423,13 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             at[columns] += step * unit[columns]
             one = seen(image, at)
             off = (one - one.mean()) / max(float(one.std()), 1e-12) - target
-            # Prior knowledge of scale and tilts.
+            # These residuals express prior knowledge of scale and tilts.
             prior = [at[3] / pitch_sd] if 3 in columns and pitch_sd else []
             prior += [at[i] / _TILT_SD for i in (4, 5) if i in columns]
             return np.append(off.ravel() / math.sqrt(alike), prior)
 
         def slopes(step: np.ndarray) -> np.ndarray:
-            # Steps of half a pixel, because cv2 resolves positions only to 1/32 of a pixel.
+            # The steps are half a pixel, because cv2 resolves positions only to 1/32 of a pixel.
             ways = 0.5 * np.eye(len(columns))
             return np.stack([residual(step + way) - residual(step - way) for way in ways], axis=1)
 
@@ -474,7 +483,7 @@ def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarr
 
 
 def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:
-    """Fit counts as background + gain * (blurred expected light)^gamma, by least squares."""
+    """Fit the counts by least squares as background + gain * (blurred expected light)^gamma."""
     import cv2
 
     found = {}
@@ -495,8 +504,8 @@ def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, fl
 
 
 def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
-    """Return the map (3, 3) from window to photograph pixels for a camera's shift (px), turn, log scale and
-    two tilts.
+    """Return the map (3, 3) from window to photograph pixels for a camera's shift (px), rotation, log scale
+    and two tilts.
     """
     turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
     centre = (np.array(shape[1::-1]) - 1) / 2
@@ -516,7 +525,7 @@ def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
 
 
 def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the squared distance from the middle of a photograph, 1 in its corners."""
+    """Return the squared distance from the middle of a photograph, scaled to 1 in the corners."""
     y, x = (np.linspace(-1, 1, size) for size in shape)
     return (y[:, None] ** 2 + x**2) / 2
 

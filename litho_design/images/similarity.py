@@ -15,15 +15,15 @@ def matched_scale(image: Tensor, target: Tensor) -> Tensor:
 
 
 def si_psnr_db(image: Tensor, target: Tensor) -> float:
-    """Return -10 log10 mean((c I - T)^2), which does not depend on the scale of the image; its peak is 1 by
-    definition.
+    """Return the PSNR, -10 log10 mean((c I - T)^2), which does not depend on the image's scale; the peak is 1
+    by definition.
     """
     error = (matched_scale(image, target) * image - target).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-30)))
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted
+    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the target's
     light.
     """
     average = (image * target).sum() / target.sum()
@@ -41,7 +41,7 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the structural similarity at each pixel of images in [0, 1]: window 11, sigma 1.5 (Wang et al.
+    """Return the SSIM at each pixel of images in [0, 1], with a window of 11 px and sigma 1.5 (Wang et al.
     2004).
     """
     from skimage.metrics import structural_similarity
@@ -59,7 +59,7 @@ def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
-    """Return SI-PSNR and SSIM of an image (m, m) against its target, and against the target at the element's
+    """Return SI-PSNR and SSIM of an image (m, m) against its target and against the target at the element's
     resolution.
     """
     figures = {}

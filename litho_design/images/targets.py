@@ -1,4 +1,4 @@
-"""Draw wanted images by code, or read them from pictures: values in [0, 1] on a square grid."""
+"""Draw target images, or read them from pictures; their values are in [0, 1] on a square grid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_data.foundation.results import Record
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
-# Number of rows drawn at a time, because a large picture in double precision takes more memory than its
+# Number of rows drawn at a time, because a large picture in double precision needs more memory than its
 # design.
 _ROWS = 256
 
@@ -30,12 +30,12 @@ class TargetRecord(Record):
 
     @classmethod
     def of_file(cls, path: Path, notes: Sequence[str]) -> TargetRecord:
-        """Record a file and its conversions, one phrase each."""
+        """Make the record of a file and its conversions, one phrase each."""
         return cls(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
 
     @classmethod
     def of_array(cls, name: str, pixels: np.ndarray, unit: str) -> TargetRecord:
-        """Record a drawing or an array (ny, nx) that is used unchanged."""
+        """Make the record of a drawing or an array (ny, nx) that is used unchanged."""
         return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
@@ -51,14 +51,14 @@ def object_name(item: ImagedObject) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """A wanted image: float32 (size, size) in [0, 1], row 0 on top, and its record."""
+    """A target image, float32 (size, size) in [0, 1] with row 0 on top, and its record."""
 
     pixels: np.ndarray
     record: TargetRecord
 
 
 def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Target:
-    """Load a wanted image of ``size_px``: a drawing by name, a picture by path, or an array.
+    """Load a target image of ``size_px``: a drawing by name, a picture by path, or an array.
 
     Args:
         source: text, ring, chart, spots or letters; an image file, whose grey values are fitted to the
@@ -88,7 +88,7 @@ def stroke_width_px(pixels: np.ndarray) -> float:
     """
     import cv2
 
-    # At twice the size, strokes of even width also have a middle pixel; its distance to the dark is the
+    # At twice the size, strokes of even width have a middle pixel too, whose distance to the dark is the
     # width.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
@@ -97,10 +97,10 @@ def stroke_width_px(pixels: np.ndarray) -> float:
 
 
 def draw_target(name: str, size_px: int) -> np.ndarray:
-    """Draw a target with anti-aliased edges: float32 (size, size) in [0, 1]."""
+    """Draw a target with anti-aliased edges, float32 (size, size) in [0, 1]."""
     fine = size_px * _OVERSAMPLE
     draw = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name]
-    # Unit square with the origin in the middle, y down.
+    # The drawing lies on a unit square with the origin in the middle and y down.
     place = (np.arange(fine) + 0.5) / fine - 0.5
     picture = np.empty((size_px, size_px), np.float32)
     for first in range(0, size_px, _ROWS):
@@ -116,7 +116,7 @@ def _text(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _letters(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Draw rows of small letters and digits: fine detail in many directions."""
+    """Draw rows of small letters and digits, which have fine detail in many directions."""
     return _words(y, ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
 
 
@@ -158,7 +158,7 @@ def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Draw a 7 x 7 fan-out without its centre."""
+    """Draw a 7 x 7 array of spots without the central one."""
     picture = np.zeros_like(x)
     for row in range(-3, 4):
         for column in range(-3, 4):
@@ -168,8 +168,7 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
-    """Read a picture in grey (ny, nx), with the values of its file; also return the conversions, one phrase
-    each.
+    """Read a picture as grey (ny, nx) with the values of its file, and list the conversions, one phrase each.
 
     Raises:
         InputError: the file does not exist or is not a readable image.
@@ -192,10 +191,10 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
 
 
 def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
-    """Read a picture in grey onto a black square, divided by its brightest value.
+    """Read a picture as grey, place it on a black square, and divide it by its brightest value.
 
     Args:
-        path: any format and bit depth that OpenCV reads; grey values are taken as brightness.
+        path: a file of any format and bit depth that OpenCV reads; grey values are used as brightness.
         size_px: side of the square.
         what: name of the picture in error messages.
 
@@ -210,7 +209,9 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
     found, notes = read_grey(path, what)
     grey: np.ndarray = found.astype(np.float32)
     if not np.isfinite(grey).all():
-        raise InputError(what, got=f"{path} with values that are not numbers", wanted="finite brightness")
+        raise InputError(
+            what, got=f"{path} with values that are not numbers", wanted="finite values of brightness"
+        )
     if grey.max() <= 0:
         raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
     height, width = grey.shape

@@ -21,7 +21,9 @@ from litho_design.tasks.design import DESIGNS
 
 
 class GapEntry(Record):
-    """One design (arm, seed) printed by one judge; ``designed`` is the arm's own expectation."""
+    """One design (arm, seed) printed by one judge; ``designed`` contains the figures that the arm itself
+    expects.
+    """
 
     arm: str
     seed: int
@@ -33,7 +35,7 @@ class GapEntry(Record):
 
 
 class GapSummary(Record):
-    """One figure of one arm under one judge: its mean over seeds with a 95 % interval."""
+    """One figure of one arm under one judge: its mean over seeds with a 95 % confidence interval."""
 
     arm: str
     judge: str
@@ -57,13 +59,14 @@ class PairedDifference(Record):
 
 
 class GapResult(RunFacts, Result):
-    """gap.json."""
+    """The contents of gap.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/gap/1"
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # The types are ordered by their number of fields. Your own task has the fields common to all designs.
+    # The types are ordered by their number of fields, because your own task has only the fields common to all
+    # designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
@@ -80,7 +83,7 @@ def design_folder(out: Path, arm: str, seed: int) -> Path:
 
 
 def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
-    """Return the mean, interval and gap of every figure for every arm and judge."""
+    """Return the mean, confidence interval and gap of every figure for every arm and judge."""
     summary = []
     for (arm, judge), group in _grouped(entries).items():
         for figure in group[0].judged:
@@ -102,7 +105,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """Return the differences of the given figures between every two arms, under each judge."""
+    """Return the differences of the given figures between every pair of arms, under each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))
@@ -121,7 +124,7 @@ def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> l
 
 
 def interval95(values: np.ndarray) -> tuple[float, float] | None:
-    """Return Student's t interval of the mean; None for a single value."""
+    """Return the 95 % confidence interval of the mean (Student's t); None for a single value."""
     if len(values) < 2:
         return None
     from scipy.stats import t

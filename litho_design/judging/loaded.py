@@ -34,7 +34,7 @@ from litho_design.tasks.task import Task, registered_task
 
 
 class LoadedDesign:
-    """The layout of a design folder with its optics and scores, whatever the task.
+    """The layout of a design folder with its optics and scores, for any task.
 
     Attributes:
         folder: folder of the design.
@@ -42,19 +42,19 @@ class LoadedDesign:
         level: layout (size, size).
         expected_um: height (size, size), µm, of the print that the design expects.
         task: the task that the layout was designed for.
-        target: wanted image (size, size) of a hologram; None for other tasks.
-        bench: the optics, from a height map to an image or a PSF.
+        target: target image (size, size) of a hologram; None for other tasks.
+        bench: the optics, which turn a height map into an image or a PSF.
 
     Args:
         folder: a design folder; its arrays are checked against the hashes in the record. A lens of rings has
             levels and heights along a radius instead of a plane.
         device: where prints and waves are computed.
         element: ``thin`` or ``thick`` instead of the design's own (see ``Optics``).
-        band_px: largest number of rows of a band, to print and score a large hologram band by band.
+        band_px: largest number of rows of a band, if a large hologram is printed and scored band by band.
 
     Raises:
-        InputError: an incomplete or altered folder, a task that is not registered here, a device that this
-            machine does not have, or bands for anything but a thin hologram.
+        InputError: the folder is incomplete or was altered, the task is not registered here, this machine
+            does not have the device, or bands are requested for anything but a thin hologram.
     """
 
     def __init__(
@@ -124,7 +124,9 @@ class LoadedDesign:
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """Scale an image to its target, as reports show it; for a PSF, take the root of PSF over peak."""
+        """Scale an image to its target, as reports show it; a PSF becomes the square root of PSF over
+        peak.
+        """
         return self.task.display(image)
 
     @property
@@ -134,7 +136,7 @@ class LoadedDesign:
 
     @property
     def frame_um(self) -> float:
-        """Return the side of a lens's objects, or of the image of another task, µm."""
+        """Return the side of a lens's objects or, for another task, of the image, µm."""
         if not isinstance(self.task, LensTask):
             return self.window_um
         imaging = self.task.settings.imaging

@@ -1,4 +1,4 @@
-"""Level a measured height map of the printed part, and register it onto its layout."""
+"""Level a measured height map of the printed part, and register it to its layout."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
-# With fewer measured pixels the score would describe mainly the filled-in part, not the print.
+# With fewer measured pixels, the score would mainly describe the filled-in part, not the print.
 _SMALLEST_COVERAGE = 0.8
-# Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
+# Levelled prints of the measured layouts have a correlation of 0.9 or more with a model's expectation.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# Dust deviates more than random errors of a print, and over a wider area than a displaced step.
+# The deviation by dust is larger than random errors of a print, and wider than that of a displaced step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # This share of the change that the tip causes remains uncertain.
 _TIP_SD = 0.3
@@ -33,10 +33,10 @@ _TIP_SD = 0.3
 class MeasuredRecord(Record):
     """The scan, its agreement with the expected print, and its processing.
 
-    ``orientation`` is the operation that turns the scan onto the layout. ``tilt_um_per_um`` (x, y) and
-    ``bow_um``, the range of the curved part over the element, were removed. ``noise_um`` is the residual at
-    frequencies at which no print has structure. ``defect_share`` is the share of the element that shows dust
-    or scars instead of the print.
+    ``orientation`` is the operation that brings the scan into the orientation of the layout.
+    ``tilt_um_per_um`` (x, y) and ``bow_um``, the range of the curved part over the element, were removed.
+    ``noise_um`` is the residual at frequencies at which no print has structure. ``defect_share`` is the share
+    of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -62,20 +62,21 @@ class MeasuredRecord(Record):
         found = [] if not self.warning else [self.warning]
         found += ["the scan was used without registration"] if self.aligned else []
         if self.orientation != "identity":
-            found.append(f"the scan was turned onto the layout by {self.orientation}")
+            found.append(f"the orientation of the scan was corrected by {self.orientation}")
         if self.levelling == "none":
-            found.append("nothing was levelled")
+            found.append("no tilt or bow was removed")
         else:
             x, y = self.tilt_um_per_um
             found.append(
-                f"removed a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm"
+                f"a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm were removed"
             )
         if self.defect_share:
-            found.append(f"dust or scars on {100 * self.defect_share:.2g} % of it were left out")
+            found.append(f"dust or scars on {100 * self.defect_share:.2g} % of the element were left out")
         if self.tip_um:
             change = f"{1000 * self.tip_change_um:.0f} nm rms"
             found.append(
-                f"the widening by a tip of {1000 * self.tip_um:.0f} nm was removed, a change of {change}"
+                f"the widening by a tip of {1000 * self.tip_um:.0f} nm radius was removed, which changed the "
+                f"heights by {change}"
             )
         return found
 
@@ -84,9 +85,9 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     """Resample the measured heights of a printed design onto the pixels of its layout.
 
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
-    set so that the medians of measured and designed print agree. Tilt and bow of the scanner are fitted
-    together with the designed print, so that no part of the shape of the design is removed. Unmeasured pixels
-    take their values from the designed print.
+    set so that the medians of the measured and the designed print agree. Tilt and bow of the scanner are
+    fitted together with the designed print, so that no part of the shape of the design is removed. Unmeasured
+    pixels take their values from the designed print.
 
     Args:
         loaded: the design.
@@ -128,9 +129,9 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     if not ncc >= _SMALLEST_NCC:
         raise InputError(
             f"scan {source.path}",
-            got=f"correlation {ncc:.2f} with the print that the design expects",
+            got=f"a correlation of {ncc:.2f} with the print that the design expects",
             wanted=f"at least {_SMALLEST_NCC}",
-            hint="level it: --scan-levelling bow" if source.levelling != "bow" else "",
+            hint="use --scan-levelling bow" if source.levelling != "bow" else "",
         )
     offset = float(np.median(levelled[valid] - expected[valid]))
     complete = np.where(valid, levelled - offset, expected).astype(np.float32)
@@ -157,7 +158,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """Remove the widening by the tip from a scan; return the scan, the tip's radius and the rms change of
+    """Remove the widening by the tip from a scan; return the scan, and the tip's radius and the rms change of
     heights, µm.
     """
     from litho_data.tip import estimate_tip, paraboloid_erosion
@@ -176,8 +177,8 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 
 
 def _defects(off_um: np.ndarray) -> np.ndarray:
-    """Return a mask of dust and scars, from the deviation of a print (ny, nx) from its expectation, µm, free
-    of tilt and bow.
+    """Return a mask of dust and scars from ``off_um`` (ny, nx), the deviation of a print from its expectation
+    without tilt and bow.
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
@@ -209,7 +210,7 @@ def _as_it_lies(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
         raise InputError(
             f"aligned scan {scan.source}",
             got=f"{scan.height_um.shape} px of {own_pitch[0]:g} µm",
-            wanted=f"the pixels of the element: {level.shape} of {pitch_um:g} µm",
+            wanted=f"{level.shape} px of {pitch_um:g} µm, the pixels of the element",
         )
     return _Placed(scan.height_um, np.isfinite(scan.height_um))
 
@@ -225,7 +226,7 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
             f"scan {scan.source} on the layout of the design",
             got=quality.reason,
             wanted="a match",
-            hint="--scan-aligned, if it lies on the pixels of the element",
+            hint="use --scan-aligned if it lies on the pixels of the element",
         )
     height, valid = resample_to_layout(
         scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um
@@ -235,7 +236,7 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan: a map (ny, nx), µm, of zero mean, its slopes (x, y), and the range of the
+    """Tilt and bow of a scan: their map (ny, nx), µm, with zero mean, the slopes (x, y), and the range of the
     bow.
     """
 
@@ -247,7 +248,7 @@ class Background:
 def fitted_background(
     height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
 ) -> Background:
-    """Fit tilt and bow of a scan (ny, nx) by least squares, together with a gain of the expected print."""
+    """Fit tilt and bow of a scan (ny, nx) by least squares, together with the gain of the expected print."""
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
@@ -267,7 +268,7 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield equally plausible prints (ny, nx), µm, with other noise, position, height scale and tip."""
+    """Yield equally plausible prints (ny, nx), µm, that differ in noise, position, height scale and tip."""
     from scipy.ndimage import shift
 
     from litho_data.tip import paraboloid_erosion

@@ -1,4 +1,4 @@
-"""Score photographs: of a hologram's image, or of a known object through a printed lens."""
+"""Score photographs of a hologram's image, or of a known object through a printed lens."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from litho_design.lenses.objects import read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
-# A score with a larger standard deviation cannot decide between designs.
+# A score with a larger standard deviation (dB) cannot decide between designs.
 _LARGEST_SD_DB = 0.5
 # This share of the change that a blur of the camera causes remains uncertain.
 _BLUR_SD = 0.3
 
 
 class PhotoScore(Record):
-    """The figures of a photographed image; it has efficiencies only if the incident power is known."""
+    """The figures of a photographed image, with efficiencies only if the incident power is known."""
 
     si_psnr_db: float
     ssim: float
@@ -87,9 +87,9 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if source.imaged is not None:
         raise InputError(
             "photographed object",
-            got="the design of a hologram",
-            wanted="the design of a lens",
-            hint="no --camera-object",
+            got="one for the design of a hologram",
+            wanted="one only for the design of a lens",
+            hint="leave out --camera-object",
         )
     power = source.power_counts
     if power is not None and not power > 0:
@@ -116,9 +116,9 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
-            got=f"a SI-PSNR uncertain by noise and dark level to {uncertainty['si_psnr_db']:.2f} dB",
+            got=f"an SI-PSNR that noise and dark level make uncertain by {uncertainty['si_psnr_db']:.2f} dB",
             wanted=f"at most {_LARGEST_SD_DB} dB",
-            hint="a longer exposure or the mean of several exposures, and --camera-dark-level",
+            hint="use a longer exposure or the mean of several, and give --camera-dark-level",
         )
     pictures = {f"photograph {photo.record.name}": image.clip(0)}
     return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)
@@ -126,13 +126,13 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
 def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
-    # Rays from two opposite sides of the element make the finest fringes.
+    # Rays from two opposite sides of the element form the finest fringes.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
     return photographed_image(wanted, pitch_um, source, finest_per_um)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Return the figures of a registered photograph (m, m) against its target, and against the target at its
+    """Return the figures of a registered photograph (m, m) against its target and the target at the element's
     resolution.
     """
     share = torch.from_numpy(image).double()
@@ -147,15 +147,14 @@ def score_lens_photo(
 ) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
-    ``photographed_image`` cleans the photograph and registers it on the sensor pixels of the image that the
-    design expects of this object. Then the photograph is deconvolved by Richardson-Lucy with the design's
-    number of iterations. The image of the object must be as large as in the design, otherwise the PSFs do not
-    fit.
+    ``photographed_image`` cleans the photograph and registers it to the image that the design expects of this
+    object, on sensor pixels. Then the photograph is deconvolved by Richardson-Lucy with the design's number
+    of iterations. The image of the object must be as large as in the design; otherwise, the PSFs do not fit.
 
     Args:
-        loaded: a lens's design.
-        source: an upright photograph (a lens turns its image by half a turn), or one whose
-            ``orientation`` says how to turn it upright.
+        loaded: the design of a lens.
+        source: an upright photograph (a lens rotates its image by 180°), or one whose ``orientation`` says
+            how to make it upright.
         printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
 
     Raises:
@@ -208,7 +207,7 @@ def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
             raise InputError(
                 "photographed object",
                 got=f"{imaged!r}, which names two objects of the design",
-                wanted="the path of its picture, with a folder in front",
+                wanted="the path of its picture, including a folder",
             )
         place = names.index(imaged)
         return (*task.objects, *task.tested)[place], items[place]

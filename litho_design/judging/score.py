@@ -1,5 +1,5 @@
-"""Score a design as models print it, as measured or as photographed; the layout is always the printable
-one.
+"""Score a design as predicted by models, as measured or as photographed; it is always the printable layout
+that is scored.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from litho_design.tasks.design import Design
 class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
-    ``uncertainty`` holds one standard deviation of a measured figure; None for models.
+    ``uncertainty`` holds the standard deviation of each measured figure; it is None for models.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"stitching"})
@@ -54,7 +54,7 @@ class JudgedScore(Record):
 
 
 class ScoreResult(RunFacts, Result):
-    """score.json."""
+    """The contents of score.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/score/1"
     FILE_NAME: ClassVar[str] = "score.json"
@@ -71,12 +71,12 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
-    # Gain of the design over doing nothing, if the score compared them.
+    # Gain of the design over the best uncorrected layout, if they were compared.
     gain: float | None = None
 
     @classmethod
     def of(cls, folder: Path, record: Design, scores: list[JudgedScore]) -> ScoreResult:
-        """Make the result of this run for the design in a folder."""
+        """Make the result of this run, for the design in a folder."""
         return cls(
             **run_facts(),
             design=str(folder),
@@ -101,8 +101,9 @@ class Judgement:
 
     Attributes:
         scores: one per judge.
-        pictures: wanted image, image or PSF (m, m) behind each print, as shown, by title; ``side_um`` wide.
-        photos: object, photograph and reconstructions (n, n) of a lens, by title; ``frame_um`` wide.
+        pictures: by title, the target image, and the image or PSF (m, m) behind each print, as reports show
+            them; all are ``side_um`` wide.
+        photos: by title, object, photograph and reconstructions (n, n) of a lens; all are ``frame_um`` wide.
     """
 
     scores: list[JudgedScore]
@@ -118,13 +119,13 @@ def judge_design(
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
 ) -> Judgement:
-    """Score the layout of a design as models print it, as measured, and as photographed.
+    """Score the layout of a design as predicted by models, as measured, and as photographed.
 
     Args:
-        judges: printers; those with the weights of the design's own model are marked as not independent.
+        judges: printers; any with the weights of the design's own model is marked as not independent.
         scan: a measured height map of the printed part.
-        camera: a photograph of the printed hologram's image, or of an object through the printed lens;
-            with ``scan`` it is deconvolved with the PSF of the measured print too.
+        camera: a photograph of the printed hologram's image, or of an object through the printed lens; with
+            ``scan``, it is also deconvolved with the PSF of the measured print.
 
     Raises:
         InputError: a measurement does not match the design.
@@ -163,13 +164,13 @@ def judge_design(
                 uncertainty=photo.uncertainty,
             )
         )
-    wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
+    wanted = {} if loaded.target is None else {"target": loaded.target.cpu().numpy()}
     shown = wanted | {title: loaded.display(image) for title, image in pictures.items()}
     return Judgement(scores, shown, loaded.window_um, photos, loaded.frame_um)
 
 
 def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
-    """Score a predicted or measured print; also return its height minus the designed height."""
+    """Score a predicted or measured print, and compare its height with the designed height."""
     figures, spread = loaded.score(height), None
     measured = isinstance(judge, MeasuredRecord)
     if isinstance(judge, MeasuredRecord):

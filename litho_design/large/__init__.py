@@ -1,1 +1,1 @@
-"""Design elements too large for one process: in bands of rows, shared among processes."""
+"""Design elements too large for one process, in bands of rows that several processes share."""

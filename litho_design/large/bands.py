@@ -45,9 +45,9 @@ class Bands:
         if self.count < self.ranks.count:
             raise InputError(
                 "processes",
-                got=f"{self.ranks.count} for {self.count} bands ({self.size_px} rows, {self.band_px} a band)",
+                got=f"{self.ranks.count} for {self.count} bands ({self.size_px} rows, {self.band_px} each)",
                 wanted="at most one per band",
-                hint="fewer processes, or a smaller --band-px",
+                hint="use fewer processes, or a smaller --band-px",
             )
 
     @property
@@ -75,25 +75,26 @@ class Bands:
         """Refuse bands so narrow that a row would lie in the halos of two other bands.
 
         Raises:
-            InputError: a band has fewer rows than twice the halo, or the last one fewer than the halo.
+            InputError: a band has fewer rows than twice the halo, or the last band has fewer rows than the
+                halo.
         """
         last = self.size_px - (self.count - 1) * self.band_px
         if self.count > 1 and (self.band_px < 2 * halo or last < halo):
             raise InputError(
                 "rows of a band",
-                got=f"{self.band_px} px, and {last} px in the last, with a reach of the printer of {halo} px",
-                wanted=f"at least {2 * halo} and {halo} px",
-                hint="a larger --band-px",
+                got=f"{self.band_px} px, and {last} px in the last one; the printer's reach is {halo} px",
+                wanted=f"at least {2 * halo} px, and {halo} px in the last band",
+                hint="use a larger --band-px",
             )
 
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
-        """Return the rows of this process (rows, x) with ``halo`` rows of both neighbours, zero beyond the
-        element.
+        """Return the rows of this process (rows, x) with ``halo`` rows of both neighbours, and zeros beyond
+        the element.
 
-        At most two bands contribute to the gradient of a row, so the order of summation does not matter.
+        At most two bands contribute to the gradient of a row, so the order of summation has no effect.
         """
         rank, count = self.ranks.rank, self.ranks.count
-        # The neighbour above needs the first rows, the neighbour below the last.
+        # The neighbour above needs the first rows, and the neighbour below needs the last ones.
         ends = {rank - 1: values[:halo], rank + 1: values[len(values) - halo :]}
         parts = [ends.get(other, values[:0]) for other in range(count)]
         sizes = [part.numel() for part in parts]
@@ -113,7 +114,7 @@ def require_reach(printer: Printer) -> None:
     """
     whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     if whole or printer.depends_on_position:
-        why = "the whole image" if whole else "the place in the write field"
+        why = "the whole image" if whole else "the position in the write field"
         raise InputError(
             f"printer {printer.name} for a large element",
             got=f"a print that depends on {why}",

@@ -15,8 +15,8 @@ from litho_design.large.bands import Bands
 
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
-    """Return the figures of an image (size, size), in shares of the incident power, against its target in [0,
-    1].
+    """Return the figures of an image (size, size) in shares of the incident power, compared with its target
+    in [0, 1].
     """
     sums = np.sum([_sums(*_read(image, target, band)) for band in bands.own()], axis=0)
     lit, signal, lit_square, dark, paper, power, square, both, wanted, wanted_square = sums.tolist()

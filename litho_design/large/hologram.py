@@ -1,4 +1,6 @@
-"""The task of a hologram in bands: like a hologram in one piece, but limited to the rows of this process."""
+"""The task of a hologram in bands, which differs from that in one piece by holding only this process's
+rows.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +32,11 @@ from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARG
 from litho_design.tasks.task import Figures, Task
 
 _LEFT_OUT = (
-    "a large element: no polish, process window, baselines, thick element or report, and no scores that "
-    "need the whole image at once"
+    "a large element has no polish, process window, baselines, thick-element score or report, and no scores "
+    "that need the whole image at once"
 )
 _PREVIEW_PX = 1024
-# Settings of light and of search, with the only values that a large element supports.
+# Settings of the light and the search, with the only values that a large element supports.
 LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
@@ -53,18 +55,18 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 class BandedHologram(HologramTask):
     """A hologram whose rows several processes share; each process computes the loss of the whole element.
 
-    All processes run this task with the same arguments and share the file system of the folder. The resulting
-    layout does not depend on their number.
+    All processes run this task with the same arguments and can write to the same folder. The resulting layout
+    does not depend on the number of processes.
 
     Args:
-        settings: settings of the hologram; those of its search are checked by ``only``.
+        settings: settings of the hologram; ``only`` checks the settings of the search.
         printer: frozen model with a finite reach, or nominal heights.
         bands: bands of the element.
-        inputs: contains ``target``, the wanted image (size, size) in [0, 1], in memory or on disk.
+        inputs: contains ``target``, the target image (size, size) in [0, 1], in memory or on disk.
         record: source of the target.
 
     Raises:
-        InputError: light or a printer that a large element does not support.
+        InputError: a large element does not support the light or the printer.
     """
 
     in_one_piece = False
@@ -91,13 +93,13 @@ class BandedHologram(HologramTask):
         ]
 
     def check_printer(self, printer: Printer) -> None:
-        """Refuse a printer whose reach is not finite, or too wide for the bands."""
+        """Refuse a printer whose reach is not finite or is too wide for the bands."""
         require_reach(printer)
         self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
-        """Return the hash of inputs and bands. The bands are included because they decide how sums
-        are rounded, and therefore the layout.
+        """Return a text that identifies the bands, because they decide how sums are rounded, and therefore
+        the layout.
         """
         return f"bands of {self.bands.band_px}"
 
@@ -125,7 +127,7 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Any:
-        """Return the figures of a print (size, size), µm, of an element in one process."""
+        """Return the figures of a print (size, size), µm, if one process holds the whole element."""
         figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
         wave = element_field(height_um, self.bench.grid, self.settings.optics)
         return Figures(**figures, zero_order_share=zero_order_share(wave))
@@ -137,7 +139,7 @@ class BandedHologram(HologramTask):
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Compute the figures of the whole element from disk."""
+        """Compute the figures of the whole element from the arrays on disk."""
         levels, seen, aim = (
             np.load(folder / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )
@@ -148,7 +150,7 @@ class BandedHologram(HologramTask):
         )
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Divide the image by its brightest value, and reduce it to at most 1,024 px a side."""
+        """Divide the image by its brightest value, and reduce it to at most 1,024 px per side."""
         import cv2
 
         side = min(len(seen), _PREVIEW_PX)
@@ -180,14 +182,14 @@ def only(settings: Record, values: dict[str, Any]) -> None:
     """Refuse settings, by path, that a large element does not support.
 
     Raises:
-        InputError: a setting has another value than the one in ``values``.
+        InputError: the value of a setting differs from that in ``values``.
     """
     for path, wanted in values.items():
         given: Any = settings
         for name in path.split("."):
             given = getattr(given, name)
         if given != wanted:
-            hint = "without --large the element is designed in one piece"
+            hint = "without --large, the element is designed in one piece"
             raise InputError(f"{path} of a large element", got=repr(given), wanted=repr(wanted), hint=hint)
 
 

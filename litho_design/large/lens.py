@@ -28,8 +28,8 @@ from litho_design.tasks.task import Task
 
 
 class RadiusMap(CellMap):
-    """Map free rings to the pixels of one radius, (..., rings) to (..., pixels): a ``CellMap`` for a radius
-    instead of a plane.
+    """Map free rings to the pixels of one radius, (..., rings) to (..., pixels), as ``CellMap`` does for a
+    plane.
     """
 
     area: Tensor
@@ -44,7 +44,7 @@ class RadiusMap(CellMap):
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean over the area of each ring of real or complex ``pixels`` along the radius."""
+        """Return the area-weighted mean, over each ring, of real or complex ``pixels`` along the radius."""
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
         return sums[0] / sums[1]
@@ -59,7 +59,7 @@ class RingLens(DirectLensTask):
         tile_px: length of the tiles in which the strip is printed.
 
     Raises:
-        InputError: settings or a printer that a lens of rings does not support.
+        InputError: a lens of rings does not support the settings or the printer.
     """
 
     in_one_piece = radial = False
@@ -70,7 +70,7 @@ class RingLens(DirectLensTask):
         only(settings, LIGHT | rings)
         self.tile_px = tile_px
         Task.__init__(self, settings, printer)
-        self.notes = ["lens of rings: levels and heights along one radius, but no layout of the plane"]
+        self.notes = ["a lens of rings has levels and heights along one radius, but no layout of the plane"]
 
     def check_printer(self, printer: Printer) -> None:
         """Refuse a printer whose reach is not finite."""
@@ -81,16 +81,16 @@ class RingLens(DirectLensTask):
         return "rings"
 
     def make_cells(self) -> CellMap:
-        """Return the map from rings to pixels of the radius."""
+        """Return the map from rings to the pixels of the radius."""
         return RadiusMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return the bench along the radius."""
+        """Return the bench, which computes along the radius."""
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the same bench again, because its matrix takes time to compute; only the lens as modelled is
-        searched.
+        """Return the same bench, because its matrix takes time to compute; the search covers only the lens as
+        modelled.
         """
         return self.bench
 
@@ -114,5 +114,5 @@ class RingLens(DirectLensTask):
         return {RINGS_FILE: levels, RING_HEIGHT_FILE: height_um.cpu().numpy()}
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Return the figures along the radius."""
+        """Return the figures of the lens and its baselines, computed along the radius."""
         return Findings(predicted=self.score(height_um).model_dump(), baselines=self.baselines())

@@ -25,8 +25,8 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """A propagator like that of ``make_propagator`` between equal grids, for a field whose bands of rows are
-    shared.
+    """A propagator like that of ``make_propagator`` between equal grids, for a field whose bands of rows
+    several processes share.
 
     Field and result are the rows of this process, complex64 (rows, size). The kernel is even along both axes,
     so only half of each column of its transform is kept.
@@ -84,7 +84,7 @@ class BandedPropagator:
         return carried
 
     def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
-        """Transform the rows band by band and exchange them for whole columns: (size, own columns)."""
+        """Transform the rows band by band, and exchange them for whole columns (size, own columns)."""
         bands, ranks = self.bands, self.bands.ranks
         rows = self._room(len(bands.rows()), self.length)
         for band in bands.own():
@@ -97,7 +97,7 @@ class BandedPropagator:
         return got.reshape(bands.size_px, width)
 
     def _to_rows(self, columns: Tensor) -> Tensor:
-        """Turn the process's columns (size, columns) back into its rows (rows, length)."""
+        """Exchange the process's columns (size, columns) for its rows (rows, length)."""
         bands, ranks = self.bands, self.bands.ranks
         if ranks.count == 1:
             return columns
@@ -136,7 +136,7 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space; small elements need a period longer than their
+        """Compute the transfer function of free space; for small elements, its period must exceed their
         side.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)

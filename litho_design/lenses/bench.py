@@ -1,4 +1,4 @@
-"""The optics of a lens: a printed height map gives a point spread function and images."""
+"""The optics of a lens, which turn a printed height map into a point spread function and images."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from litho_design.optics.imaging import Blur, bin_pixels
 from litho_design.optics.source import require_one_wave
 from litho_design.printers.layout import LayoutSettings
 
-# Side of the centre in the centre-to-background ratio, as in the paper.
+# Side of the central box in the centre-to-background ratio, as in the paper.
 CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """The common part of the benches of a plane and of rings: aperture, focal window and perfect lens."""
+    """The common part of the benches for a plane and for rings: aperture, focal window and perfect lens."""
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
@@ -37,7 +37,9 @@ class LensOptics(nn.Module):
 
     @property
     def numerical_aperture(self) -> float:
-        """Return the sine of the angle from the focus to the edge of the aperture, on an axis."""
+        """Return the sine of the angle, seen from the focus, between the axis and the edge of the aperture
+        along x or y.
+        """
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
 
@@ -47,12 +49,12 @@ class LensOptics(nn.Module):
         return centre_to_background(psf, centre_px, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return -log(centre-to-background ratio) of a PSF (window, window), and its parts."""
+        """Return the loss of a PSF (window, window), -log(centre-to-background ratio), and its parts."""
         ratio = self.ratio(psf)
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
 
     def radius_um(self) -> Tensor:
-        """Return the distance from the axis of each height, float64, µm."""
+        """Return the distance of each height from the axis, float64, µm."""
         raise NotImplementedError
 
     def ideal_height_um(self) -> Tensor:
@@ -82,7 +84,7 @@ class LensBench(LensOptics):
         return intensity_share(self.propagator(field), self.window)
 
     def radius_um(self) -> Tensor:
-        """Return the distance from the axis of each pixel (size, size)."""
+        """Return the distance of each pixel (size, size) from the axis."""
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
         return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
@@ -107,22 +109,23 @@ class RadialLensBench(LensOptics):
         self._incident = math.pi * (rings * layout.pitch_um) ** 2
 
     def forward(self, ring_height_um: Tensor) -> Tensor:
-        """Return the PSF (window, window) of ring heights (rings,), µm."""
+        """Return the PSF (window, window) of a lens with the ring heights (rings,), µm."""
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
-        # The wave is interpolated, not the intensity, because only the wave is smooth on the scale of a
+        # The wave is interpolated instead of the intensity, because only the wave is smooth on the scale of a
         # pixel.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
     def radius_um(self) -> Tensor:
-        """Return the distance from the axis of the middle of each ring (rings,)."""
+        """Return the distance of the middle of each ring (rings,) from the axis."""
         rings = torch.arange(self.propagator.rings, dtype=torch.float64, device=self.share.device)
         return (rings + 0.5) * self.layout.pitch_um
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
-    """Return the mean intensity of the central box over the mean of the rest of an element-sized image plane.
+    """Return the mean intensity in the central box, divided by that in the rest of an image plane as large as
+    the element.
 
     All light outside the box counts as background, wherever it goes: (1 - box) is spread over the area of the
     element. A ratio computed only within the PSF window would reward light sent outside the window.
@@ -143,9 +146,10 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 
 
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
-    """Return sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
+    """Return sensor images (n, size, size), which are psf * object plus read and photon noise drawn from
+    ``seed``.
 
-    Photon noise is also Gaussian, with the variance of Poisson noise. The gradient treats its standard
+    Photon noise is Gaussian too, with the variance of Poisson noise. The gradient treats its standard
     deviation as constant.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))

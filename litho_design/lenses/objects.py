@@ -28,8 +28,9 @@ def object_stack(
 
     Args:
         objects: names of drawings, and records of pictures.
-        size_px: side of the frame, sensor pixels.
-        pictures: float32 (size, size) in [0, 1] of each picture among the objects, in their order.
+        size_px: side of the frame, in sensor pixels.
+        pictures: pixels of each picture among the objects, float32 (size, size) in [0, 1], in the order of
+            the objects.
 
     Raises:
         InputError: the pixels of a picture are missing or have another size.
@@ -54,16 +55,16 @@ def with_objects(
     """Return the ``settings`` of a computational lens, with your own pictures as objects.
 
     A path is a picture, or a folder whose files, except hidden ones, are all pictures. Without ``held_out``,
-    the last quarter of the pictures in the order of their names, at least two, are held out of the design and
-    only scored. Without ``objects``, the design uses the drawings.
+    the last quarter of the pictures in order of name, but at least two, are held out of the design and only
+    scored. Without ``objects``, the design uses the drawings.
 
     Returns:
         The settings, which contain the name, SHA-256 and conversion of each picture, and the pixels as inputs
         of the task. Without paths, the settings are unchanged and there are no inputs.
 
     Raises:
-        InputError: a task that images no objects, a file that is not a picture, a picture without light or
-            given twice, or too few pictures.
+        InputError: the task images no objects, a file is not a picture, a picture has no light or is given
+            twice, or there are too few pictures.
     """
     if not objects and not held_out:
         return settings, {}
@@ -72,7 +73,7 @@ def with_objects(
             "objects",
             got=f"the {settings.task} task, which images no objects",
             wanted="the computational task",
-            hint="or leave out --objects and --held-out-objects",
+            hint="otherwise, leave out --objects and --held-out-objects",
         )
     kept, tested = (
         [read_object(file, settings.imaging.object_px) for place in paths for file in _files(Path(place))]
@@ -84,7 +85,7 @@ def with_objects(
         kept, tested = kept[:-count], kept[-count:]
     for (pixels, record), (others, _) in itertools.combinations([*kept, *tested], 2):
         if np.array_equal(pixels, others):
-            got = f"{record.name}, a picture that was given already"
+            got = f"{record.name}, a picture given twice"
             raise InputError("objects", got=got, wanted="each picture once")
     if len(tested) < _FEWEST_HELD_OUT or (objects and not kept):
         raise InputError(
@@ -100,11 +101,11 @@ def with_objects(
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
-    """Return one sentence that names the objects if some are pictures, otherwise an empty list."""
+    """Return one sentence that names the objects if some are pictures; otherwise, return an empty list."""
     if all(isinstance(item, str) for item in (*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))
-    return [f"objects of the design: {kept}; held out: {tested}; their conversions are in the record"]
+    return [f"the design uses the objects {kept}; {tested} are held out; the record lists their conversions"]
 
 
 def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:

@@ -1,4 +1,4 @@
-"""Score a lens: its PSF against that of a perfect lens, and its images."""
+"""Score the PSF of a lens against that of a perfect lens, and score its images."""
 
 from __future__ import annotations
 
@@ -19,39 +19,42 @@ _TEST_SEEDS = range(1000, 1003)
 
 
 class LensScore(Record):
-    """Powers are shares of the power on the aperture; lengths are in µm."""
+    """The score of a PSF; powers are shares of the power on the aperture, and lengths are in µm."""
 
-    focusing_efficiency: float = Field(
-        description="power within the focusing radius, share of the aperture's"
-    )
+    focusing_efficiency: float = Field(description="share of the aperture's power within the focusing radius")
     focusing_radius_um: float = Field(description="focusing radius: 3 x ideal FWHM, µm")
     strehl: float = Field(description="peak over the peak of a perfect lens")
     mtf_volume_ratio: float = Field(description="volume of the MTF over that of a perfect lens")
     mtf_half_cutoff: float = Field(description="MTF at half the cut-off NA / wavelength")
     fwhm_um: float = Field(description="full width at half maximum, µm")
-    fwhm_ideal_um: float = Field(description="the same of a perfect lens, µm")
+    fwhm_ideal_um: float = Field(description="full width at half maximum of a perfect lens, µm")
     cbr: float = Field(description="centre-to-background ratio")
-    cbr_ceiling: float = Field(description="the same of a perfect lens: the upper limit")
-    eff_window: float = Field(description="power in the PSF window, share of the aperture's")
+    cbr_ceiling: float = Field(description="centre-to-background ratio of a perfect lens, the upper limit")
+    eff_window: float = Field(description="share of the aperture's power in the PSF window")
 
 
 class ImagingScore(Record):
-    """Means and standard deviations over test objects and noise seeds that the design never used.
+    """The score of images: means and standard deviations over test objects and noise seeds that the design
+    never used.
 
-    ``design`` deconvolves with the PSF that the design expected, ``calibrated`` with the PSF of the print
-    itself; ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
+    ``design`` deconvolves with the PSF that the design expected, and ``calibrated`` with the PSF of the print
+    itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
     """
 
-    mae_direct: float = Field(description="test objects: MAE of the sensor image, best scale")
-    mae_design: float = Field(description="test objects: MAE, deconvolved with the designed PSF")
-    mae_calibrated: float = Field(description="test objects: MAE, deconvolved with the print's own PSF")
-    mae_calibrated_sd: float = Field(description="its standard deviation over objects and noise seeds")
+    mae_direct: float = Field(description="MAE of the sensor image of test objects, at the best scale")
+    mae_design: float = Field(description="MAE of test objects, deconvolved with the designed PSF")
+    mae_calibrated: float = Field(description="MAE of test objects, deconvolved with the print's own PSF")
+    mae_calibrated_sd: float = Field(
+        description="standard deviation of mae_calibrated over objects and noise seeds"
+    )
     psnr_design_db: float = Field(description="PSNR with the designed PSF, dB")
     psnr_calibrated_db: float = Field(description="PSNR with the print's own PSF, dB")
     ssim_direct: float = Field(description="SSIM of the sensor image")
     ssim_design: float = Field(description="SSIM with the designed PSF")
     ssim_calibrated: float = Field(description="SSIM with the print's own PSF")
-    ssim_calibrated_sd: float = Field(description="its standard deviation over objects and noise seeds")
+    ssim_calibrated_sd: float = Field(
+        description="standard deviation of ssim_calibrated over objects and noise seeds"
+    )
 
 
 @torch.no_grad()
@@ -79,7 +82,7 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 
 
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
-    """Return the diameter of the circle whose area lies above half the maximum, µm.
+    """Return the diameter, µm, of a circle as large as the area that lies above half the maximum.
 
     The PSF is interpolated fourfold (zero-padded spectrum), so that its pixels do not limit the result.
     """
@@ -87,20 +90,22 @@ def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
     pad = (fine - 1) * psf.shape[-1] // 2
     image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
-    # A spectrum with an odd side cannot be padded to exactly four times its length.
+    # Padding cannot make a spectrum with an odd side exactly four times as long.
     sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
     area = float((image > image.max() / 2).sum()) * sample_um**2
     return 2 * math.sqrt(area / math.pi)
 
 
 def mtf(psf: Tensor) -> Tensor:
-    """Return |FFT(psf)| / DC, (n, n), zero frequency first."""
+    """Return the MTF, |FFT(psf)| / DC, (n, n), with the zero frequency first."""
     transfer = torch.fft.fft2(psf).abs()
     return transfer / transfer[0, 0]
 
 
 def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
-    """Return the MTF at one frequency, cycles/µm: mean of both axes, linear between samples."""
+    """Return the MTF at one frequency, cycles/µm, as the mean of both axes, interpolated linearly between
+    samples.
+    """
     curve = mtf(psf)
     position = frequency_per_um * psf.shape[-1] * pitch_um
     index = int(position)
@@ -113,8 +118,8 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 def imaging_score(
     psf: Tensor, design_psf: Tensor, objects: Tensor, settings: ImagingSettings
 ) -> dict[str, float]:
-    """Image objects (n, size, size) through ``psf`` and reconstruct them with both PSFs: see
-    ``ImagingScore``.
+    """Image objects (n, size, size) through ``psf`` and reconstruct them with both PSFs (see
+    ``ImagingScore``).
 
     Args:
         psf, design_psf: (window, window), share of the incident power per window pixel.
@@ -139,7 +144,7 @@ def black_images(objects: Tensor) -> dict[str, float]:
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Return each figure of the images of all objects, by draw."""
+    """Return, for each figure, its values over all draws and objects."""
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):
         for image, wanted in zip(images, objects, strict=True):

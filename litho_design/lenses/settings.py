@@ -22,36 +22,37 @@ from litho_design.optimisation.settings import (
 )
 from litho_design.printers.layout import LayoutSettings
 
-# Difference in grey, with white = 1, as in the published code.
+# This is a difference in grey, with white = 1, as in the published code.
 SMOOTH_BELOW = 0.1
 
 LensTaskName = Literal["direct", "computational"]
 
 
 class LensView(Record):
-    """Settings that state aperture, PSF window and search path of a lens.
+    """Aperture, PSF window and search path of a lens.
 
-    ``window_px`` pixels of the layout's pitch are computed around the focus. ``path="radial"`` searches with
-    a strip through the centre and the ring propagator instead of the whole plane. The radial path needs a
-    circular aperture and a ring layout; scores always use the plane.
+    ``window_px`` pixels of the layout's pitch are computed around the focus. With ``path="radial"``, the
+    search uses a strip through the centre and the ring propagator instead of the whole plane. The radial path
+    needs a circular aperture and a ring layout; scores always use the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})
 
     aperture: Literal["square", "circle"] = setting("circle", "Aperture of the lens")
-    window_px: int = setting(254, "Lens: side of the PSF window", unit="px", option="--window-px", ge=16)
+    window_px: int = setting(254, "Side of the PSF window of a lens", unit="px", option="--window-px", ge=16)
     path: Literal["plane", "radial"] = setting(
         "plane", "Search over the whole plane, or over rings along a radius"
     )
 
 
 class ImagingSettings(Record):
-    """Settings of computational imaging: sensor, noise, reconstruction, and the objects of design and test.
+    """Settings of computational imaging: sensor, noise, reconstruction, and objects for the design and the
+    test.
 
     An object is the name of a drawing or the record of a picture (see ``with_objects``). ``read_noise`` is
     the standard deviation relative to a white object behind a lens that focuses all light; the paper does not
     state its read noise. The image of an object is ``object_px * pixel_px`` pixels of the layout wide, and
-    light outside the PSF window does not reach it.
+    light outside the PSF window does not contribute to it.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
@@ -112,24 +113,25 @@ class LensSettings(DesignSettings):
 def lens_settings(
     task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> LensSettings:
-    """Return a preset of the lens with ``changes`` by path; all have rings, a width of 120 µm and a focal
-    length of 400 µm.
+    """Return a preset for a lens with ``changes`` by path; all presets have rings, a width of 120 µm and a
+    focal length of 400 µm.
 
     ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square aperture. The
     rings come from the published code, as the text does not mention them. The paper's display, 36 mm wide at
-    140 mm, is imaged 102.9 µm wide on the sensor: 103 pixels of 1 µm. The PSF window is as wide. We chose the
-    pixel of 1 µm, which samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: the published
-    code has 12 levels, rings as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with
-    half the rate every 25, and smooth L1. It has read and photon noise, its own wavelength and index step,
-    and objects as wide as the lens. docs/from_the_authors_code.md lists what is not reproduced of that code.
-    ``default``: a circular aperture, the Fresnel phase as start, and the ring path in the search.
+    140 mm, is imaged 102.9 µm wide on the sensor: 103 pixels of 1 µm. The PSF window is equally wide. We
+    chose the pixel of 1 µm, which samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: the
+    published code has 12 levels, rings as wide as the diagonal of a pixel, temperature 1, 2000 iterations at
+    a rate of 1 that is halved every 25 iterations, and smooth L1. It has read and photon noise, its own
+    wavelength and index step, and objects as wide as the lens. docs/from_the_authors_code.md lists what is
+    not reproduced of that code. ``default``: a circular aperture, the Fresnel phase as start, and the ring
+    path in the search.
 
     Args:
-        task: focus light, or image and deconvolve; a ``task`` in the changes replaces it.
+        task: focus light, or image and deconvolve; a ``task`` among the changes overrides it.
         variant, changes: as for ``hologram_settings``.
 
     Raises:
-        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+        InputError: a change names an unknown setting, or a value that the setting does not accept.
     """
     return preset(_preset, variant, {"task": task, **(changes or {})})
 

@@ -1,4 +1,4 @@
-"""Lenses as tasks: they turn levels on the pixels into a loss, a score and the saved arrays."""
+"""The tasks of lenses, which turn levels on the pixels into a loss, a score and the saved arrays."""
 
 from __future__ import annotations
 
@@ -38,11 +38,12 @@ from litho_design.tasks.task import Task, register_task
 
 # Figures that are defined even if the lens does not focus.
 _OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
-# The noise is the same in every iteration, so that the search compares layouts, not noise; scores draw other
-# noise.
+# The noise is the same in every iteration, so that the search compares layouts and not noise. Scores draw
+# other noise.
 _DESIGN_NOISE_SEED = 0
 _PLANE_NOTE = (
-    "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
+    "the search ran on the whole plane, not along a radius, because the printer's effects depend on the "
+    "position"
 )
 
 
@@ -53,17 +54,17 @@ def lens_task(settings: LensSettings, printer: Printer, **given: Any) -> LensTas
 
 
 class LensTask(Task):
-    """A lens, ready for ``run_design``: the common part of direct and computational lenses.
+    """The task of designing a lens, for ``run_design``; the common part of direct and computational lenses.
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
         ensemble: further models in the loss, as for ``Task``.
-        inputs: pixels of the objects that are pictures, as ``with_objects`` gives them.
+        inputs: pixels of the objects that are pictures, as ``with_objects`` returns them.
 
     Raises:
-        InputError: a radial search of a layout without rings or with a square aperture, a start that is for
-            holograms, an object without pixels, or spreads beyond the range of the propagator.
+        InputError: the search is radial but the layout has no rings or the aperture is square, the start is
+            for holograms, an object has no pixels, or the spreads exceed the range of the propagator.
     """
 
     starts = ("random", "fresnel")
@@ -103,17 +104,17 @@ class LensTask(Task):
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
 
     def make_bench(self, optics: Optics) -> LensBench:
-        """Return the bench from the element to the focal window."""
+        """Return the bench, which propagates from the element to the focal window."""
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Return a bench along a radius if layout and printers allow one, otherwise a bench of the whole
-        plane.
+        """Return a bench along a radius if layout and printers allow one; otherwise, return a bench of the
+        whole plane.
         """
         if not self.radial:
             return self.make_bench(optics)
         if optics.element == "thick":
-            hint = "--set view.path=plane"
+            hint = "use --set view.path=plane"
             raise InputError(
                 "search path 'radial'", got="a thick element", wanted="a thin element", hint=hint
             )
@@ -124,7 +125,7 @@ class LensTask(Task):
         return self.printed_rings(level, printer) if self.radial else self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
-        """Return the area of the rings."""
+        """Return the area of each ring; None if the search runs on the plane."""
         bench = self.scenes[0][1]
         if not isinstance(bench, RadialLensBench):
             return None
@@ -153,11 +154,11 @@ class LensTask(Task):
         return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self.bench.ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Return the root of the PSF over its peak."""
+        """Return the square root of the PSF over its peak."""
         return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
-        """Return the height (rings,), µm, inside the aperture, from the print of a strip along a radius.
+        """Print a strip along a radius, and return the heights (rings,), µm, inside the aperture.
 
         The strip continues the rings beyond the aperture, as the layout's corners do.
         """
@@ -172,27 +173,27 @@ class LensTask(Task):
 
 @register_task
 class DirectLensTask(LensTask):
-    """A lens that focuses light."""
+    """The task of a lens that focuses light."""
 
     name = "lens-direct"
     headline = ("cbr", "strehl", "focusing_efficiency", "fwhm_um")
     score_type = LensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return -log(centre-to-background ratio)."""
+        """Return the loss, -log(centre-to-background ratio), and its parts."""
         return self.bench.focusing_loss(seen)
 
 
 @register_task
 class ComputationalLensTask(LensTask):
-    """A lens whose image is deconvolved."""
+    """The task of a lens whose image is deconvolved."""
 
     name = "lens-computational"
     headline = ("mae_design", "mae_calibrated", "ssim_calibrated", "strehl", "cbr")
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the error of the objects after Richardson-Lucy deconvolution."""
+        """Return the error of the objects' images after Richardson-Lucy deconvolution, and its parts."""
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
         image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
@@ -204,7 +205,7 @@ class ComputationalLensTask(LensTask):
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
-        """Return the PSF's figures and those of the images of test objects; ``expected_um`` is by default the
+        """Return the figures of the PSF and of the images of test objects; by default, ``expected_um`` is the
         print.
         """
         with torch.no_grad():
@@ -219,21 +220,22 @@ class ComputationalLensTask(LensTask):
 
 def _narrow_window(bench: LensBench) -> list[str]:
     """Return a note if the PSF window is narrower than the focusing circle."""
-    # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
+    # The Airy disc has a full width at half maximum of 0.514 wavelength / NA; the radius of the circle is
+    # three times this width.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
     window_um, enough_px = bench.window.size_um[0], math.ceil(2 * radius_um / bench.layout.pitch_um)
     if window_um >= 2 * radius_um:
         return []
     return [
         f"the PSF window of {window_um:.1f} µm is narrower than the focusing circle (radius "
-        f"{radius_um:.3g} µm), so the focusing efficiency leaves light out; use --window-px {enough_px}"
+        f"{radius_um:.3g} µm), so the focusing efficiency misses light; use --window-px {enough_px}"
     ]
 
 
 @lru_cache(maxsize=8)
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
-    """Return the ring of each pixel of a strip: two central rows, rings 0 to the aperture, and a halo on all
-    sides.
+    """Return the ring of each pixel of a strip that consists of two central rows, from ring 0 to the
+    aperture, and a halo on all sides.
 
     Beyond the last of the ``rings``, the strip repeats that ring.
     """
@@ -254,10 +256,10 @@ def _check(settings: LensSettings) -> None:
     optics = settings.optics
     if radial and (optics.incidence_x or optics.incidence_y or optics.beam_um):
         got, wanted = "oblique incidence or a beam", "uniform light along the axis"
-        raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
+        raise InputError("search path 'radial'", got=got, wanted=wanted, hint="use --set view.path=plane")
     if optics.propagation == "far-field":
         raise InputError(
-            "propagation of a lens", got="far-field", wanted="auto: a lens has its own focal plane"
+            "propagation of a lens", got="far-field", wanted="auto, because a lens has its own focal plane"
         )
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")
@@ -266,7 +268,7 @@ def _check(settings: LensSettings) -> None:
 
 
 def _check_outermost_zone(settings: LensSettings) -> None:
-    """Check that two cells fit into the outermost zone, which is wavelength / sin(angle of the rim) wide."""
+    """Check that two cells fit into the outermost zone, whose width is wavelength / sin(angle of the rim)."""
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_px * layout.pitch_um / 2
     zone_um = optics.wavelength_um * math.hypot(radius_um, optics.distance_um) / radius_um
@@ -274,7 +276,7 @@ def _check_outermost_zone(settings: LensSettings) -> None:
         sine = optics.wavelength_um / (2 * layout.cell_um)
         raise InputError(
             f"cells of {layout.cell_um:g} µm",
-            got=f"an outermost zone of the lens of {zone_um:.3g} µm",
+            got=f"an outermost zone of the lens {zone_um:.3g} µm wide",
             wanted="at least two cells per zone",
-            hint=f"--distance-um {radius_um * math.sqrt(1 / sine**2 - 1):.4g} or more, or smaller cells",
+            hint=f"use --distance-um {radius_um * math.sqrt(1 / sine**2 - 1):.4g} or more, or smaller cells",
         )

@@ -1,4 +1,4 @@
-"""Scalar diffraction in pure, differentiable functions, tested against closed forms."""
+"""Scalar diffraction in pure, differentiable functions, tested against closed-form solutions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Propagate with the band-limited angular spectrum, at distances too short for the sampled kernel."""
+"""Propagate with the band-limited angular spectrum, at distances too short for the sampled
+Rayleigh-Sommerfeld kernel.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +15,23 @@ from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import KernelPropagator, wrapped_order
 from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
 
-# Longest period, pixels along both axes; making the kernel takes half a gibibyte.
+# Longest period along each axis, in pixels; making a kernel of this size takes half a gibibyte.
 _LONGEST_PERIOD = 4096
 
 
 class ASMPropagator(KernelPropagator):
-    """Carry a complex field to a parallel plane with the transfer function of free space.
+    """Propagate a complex field to a parallel plane with the transfer function of free space.
 
     H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so evanescent waves decay instead of
     becoming NaN. The sampled H has a period, up to 4096 pixels, that is long enough to keep its steepest rays
     from wrapping around. Frequencies whose rays are steeper than the period allows are removed (after
     Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). Only the samples of the kernel at separations
-    between the two grids are stored, so padding costs nothing after construction. A negative distance runs
-    the propagating waves backwards and drops the evanescent ones.
+    that occur between the two grids are stored, so padding costs nothing after construction. A negative
+    distance propagates waves backwards and drops evanescent ones.
 
-    With pixels above half a wavelength the steepness of rays is limited, and the result is exact for waves
-    within their band. With smaller pixels, rays up to grazing incidence exist: 1 % of the wave of a rough
-    element is missing or wrapped, and ``RSPropagator`` is the better choice.
+    With pixels larger than half a wavelength, the steepness of rays is limited, and the result is exact for
+    waves within the band of the pixels. With smaller pixels, rays up to grazing incidence exist. Then 1 % of
+    the wave of a rough element is missing or wrapped, and ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of equal pitch; shape and origin are free.
@@ -38,7 +40,7 @@ class ASMPropagator(KernelPropagator):
         dtype: torch.complex64 or torch.complex128.
 
     Raises:
-        InputError: unequal pitches.
+        InputError: the pitches are unequal.
     """
 
     def __init__(
@@ -64,8 +66,8 @@ class ASMPropagator(KernelPropagator):
 
 @dataclass(frozen=True)
 class SpectrumAxis:
-    """One axis: frequencies (cycles/µm), a mask of those kept, samples of the kernel, and the shift between
-    the grids.
+    """One axis of the spectrum: frequencies (cycles/µm), mask of those kept, samples of the kernel, and shift
+    between the grids.
     """
 
     frequency: Tensor
@@ -87,8 +89,8 @@ def spectrum_axes(
 
 
 def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
-    """Return the transfer function of free space, complex128 (y, x); it is 0 at frequencies too steep for the
-    period.
+    """Return the transfer function of free space, complex128 (y, x); it is 0 at frequencies whose rays are
+    too steep for the period.
     """
     fy, fx = y.frequency[:, None], x.frequency[None, :]
     band = y.inside[:, None] & x.inside[None, :]
@@ -116,5 +118,5 @@ def _axis_band(
     # A ray wraps around if it travels one period beyond the far edge of the target.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
-    # At zero distance nothing changes, not even evanescent waves.
+    # At zero distance, nothing changes, not even evanescent waves.
     return SpectrumAxis(frequency, inside | (distance_um == 0), index % length, start)

@@ -1,4 +1,4 @@
-"""Convolve by FFT and compute only the samples that are kept, also in the gradient."""
+"""Convolve by FFT and compute only the samples that are kept; the gradient does the same."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from litho_design.optics.sampling import fast_length
 
 
 class KernelPropagator(nn.Module):
-    """Carry a field from one plane to another by convolution with a kernel.
+    """Propagate a field from one plane to another by convolution with a kernel.
 
-    The kernel's grid is finer than those of source and target by integer factors.
+    The grid of the kernel is finer than those of source and target by integer factors.
 
     Args:
         kernel: complex128 (ky, kx) at the separations of ``wrapped_order``.
@@ -34,7 +34,8 @@ class KernelPropagator(nn.Module):
     ):
         super().__init__()
         self.source, self.target, self._finer = source, target, finer
-        # The buffer is not persistent: it follows from the arguments, so checkpoints need not contain it.
+        # The buffer is not persistent, because it follows from the arguments and checkpoints need not contain
+        # it.
         self.register_buffer("transfer", torch.fft.fft2(kernel).to(dtype), persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -61,8 +62,8 @@ def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int
 
 
 def wrapped_order(here: int, there: int) -> Tensor:
-    """Return the separations, in pixels, between a source of ``here`` and a target of ``there`` pixels,
-    negative ones last.
+    """Return the separations, in pixels, between a source of ``here`` and a target of ``there`` pixels;
+    negative ones come last.
 
     Unused entries repeat a used separation.
     """
@@ -76,7 +77,8 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
     Args:
         field: complex (..., ny, nx).
-        transfer: complex (ky, kx), FFT of the kernel in wrapped order; ky >= ny + my - 1, kx alike.
+        transfer: complex (ky, kx), FFT of the kernel in wrapped order; ky >= ny + my - 1, and likewise for
+            kx.
         out_shape: (my, mx).
 
     Returns:
@@ -86,7 +88,8 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
 
 class _Convolution(torch.autograd.Function):
-    """The adjoint is the same operation with the conjugate transfer function and the two shapes exchanged.
+    """A convolution, whose adjoint is the same operation with the conjugate transfer function and exchanged
+    shapes.
 
     The gradient is written out because autograd would keep padded copies and transform the rows that are
     cropped.

@@ -1,4 +1,4 @@
-"""Propagate to the far field: the focal plane of an ideal lens behind the element, where positions are
+"""Propagate to the far field, the focal plane of an ideal lens behind the element, where positions stand for
 angles.
 """
 
@@ -14,7 +14,7 @@ from litho_data.foundation.grid import PixelGrid
 
 
 class FarFieldPropagator(nn.Module):
-    """Carry a field to the focal plane of an ideal lens.
+    """Propagate a field to the focal plane of an ideal lens.
 
     U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx, where position p corresponds to the sine p / f.
     The sum is exact for any two grids and uses one matrix per axis; pixels are squares (Goodman, Fourier
@@ -25,7 +25,7 @@ class FarFieldPropagator(nn.Module):
         distance_um: focal length f.
 
     Raises:
-        InputError: an image wider than λ f / pitch, beyond which the light of a sampled element repeats.
+        InputError: the image is wider than λ f / pitch, beyond which the light of a sampled element repeats.
     """
 
     along_y: Tensor
@@ -52,7 +52,7 @@ class FarFieldPropagator(nn.Module):
                 torch.from_numpy(grid.y_um if axis == 0 else grid.x_um).double() for grid in (source, target)
             )
             phase = -2 * math.pi / scale * torch.outer(there, here)
-            # A pixel is a square and sends less light sideways than a point.
+            # A pixel is a square, which sends less light sideways than a point does.
             square = torch.sinc(there * source.pitch_um[axis] / scale)[:, None].expand_as(phase)
             matrix = torch.polar(square * (source.pitch_um[axis] / math.sqrt(scale)), phase)
             self.register_buffer(name, matrix.to(dtype), persistent=False)

@@ -9,15 +9,15 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Number of steps in a block that the backward pass recomputes. If all steps fit into the memory below, at
-# about twenty values per pixel and step, they are kept instead.
+# Number of steps in a block that the backward pass recomputes. If all steps fit into the memory stated below,
+# at about twenty values per pixel and step, they are kept instead.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """Apply x -> psf * x on the object's frame, dark outside it; the operation is linear and does not wrap
-    around.
+    """Blur an object x to psf * x on its frame. Outside the frame it is dark; the operation is linear and
+    does not wrap around.
 
     The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
@@ -53,7 +53,7 @@ class Blur:
 
 
 def bin_pixels(image: Tensor, factor: int) -> Tensor:
-    """Sum blocks of ``factor`` x ``factor`` pixels: power per coarse pixel, (..., ny / f, nx / f)."""
+    """Sum blocks of ``factor`` x ``factor`` pixels to the power per coarse pixel, (..., ny / f, nx / f)."""
     blocks = image.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor))
     return blocks.sum((-3, -1))
 
@@ -61,16 +61,16 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
 def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tensor:
     """Estimate the object behind a recorded image.
 
-    e <- e * H^T (b / H e) / (H^T 1), from a flat start of the right flux (Richardson 1972, Lucy 1974). The
-    division by H^T 1 makes the result correct at the borders and for a PSF with any sum: the estimate
-    approaches the object itself, and sum(H e) = sum(b) after every step.
+    Each step is e <- e * H^T (b / H e) / (H^T 1), from a flat start with the right flux (Richardson 1972,
+    Lucy 1974). The division by H^T 1 makes the result correct at the borders and for a PSF with any sum: the
+    estimate approaches the object itself, and sum(H e) = sum(b) after every step.
 
     Args:
         recorded: image (..., ny, nx); negative values (read noise) count as dark.
         psf: real (k, k) of odd sides, on the same pixels.
 
     Returns:
-        Estimate (..., ny, nx); gradients flow to both arguments. For large images the backward pass
+        Estimate (..., ny, nx); gradients flow to both arguments. For large images, the backward pass
         recomputes the steps block by block, so memory does not grow with ``iterations``.
     """
     blur = Blur(psf, (int(recorded.shape[-2]), int(recorded.shape[-1])))

@@ -1,4 +1,4 @@
-"""Choose the propagator of a scene: the requested one, or one that is valid at its distance."""
+"""Choose the propagator of a scene: the requested one, or one that is valid at the scene's distance."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Propagator = RSPropagator | ASMPropagator | FarFieldPropagator
 def make_propagator(
     source: PixelGrid, target: PixelGrid, optics: Optics, *, dtype: torch.dtype = torch.complex64
 ) -> Propagator:
-    """Carry waves from ``source`` to ``target`` in ``optics``.
+    """Make the propagator of waves from ``source`` to ``target`` in ``optics``.
 
-    ``auto`` takes the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter distances it
-    takes the angular spectrum, whose period is then long enough without further padding. ``far-field`` takes
+    ``auto`` uses the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter distances, it
+    uses the angular spectrum, whose period is then long enough without further padding. ``far-field`` uses
     the distance as the focal length of an ideal lens.
 
     Raises:
-        InputError: a distance below the sampling limit if ``rayleigh-sommerfeld`` is requested, or unequal
-            pitches for the angular spectrum.
+        InputError: the distance is below the sampling limit and ``rayleigh-sommerfeld`` is requested, or the
+            pitches are unequal and the angular spectrum is used.
     """
     kind: type[Propagator] = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
     if optics.propagation == "far-field":

@@ -14,11 +14,11 @@ _CHUNK_ENTRIES = 1 << 23
 
 
 class RadialPropagator(nn.Module):
-    """Carry a field of concentric rings to points at given radii of a parallel plane.
+    """Propagate a field of concentric rings to points at given radii of a parallel plane.
 
     U(p) = sum over rings of u times the integral of h over the ring, with h as in ``RSPropagator``. Each ring
-    is integrated with two Gauss-Legendre nodes across it and the midpoint rule around it. The midpoint rule's
-    error on a periodic integrand falls exponentially once the phase is resolved.
+    is integrated with two Gauss-Legendre nodes across it and the midpoint rule around it. For a periodic
+    integrand, the error of the midpoint rule falls exponentially once the phase is resolved.
 
     Args:
         rings: number of rings; ring i covers radii [i, i + 1) * ring_width_um.
@@ -27,7 +27,7 @@ class RadialPropagator(nn.Module):
         distance_um, wavelength_um: as in ``RSPropagator``.
 
     Raises:
-        InputError: a distance that is not positive.
+        InputError: the distance is not positive.
     """
 
     matrix: Tensor
@@ -54,7 +54,7 @@ class RadialPropagator(nn.Module):
 
     @property
     def ring_area_um2(self) -> Tensor:
-        """Return the area of each ring, float64 (rings,), µm^2; |u|^2 summed with these areas is a power."""
+        """Return the area of each ring, float64 (rings,), µm^2; the sum of |u|^2 times area is a power."""
         return math.pi * self.ring_width_um**2 * (2 * torch.arange(self.rings, dtype=torch.float64) + 1)
 
     def forward(self, field: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
-# Replicas of the spectrum lie at 1/pitch; two decay lengths of the evanescent wave at this frequency leave
-# 4e-6.
+# Replicas of the spectrum lie at 1/pitch; after two decay lengths, 4e-6 of the evanescent wave at this
+# frequency remains.
 _DECAY_LENGTHS = 2.0
 
 
@@ -27,8 +27,8 @@ def centred_grid(
 def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float) -> float:
     """Return the smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
 
-    Far from the axis the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below the
-    Nyquist frequency of the source. Close to the axis the evanescent replicas must have decayed.
+    Far from the axis, the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below the
+    Nyquist frequency of the source. Close to the axis, the evanescent replicas must have decayed.
     """
     limit = 0.0
     for axis in range(2):
@@ -58,7 +58,7 @@ def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wav
 
 
 def fast_length(length: int) -> int:
-    """Return the next size for which the FFT is fast (factors 2, 3 and 5 only)."""
+    """Return the smallest size of at least ``length`` for which the FFT is fast (factors 2, 3 and 5 only)."""
     from scipy.fft import next_fast_len  # imported late to save the command line a tenth of a second
 
     found: int = next_fast_len(length, real=True)

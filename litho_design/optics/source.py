@@ -1,4 +1,4 @@
-"""Light from an incoherent source of some width and bandwidth, instead of one plane wave of one colour."""
+"""Light from an extended or broadband incoherent source, instead of one plane wave of one colour."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_design.optics.thin_element import Optics
 
-# Points of a source per (wavelength / side)^2 of its area in sines: they lie closer together than an element
-# resolves.
+# Number of points per (wavelength / side)^2 of the area of a source in sines; these points lie closer
+# together than an element resolves.
 _POINTS_PER_AREA = 3
 _FEWEST = 8
 _MOST = 128
@@ -18,13 +18,13 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
-    """Return plane waves of one colour whose images add up to the image of the source, each with its share of
-    the light.
+    """Return the share of the light, and the optics, of plane waves of one colour whose images add up to that
+    of the source.
 
     Colours sample a Gaussian spectrum by Gauss-Hermite quadrature. Directions are spread evenly on a disc of
     sines around the direction of ``optics``. The images of neighbouring waves are closer than lambda z / D,
-    the finest detail of an element of side D. A point source of one colour is returned unchanged, as one
-    part.
+    the finest detail of an element of side D. For a point source of one colour, the only part is ``optics``
+    itself.
 
     Args:
         size_um: side of the element.
@@ -59,7 +59,7 @@ def _directions(optics: Optics, size_um: float) -> list[tuple[float, float]]:
     area = math.pi * (optics.source_sine * size_um / optics.wavelength_um) ** 2
     count = _checked(max(_FEWEST, math.ceil(_POINTS_PER_AREA * area)), "width")
     number = np.arange(count)
-    # The points lie on a sunflower spiral, so that each covers the same area.
+    # The points lie on a sunflower spiral, so that all cover the same area.
     disc = optics.source_sine * np.sqrt((number + 0.5) / count) * np.exp(1j * _GOLDEN_ANGLE * number)
     disc += complex(*middle) - disc.mean()
     return [(one.real, one.imag) for one in disc.tolist()]
@@ -69,17 +69,17 @@ def _checked(count: int, what: str) -> int:
     if count > _MOST:
         raise InputError(
             f"{what} of the source",
-            got=f"{count} waves, which an element of this size resolves",
+            got=f"{count} waves, because an element of this size resolves so many",
             wanted=f"at most {_MOST}",
         )
     return count
 
 
 def require_one_wave(optics: Optics, what: str) -> None:
-    """Refuse a source of some width or bandwidth where only one plane wave is computed.
+    """Refuse an extended, broadband or near source where only one plane wave is computed.
 
     Raises:
-        InputError: such a source.
+        InputError: the source is not a distant point source of one colour.
     """
     if optics.bandwidth_um or optics.source_sine or optics.source_distance_um:
         raise InputError(

@@ -1,4 +1,6 @@
-"""The stroke of a print, and how much light a staircase with this stroke sends into a diffraction order."""
+"""The stroke of a print, and the share of light that a staircase with this stroke sends into a diffraction
+order.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels, seen as one period of a blaze; None for figures that need a full
-    wave.
+    """Printed heights of the levels, treated as one period of a blaze; figures for one wave are None if the
+    gain is not positive.
     """
 
     printed_height_um: list[float]
@@ -40,7 +42,7 @@ def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
 def measure_stroke(
     printed_height_um: Sequence[float], wave_height_um: float, *, level_height_um: float
 ) -> Stroke:
-    """Return the efficiency of the printed levels, seen as one period of a blaze.
+    """Return the stroke of the printed levels, and their efficiency as one period of a blaze.
 
     Args:
         printed_height_um: printed height of a wide uniform area of each level, µm.
@@ -48,7 +50,7 @@ def measure_stroke(
         level_height_um: nominal step, µm.
 
     Returns:
-        The stroke, its efficiency in the first and zero order as a blaze, and the number of levels (or the
+        The stroke, its efficiency as a blaze in the first and zero order, and the number of levels (or the
         step height) with which the print would reach one wave.
     """
     count = len(printed_height_um)

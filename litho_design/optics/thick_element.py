@@ -1,4 +1,4 @@
-"""The wave propagation method: send light through a relief of finite height, slice by slice."""
+"""The wave propagation method, which sends light through a relief of finite height, slice by slice."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ import math
 import torch
 from torch import Tensor
 
-# Slices are a twentieth of a wave high: halving them changes a blaze of 1.6 µm period by less than 0.002.
+# Slices are a twentieth of a wave high, because halving them changes a blaze of 1.6 µm period by less than
+# 0.002.
 _SLICES_PER_WAVELENGTH = 20
 
 
 def wave_through_relief(
     field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
 ) -> Tensor:
-    """Return the wave behind a relief, from the wave at its foot; the result is propagated back to the
-    foot, as for a thin element.
+    """Return the wave behind a relief from the wave at its foot, propagated back to the foot as for a thin
+    element.
 
-    In every slice the wave is propagated by the angular spectrum twice, in the resist and in air, and each
-    pixel takes the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the
-    surface cuts mixes both waves by their shares, so that gradients flow. One reflection at normal incidence
-    is included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air
-    to the foot, the plane of a thin element. The field is periodic beyond the borders.
+    In every slice, the angular spectrum propagates the wave twice, in the resist and in air, and each pixel
+    keeps the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the surface
+    cuts mixes both waves by their shares, so that gradients flow. One reflection at normal incidence is
+    included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air to
+    the foot, the plane of a thin element. The field is periodic beyond the borders.
 
     Args:
         field: complex (..., ny, nx) at the foot of the relief, inside the resist.
-        height_um: real (..., ny, nx), not below 0, µm.
+        height_um: real heights (..., ny, nx) of 0 or more, µm.
         index: refractive index of the resist; above the relief is air.
     """
     highest_um = float(height_um.detach().max())

@@ -71,8 +71,8 @@ class Optics(Record):
     )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum", "far-field"] = setting(
         "auto",
-        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, the valid one of these two, or the "
-        "far field in the focal plane of a lens",
+        "Propagator: the valid one of the next two (auto), the Rayleigh-Sommerfeld sum, the angular "
+        "spectrum, or the far field in the focal plane of a lens",
         option="--propagation",
     )
     element: ElementKind = setting(
@@ -80,10 +80,12 @@ class Optics(Record):
         "Element: one phase per pixel (thin), or the wave propagation method through the relief (thick)",
         option="--element",
     )
-    dispersion: Resin = setting("ip-dip", "Resin whose dispersion is used if the wavelength varies")
+    dispersion: Resin = setting("ip-dip", "Resin whose dispersion applies if the wavelength varies")
 
     def at_wavelength(self, wavelength_um: float) -> Optics:
-        """Return the same optics at another wavelength, with the resin's index step at this wavelength."""
+        """Return the same optics at another wavelength, with the index step of the resin at this
+        wavelength.
+        """
         there, here = (refractive_index(self.dispersion, one) for one in (wavelength_um, self.wavelength_um))
         step = self.index_step + there - here
         return self.model_copy(update={"wavelength_um": wavelength_um, "index_step": step})
@@ -105,10 +107,9 @@ def element_field(
     """Return the wave just behind a phase element that a plane wave of unit power illuminates.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
-    This wave is multiplied by a Gaussian beam and the wave of a near point if the optics have them, and
-    scaled so that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are
-    therefore a share of the incident power. For a thick element in air, ``wave_through_relief`` replaces the
-    phase.
+    If the optics have a Gaussian beam or a near point source, the wave is multiplied by these. It is scaled
+    so that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are therefore
+    shares of the incident power. For a thick element in air, ``wave_through_relief`` replaces the phase.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -145,7 +146,7 @@ def element_field(
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the wave behind a thick element in air that ``field`` (..., ny, nx) illuminates; it is dark
+    """Return the wave behind a thick element in air that ``field`` (..., ny, nx) illuminates, with darkness
     around the element.
     """
     import torch

@@ -25,7 +25,7 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """State the estimate in one line: for the iterations left after ``done``, and for scores and
+        """State in one line the estimate for the iterations left after ``done``, for scores and for the
         report.
         """
         left = search.iterations - done
@@ -33,8 +33,8 @@ class Budget(Record):
         minutes = (searched + left / search.evaluate_every * self.seconds_per_evaluation + seconds_after) / 60
         what = f"{left} more iterations" if done else f"{search.iterations} iterations"
         return (
-            f"estimate: {what} of {self.seconds_per_iteration:.2f} s, "
-            f"about {minutes:.1f} min with scores and page; peak memory {self.peak_memory_gib:.2f} GiB"
+            f"estimate: {what} of {self.seconds_per_iteration:.2f} s each, about {minutes:.1f} min "
+            f"including scores and report; peak memory {self.peak_memory_gib:.2f} GiB"
         )
 
 
@@ -65,7 +65,7 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Return the highest memory use so far: of the device for CUDA, otherwise of the process."""
+    """Return the highest memory use so far, of the device for CUDA and otherwise of the process."""
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

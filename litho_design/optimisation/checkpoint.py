@@ -44,7 +44,9 @@ class SearchState:
 def save_checkpoint(
     path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Any], seconds: float
 ) -> None:
-    """Write the state of a search and of its parts; ``fingerprint`` says to which task they belong."""
+    """Write the state of a search and of its parts; ``fingerprint`` identifies the task to which they
+    belong.
+    """
     found = vars(state) | {"earlier_seconds": seconds}
     states = {name: part.state_dict() for name, part in stateful.items()}
     content = states | {"fingerprint": fingerprint, "found": found}
@@ -55,17 +57,18 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Any], device: torch.device
 ) -> SearchState:
-    """Load the parts in place from a checkpoint, and return its state on ``device``.
+    """Load the parts of a search in place from a checkpoint, and return the state of the search on
+    ``device``.
 
     Raises:
-        InputError: the checkpoint is of another task, or the file is damaged.
+        InputError: the checkpoint belongs to another task, or the file is damaged.
     """
     content = _load(path)
     if content["fingerprint"] != fingerprint:
         raise InputError(
             f"checkpoint {path}",
-            got="a run with other settings",
-            wanted="the same settings, target and model",
+            got="a checkpoint of a run with another setting, target or model",
+            wanted="the settings, target and model of this run",
             hint="choose another --out, or delete the checkpoint to start again",
         )
     for name, part in stateful.items():
@@ -89,7 +92,8 @@ def finished_iterations(folder: Path, ranks: Ranks) -> int:
     Return 0 if there is no such run.
 
     Raises:
-        InputError: the processes differ in their iterations, or their number has changed.
+        InputError: the processes have finished different numbers of iterations, or the number of processes
+            has changed.
     """
     path = checkpoint_path(folder, ranks.part)
     done = int(_load(path)["found"]["iteration"]) if path.exists() else 0
@@ -97,9 +101,9 @@ def finished_iterations(folder: Path, ranks: Ranks) -> int:
     if not alike or (not done and any(folder.glob("checkpoint*.pt"))):
         raise InputError(
             f"checkpoints in {folder}",
-            got="checkpoints of another number of processes, or of different iterations",
-            wanted=f"one of the same iteration from each of {ranks.count}",
-            hint="start as many processes as before, or delete them to start again",
+            got="checkpoints from another number of processes, or of different iterations",
+            wanted=f"checkpoints of the same iteration, one from each of {ranks.count} processes",
+            hint="start as many processes as the interrupted run had, or delete the checkpoints to restart",
         )
     return done
 
@@ -119,6 +123,6 @@ def _load(path: Path) -> dict[str, Any]:
             f"checkpoint {path}",
             got="a damaged file",
             wanted="the checkpoint of an interrupted run",
-            hint="delete it to start again",
+            hint="delete the file to start again",
         ) from None
     return content

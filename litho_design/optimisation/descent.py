@@ -21,11 +21,12 @@ def descended(
     iterations: int,
     project: Callable[[], object] = lambda: None,
 ) -> tuple[T, float]:
-    """Minimise ``loss`` by Adam; return the second result of the best step, and its loss.
+    """Minimise ``loss`` by Adam; return the result of the step with the lowest loss, and that loss.
 
     Args:
         free: the numbers to change, in place.
-        loss: returns the loss at their current values, and a result that later steps do not change.
+        loss: function that returns the loss at the current numbers, and a result that later steps do not
+            change.
         project: called after every step, to bring the numbers back into their range.
     """
     optimiser = torch.optim.Adam(free, lr=rate)

@@ -1,4 +1,4 @@
-"""Free parameters and the layout that they describe: cells or rings, with Gumbel-Softmax or rounded
+"""Free parameters and the layout that they describe: cells or rings, by Gumbel-Softmax or by rounded
 heights.
 """
 
@@ -13,10 +13,10 @@ from litho_design.optimisation.process_window import blurred
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
-# A learning rate of 1 moves a height by one of 13 levels, and by the same share of the height with more or
-# fewer levels.
+# With 13 levels, a learning rate of 1 moves a height by one level; with more or fewer levels, it moves the
+# height by the same share of the range.
 _RATE_STEPS = 12
-# This width is in levels, so that the first step can reach the neighbours of the starting level.
+# This width, in levels, lets the first step reach the neighbours of the starting level.
 _START_SPREAD_LEVELS = 1.0
 
 
@@ -56,7 +56,9 @@ class CellMap(nn.Module):
         return values.repeat_interleave(self.cell_px, -1).repeat_interleave(self.cell_px, -2)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean over each cell of real or complex ``pixels`` (size, size); empty rings give 0."""
+        """Return the mean of real or complex ``pixels`` (size, size) over each cell; the mean of an empty
+        ring is 0.
+        """
         if not self.radial:
             blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
             return blocks.mean((-3, -1))
@@ -67,7 +69,7 @@ class CellMap(nn.Module):
 
 
 class GumbelLevels(nn.Module):
-    """A categorical distribution over levels per cell, sampled with Gumbel-Softmax.
+    """One categorical distribution over levels for each cell, sampled with Gumbel-Softmax.
 
     A sample is the expected level under the sampled weights (Jang, Gu and Poole 2017, arXiv:1611.01144).
     """
@@ -96,7 +98,9 @@ class GumbelLevels(nn.Module):
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Centre the distribution on ``levels`` (real, *cells) with Gaussian ``jitter_levels``."""
+        """Centre the distributions on ``levels`` (real, *cells) plus Gaussian noise of sd
+        ``jitter_levels``.
+        """
         levels = _jittered(levels.to(self.logits), jitter_levels, seed, self.levels)
         ladder = torch.arange(self.levels, device=self.logits.device).view(-1, *[1] * levels.dim())
         self.logits.copy_(-((ladder - levels) ** 2) / (2 * _START_SPREAD_LEVELS**2))
@@ -112,9 +116,9 @@ class GumbelLevels(nn.Module):
 
 
 class DirectLevels(nn.Module):
-    """One real level per cell, filtered if the layout says so.
+    """One real level per cell, filtered if the layout has a cell filter.
 
-    With ``hard``, rounding passes the gradient straight through.
+    With ``hard``, levels are rounded, and the gradient passes straight through the rounding.
     """
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -142,7 +146,7 @@ class DirectLevels(nn.Module):
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Start at ``levels`` (real, *cells) with Gaussian ``jitter_levels``."""
+        """Start at ``levels`` (real, *cells) plus Gaussian noise of sd ``jitter_levels``."""
         self.height.copy_(_jittered(levels.to(self.height), jitter_levels, seed, self.levels))
 
     @torch.no_grad()
@@ -153,7 +157,9 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Clamp levels to the range, which an optimiser may leave if it does not call ``project``."""
+        """Clamp levels to the range, because an optimiser step that is not followed by ``project`` may leave
+        it.
+        """
         return self._filtered().clamp(0, self.levels - 1)
 
     def _filtered(self) -> Tensor:
@@ -176,7 +182,9 @@ def make_parametrisation(
         return DirectLevels(layout, cells)
     if layout.cell_filter_um:
         raise InputError(
-            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions cannot be filtered"
+            "cell filter",
+            got="the parametrisation gumbel",
+            wanted="direct, because distributions cannot be filtered",
         )
     return GumbelLevels(layout, cells)
 

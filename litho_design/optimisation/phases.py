@@ -1,5 +1,5 @@
-"""Find the wanted phases (Gerchberg-Saxton for images, Fresnel for lenses) and the printed levels nearest to
-them.
+"""Find the phases that a design needs (Gerchberg-Saxton for images, Fresnel for lenses) and the printed
+levels nearest to them.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from litho_design.optimisation.parameters import CellMap
 
 # A wave has no phase if its amplitude is below this, relative to that of the element.
 _DARK = 1e-12
-# After a start from phases that are random on the whole circle, one in six pairs of neighbouring cells ends
-# more than half a wave apart. Printing rounds off such a step, and the search does not repair it. A nearly
-# flat start ends with a third fewer of these steps, and different seeds still give different results.
+# If the search starts from phases that are random on the whole circle, one in six pairs of neighbouring cells
+# ends more than half a wave apart. Printing rounds off such a step, and the search does not repair it. A
+# nearly flat start ends with a third fewer of these steps, and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -40,20 +40,20 @@ def gerchberg_saxton(
     adjoint sends the correction back, and the result is projected on the phases of the element: u' = Pi(u +
     P^H (a exp(j arg P u) - P u)). The norm of P is at most one, so this step majorises the squared amplitude
     error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al.
-    2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is missing. This form gains
-    uniformity but loses the guarantee that the error never rises. The start phases are half a turn, the
-    middle of levels that make a full wave, plus or minus up to a radian.
+    2007, doi:10.1364/OE.15.001913) raises the target amplitude where light is missing. This form improves
+    uniformity but loses the guarantee that the error never rises. The start phases are pi, the middle of the
+    range of levels that make a full wave, plus or minus up to one radian.
 
     Args:
-        propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
-        target: wanted intensity (size, size) in [0, 1].
+        propagator: RSPropagator or ASMPropagator on square grids with the pixel pitch of the element.
+        target: target intensity (size, size) in [0, 1].
         cells: the element's free cells.
         counted: pixels whose amplitude is prescribed, bool (size, size); elsewhere the wave is kept as it is.
-            The wanted amplitude is then scaled to the light on these pixels.
+            The target amplitude is then scaled to the light on these pixels.
         level_phase: printed phase of each level, radian (levels,); if given, the second half of the
             iterations projects on these phases instead of on the whole circle.
-        total: sums over the pixels of the whole element, if cells and target are a part of it; otherwise
-            None.
+        total: function that sums over the pixels of the whole element, if cells and target cover only a part
+            of it; otherwise None.
 
     Returns:
         Phase per cell, radian, and the amplitude error sqrt(sum (|P u| - a)^2) before each step.
@@ -105,10 +105,11 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels nearest to a lens's ``phase`` plus the constant phase that loses the least light.
+    """Return the levels nearest to the ``phase`` of a lens plus the constant phase that loses the least
+    light.
 
-    A stroke below one wave leaves a gap in the phase circle, and a constant phase shift moves this gap. The
-    mean of exp(j error) over the cells is the amplitude at the focus.
+    If the stroke is below one wave, the levels leave a gap in the phase circle, which a constant phase moves.
+    The mean of exp(j error) over the cells is the amplitude at the focus.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

@@ -25,7 +25,7 @@ def polish_levels(
 
     Args:
         levels: int64 (*cells).
-        rounds: evaluations with gradient.
+        rounds: number of evaluations with gradient.
 
     Returns:
         Levels, int64 (*cells), and the loss after each accepted round, starting value first.
@@ -52,7 +52,7 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate the gain of the best one-level move of each cell to first order.
+    """Estimate, to first order, the gain of the best one-level move of each cell.
 
     Return gain, move (-1 or +1) and loss.
     """

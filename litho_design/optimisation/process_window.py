@@ -1,4 +1,4 @@
-"""The process window: random prints and optics that differ from the model, and models that differ."""
+"""The process window: random prints and optics that deviate from the model, and models that disagree."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# A print passes if no figure in dB falls further than the first value below the print as modelled, every
-# other figure keeps the second value as a share, and no error grows by more than the inverse of this share.
+# A print passes if each figure in dB is at most the first value below that of the print as modelled, every
+# other figure is at least the second value times the modelled one, and no error exceeds the modelled one
+# divided by the second value.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
 # (1e-6 µm)^2 is far below any height and keeps the root differentiable where all models agree.
@@ -29,12 +30,13 @@ _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelengt
 
 
 class ProcessWindow(Record):
-    """The spread of prints and optics, and its weight in a search.
+    """The spread of prints and optics, and how a search uses it.
 
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. With ``samples`` above 0, a search minimises the mean loss of the worst ``tail`` share of that many
-    draws; every iteration uses the same draws. The defaults are guesses; replace them by the spreads of your
-    printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
+    draws; every iteration uses the same draws. The defaults are guesses; replace them with the spreads of
+    your printer. The fields of one measured data set vary by 13 % in gain, including the scale of the
+    microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -47,21 +49,23 @@ class ProcessWindow(Record):
     blur_sd_um: float = setting(
         0.05, "Spread of the additional blur of a print", unit="µm", option="--blur-sd-um", ge=0
     )
-    defocus_sd_um: float = setting(3.0, "Spread of the distance", unit="µm", option="--defocus-sd-um", ge=0)
+    defocus_sd_um: float = setting(
+        3.0, "Spread of the distance to the image plane", unit="µm", option="--defocus-sd-um", ge=0
+    )
     wavelength_sd_um: float = setting(
         0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
     )
     samples: int = setting(
         0,
-        "Draws of the process window in the loss; 0 designs for the nominal print only",
+        "Number of draws of the process window in the loss; 0 designs for the nominal print only",
         option="--robust-samples",
         ge=0,
     )
     tail: float = setting(
-        0.25, "Share of the worst draws whose mean loss is minimised", option="--risk-tail", gt=0, le=1
+        0.25, "Share of draws, the worst ones, whose mean loss is minimised", option="--risk-tail", gt=0, le=1
     )
     seed: int = setting(0, "Seed of the draws")
-    yield_draws: int = setting(100, "Random prints of the yield", option="--yield-draws", ge=2)
+    yield_draws: int = setting(100, "Number of random prints for the yield", option="--yield-draws", ge=2)
 
 
 def spreads(window: ProcessWindow) -> list[str]:
@@ -86,8 +90,8 @@ class Draw:
         """Apply this draw to a printed map (size, size), or to rings (n,) from the centre; return the height,
         µm.
 
-        A uniform offset changes no image, only the scores of heights. Rings are blurred along the radius
-        only, which is exact for rings that are far from the centre or much wider than the blur.
+        A uniform offset changes no image, only the scores of heights. Rings are blurred only along the
+        radius, which is exact for rings far from the centre or much wider than the blur.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -95,14 +99,16 @@ class Draw:
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
-    """Return ``count`` draws from ``window.seed``; a longer list begins with the draws of a shorter one.
+    """Return ``count`` draws with the seed ``window.seed``; a longer list begins with the draws of a shorter
+    one.
 
-    ``unseen`` draws come from a separate stream, because a yield must hold for prints that no search has
-    used.
+    ``unseen`` draws come from a separate random stream, because a yield must hold for prints that no search
+    has used.
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    # Each draw takes five numbers. A further spread needs its own stream, or all earlier draws would change.
+    # Each draw uses five random numbers. A further spread needs its own stream; otherwise, all existing draws
+    # would change.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -121,8 +127,8 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
     """Refuse spreads whose draws, in the search or in the yield, cannot be propagated.
 
     Raises:
-        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
-            or without a positive wavelength.
+        InputError: a draw is below the sampling limit of the propagator between ``source`` and ``target``, or
+            has no positive wavelength.
     """
     drawn = draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
@@ -139,7 +145,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
         limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
     nearest_um, wanted = min(draw.optics.distance_um for draw in drawn), f"at least {limit_um:.4g} µm"
     if optics.distance_um < limit_um:
-        hint = f"the wavelength is {optics.wavelength_um:g} µm: are nm meant?" if limit_um > 20 else ""
+        hint = f"the wavelength is {optics.wavelength_um:g} µm; convert nm to µm" if limit_um > 20 else ""
         raise InputError("propagation distance", got=f"{optics.distance_um:g} µm", wanted=wanted, hint=hint)
     if nearest_um < limit_um:
         raise InputError(
@@ -151,7 +157,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 class Yield(Record):
-    """The share of random prints that pass, its 95 % interval (Wilson), and the figures that decide."""
+    """The share of random prints that pass, its 95 % confidence interval (Wilson), and the figures that
+    decide.
+    """
 
     draws: int
     passed: int
@@ -191,19 +199,20 @@ def measure_yield(
 
 
 def risk(losses: Tensor, tail: float) -> Tensor:
-    """Return the mean of the worst share of many losses."""
+    """Return the mean of the worst losses, which are a share ``tail`` of all."""
     worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the standard deviation among models, µm, as an rms over the area; it is differentiable.
+    """Return the standard deviation of prints among models, µm, as an rms over the area; it is
+    differentiable.
 
     A constant height is only a constant phase, so the mean of every print is subtracted first.
 
     Args:
         heights_um: prints of one layout by k models, (k, ...).
-        area: area that each height covers, (...), in any unit, for rings; None for pixels.
+        area: for rings, the area (...) that each height covers, in any unit; None for pixels.
     """
     flat = heights_um.flatten(1)
     share = flat[0].new_ones(flat[0].shape) if area is None else area.flatten()
@@ -213,11 +222,11 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """Return ``window`` with the spread and correlation of gain and offset of measured prints.
+    """Return ``window`` with the spread and correlation of gain and offset that measured prints have.
 
-    Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound of the
-    spread between prints: it also contains the changing scale of the microscope and the residual of the fit.
-    Locked scans are left out, so that a search never depends on them.
+    Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound on the
+    spread between prints, because it also contains the changing scale of the microscope and the residual of
+    the fit. Locked scans are left out, so that a search never depends on them.
 
     Args:
         store: a ``litho_data`` store with at least three scans outside its lock box.
@@ -236,7 +245,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     if len(fits) < 3:
         raise InputError(
             "process window",
-            got=f"{len(fits)} scans with structure ({len(locked)} locked scans are left out)",
+            got=f"{len(fits)} scans with structure, not counting {len(locked)} locked scans",
             wanted="at least three",
         )
     gain, offset = np.array(fits).T
@@ -250,8 +259,8 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
 
 def blurred(height: Tensor, sigma_px: float) -> Tensor:
-    """Blur a map with mirrored borders, or rings that are mirrored at the centre and level outside, with a
-    Gaussian.
+    """Blur a map or rings with a Gaussian; a map is mirrored at its borders, and rings are mirrored at the
+    centre and constant outside.
     """
     import torch
     import torch.nn.functional as F

@@ -1,4 +1,4 @@
-"""The processes that share an element: those that torchrun started, or only this one."""
+"""The processes that share an element: those started by torchrun, or only this one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Ranks:
-    """The number of this process among all processes; sums and exchanges carry gradients."""
+    """The number of this process among all processes, and their sums and exchanges, which carry gradients."""
 
     rank: int = 0
     count: int = 1
@@ -38,7 +38,7 @@ class Ranks:
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
     def device(self, device: str | torch.device) -> str | torch.device:
-        """Choose the device of this process; with ``cuda`` each process takes its own GPU."""
+        """Choose the device of this process; with ``cuda``, each process uses its own GPU."""
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
@@ -67,8 +67,8 @@ class Ranks:
         return torch.view_as_complex(got) if sent.is_complex() else got
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum the values of all processes, () float64; in the gradient, the contributions of all processes
-        are added.
+        """Sum the values of all processes, () float64; the gradient adds the contributions of all
+        processes.
         """
         own = values.sum(dtype=torch.float64)
         if self.count == 1:
@@ -88,5 +88,5 @@ class Ranks:
             dist.barrier()
 
 
-# This process, if no other shares the element.
+# This process is the only one that holds the element.
 ALONE = Ranks()

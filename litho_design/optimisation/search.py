@@ -1,4 +1,4 @@
-"""The search loop of every task: it turns free parameters into printable levels and resumes from
+"""The search loop of every task, which turns free parameters into printable levels and resumes from
 checkpoints.
 """
 
@@ -39,18 +39,18 @@ def search_layout(
     """Minimise ``objective`` over layouts; only the printable (argmax) layout is scored and kept.
 
     Args:
-        parameters: a started parametrisation, changed in place.
+        parameters: a parametrisation at its start, which is changed in place.
         objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
         folder: folder of ``checkpoint.pt``; None to run without a checkpoint.
-        fingerprint: identifies the task; a checkpoint of another task is refused.
-        part: name of this process's part of a shared search, used in the name of its checkpoint.
+        fingerprint: text that identifies the task; a checkpoint of another task is refused.
+        part: name of this process's part of a shared search, which becomes part of the checkpoint's name.
 
     Returns:
-        The state with the kept argmax levels (``best_levels``, per cell), and the history: one record per
-        evaluated iteration with the loss of the sample and of the argmax layout.
+        The state, which contains the kept argmax levels (``best_levels``, per cell) and the history. The
+        history has one record per evaluated iteration, with the loss of the sample and of the argmax layout.
 
     Raises:
-        InputError: the checkpoint in ``folder`` is of another task, or the loss is not finite.
+        InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.
     """
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate * parameters.rate_unit)
@@ -117,7 +117,7 @@ def _evaluate(
 
 
 def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) -> StepLR | ReduceLROnPlateau:
-    """Make the scheduler that lowers the rate of ``optimiser`` by the settings; the checkpoint stores its
+    """Make the scheduler that lowers the rate of ``optimiser`` as the settings say; the checkpoint stores its
     state.
     """
     factor, iterations = settings.rate_factor, settings.rate_iterations

@@ -13,7 +13,7 @@ from litho_design.optics import Optics
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.printers.layout import LayoutSettings
 
-# Smallest fall of a loss that counts as progress.
+# Smallest decrease of a loss that counts as progress.
 PROGRESS = 1e-4
 
 S = TypeVar("S", bound="DesignSettings")
@@ -46,15 +46,16 @@ class SearchSettings(Record):
     )
     rate_schedule: Literal["constant", "step", "plateau"] = setting(
         "constant",
-        "Learning rate over the iterations: constant; times rate_factor every rate_iterations (step); or "
-        f"times it after more than rate_iterations without a loss lower by {PROGRESS:g} (plateau)",
+        "Learning rate over the iterations: constant; multiplied by rate_factor every rate_iterations "
+        "(step); or multiplied by it after more than rate_iterations in which the loss fell by less than "
+        f"{PROGRESS:g} (plateau)",
     )
     rate_factor: float = setting(0.5, "Factor of the learning rate at each reduction", gt=0, lt=1)
     rate_iterations: int = setting(25, "Iterations between two reductions, or without a lower loss", ge=1)
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
-    keep: Literal["best", "last"] = setting("best", "Evaluated layout that is kept")
+    keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
     polish_rounds: int = setting(10, "Rounds of single-level changes after the search", ge=0)
     checkpoint_every: int = setting(50, "Iterations between two checkpoints", ge=1)
     precision: Literal["float32", "bfloat16"] = setting(
@@ -65,13 +66,13 @@ class SearchSettings(Record):
     seed: int = setting(0, "Seed of start and sampling", option="--seed")
 
     def temperature(self, iteration: int) -> float:
-        """Return the Gumbel temperature: half a cosine from start to end."""
+        """Return the Gumbel temperature, which follows half a cosine from start to end."""
         share = iteration / max(self.iterations - 1, 1)
         weight = (1 + math.cos(math.pi * share)) / 2
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The search of the paper. Holograms and lenses each add a different learning rate.
+# The search of the paper. Holograms and lenses each add their own learning rate.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -84,7 +85,9 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """If the search has further models, its loss is their worst loss + weight * disagreement in waves."""
+    """With further models, the loss of a search is the worst loss over all models + weight * disagreement in
+    waves.
+    """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
 
@@ -102,7 +105,7 @@ class Fabrication(Record):
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
 
     inside_weight: float = setting(
-        0.0, "Weight of levels and steps that are rare in the model's training layouts",
+        0.0, "Weight of the penalty on levels and steps that are rare in the model's training layouts",
         option="--inside-weight", ge=0,
     )  # fmt: skip
 
@@ -114,7 +117,7 @@ class DesignSettings(Record):
 
     variant: Variant = setting(
         "default",
-        "Preset: this project's, as printed in the paper, or as in the authors' code",
+        "Preset: this project's (default), as stated in the paper, or as in the authors' code",
         option="--variant",
     )
     layout: LayoutSettings = setting(LayoutSettings(), "Layout")
@@ -129,13 +132,13 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
     """Return settings for your own task, with changes by path, such as ``{"layout.size_px": 256}``.
 
     Raises:
-        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+        InputError: a change names an unknown setting, or a value that the setting does not accept.
     """
     return changed(DesignSettings(), dict(changes or {}))
 
 
 def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[str, Any] | None = None) -> S:
-    """Return the settings of a preset, with changes by path; a ``variant`` among the changes replaces the
+    """Return the settings of a preset, with changes by path; a ``variant`` among the changes overrides the
     given one.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The virtual fab as a judge: it prints finished layouts, but has no gradients to design with.
+"""The virtual fab as a judge, which prints finished layouts but has no gradients to design with.
 
 The fab shares no code with the models and includes the effects that were hidden in their training prints. The
 fab therefore prints what the machine would have printed.
@@ -20,7 +20,8 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# A separate random stream, so that this roughness differs from that of every scan of the truth file's run.
+# This random stream is separate, so that the roughness differs from that of every scan of the truth file's
+# run.
 _ROUGHNESS_STREAM = 2
 
 
@@ -35,10 +36,11 @@ class ElementJob(Job):
 
 
 class FabSimulator(nn.Module):
-    """Print like the virtual fab of a ``truth.json``, with surface roughness but without scan effects.
+    """Print like the virtual fab described by a ``truth.json``, with surface roughness but without scan
+    effects.
 
     The fab is called like a frozen model but has no gradients. The roughness is the same for every layout of
-    one size, so their prints differ only by the layouts.
+    one size, so the prints differ only because the layouts do.
     """
 
     name = "fab"
@@ -50,8 +52,8 @@ class FabSimulator(nn.Module):
         self.printer, self.noise = truth.printer, truth.noise
         self.knobs = KnobBoard([knob.setting for knob in truth.knobs], truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
-        # This text contains everything that determines the print; its hash identifies the fab as weights
-        # identify a model.
+        # This text contains everything that determines the print. Its hash identifies the fab, just as the
+        # hash of the weights identifies a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
         self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
 
@@ -79,8 +81,8 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
     """Load the fab of a truth file.
 
     Raises:
-        InputError: there is no truth file, or the layout has another pitch or level height, or more levels,
-            than the fab prints.
+        InputError: there is no truth file, the pitch or level height of the layout is not the fab's, or the
+            layout has more levels than the fab prints.
     """
     fab = FabSimulator(Truth.read(source))
     asked = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um}

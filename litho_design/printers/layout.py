@@ -1,4 +1,4 @@
-"""Layouts: their geometry and levels."""
+"""The geometry and levels of layouts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LayoutSettings(Record):
     size_px: int = setting(1024, "Side of the element", unit="px", option="--size-px", ge=4)
     pitch_um: float = setting(
         0.1,
-        "Side of a pixel, which must be that of the model",
+        "Side of a pixel, which must equal that of the model",
         unit="µm",
         option="--pitch-um",
         ge=PITCH_UM.low,
@@ -57,12 +57,13 @@ class LayoutSettings(Record):
         """Return the width of a ring in pixels; it need not be a whole number.
 
         Raises:
-            InputError: rings are narrower than a pixel.
+            InputError: the rings are narrower than a pixel.
         """
-        # 0.7 / 0.1 is a little less than 7, and a pixel on the edge would change its ring.
+        # The width is rounded because 0.7 / 0.1 is a little less than 7, which would move pixels on an edge
+        # to another ring.
         width_px = round(self.cell_um / self.pitch_um, 9)
         if width_px < 1:
-            wanted = f"rings of a pixel, {self.pitch_um} µm, or wider"
+            wanted = f"rings at least one pixel ({self.pitch_um} µm) wide"
             raise InputError("cell_um", got=f"{self.cell_um} µm", wanted=wanted)
         return width_px
 
@@ -71,13 +72,13 @@ class LayoutSettings(Record):
         """Return the number of pixels along the side of a cell.
 
         Raises:
-            InputError: cells are not a whole number of pixels, or do not fill the element.
+            InputError: the cells are not a whole number of pixels wide, or do not fill the element.
         """
         cell_px = round(self.cell_um / self.pitch_um)
         if cell_px < 1 or abs(cell_px * self.pitch_um - self.cell_um) > 1e-9 or self.size_px % cell_px:
             raise InputError(
                 "cell_um",
                 got=f"{self.cell_um} µm",
-                wanted=f"whole pixels of {self.pitch_um} µm that divide {self.size_px} px",
+                wanted=f"a whole number of pixels of {self.pitch_um} µm that divides {self.size_px} px",
             )
         return cell_px

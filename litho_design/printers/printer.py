@@ -1,4 +1,4 @@
-"""A printer for one element: it turns layout levels into printed heights."""
+"""A printer for one element, which turns layout levels into printed heights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Precision = Literal["float32", "bfloat16"]
 class TilingCheck(Record):
     """Difference between a print computed as a whole and the same print in tiles.
 
-    For models with a finite reach the difference is only rounding. For others, such as a Fourier operator,
+    For models with a finite reach, the difference is only rounding. For others, such as a Fourier operator,
     the difference is an error of the model.
     """
 
@@ -95,7 +95,9 @@ class Printer(nn.Module):
 
     @property
     def depends_on_position(self) -> bool:
-        """Return whether added effects may depend on the position in the write field, which a patch lacks."""
+        """Return whether the print may depend on the position in the write field, which is unknown for a
+        patch.
+        """
         return bool(self.card.get("process_effects"))
 
     @property
@@ -104,15 +106,16 @@ class Printer(nn.Module):
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
-        """Print real ``level`` (b, 1, size, size); return the height, µm (b, 1, size, size)."""
+        """Print real ``level`` (b, 1, size, size); return the height (b, 1, size, size), µm."""
         height_um = level * self.layout.level_height_um
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
         """Print a patch cut out of a layout (b, 1, y, x); return its height, µm, without the outer
-        ``halo_px``.
+        ``halo_px`` pixels.
 
-        By default ``halo_px`` is the halo of the printer; ``strip_halo_px`` is enough for two rows of pixels.
+        By default, ``halo_px`` is the halo of the printer; ``strip_halo_px`` is enough for two rows of
+        pixels.
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
@@ -122,7 +125,7 @@ class Printer(nn.Module):
         1, y, x).
 
         The backward pass prints each tile again, so memory depends on ``tile_px`` and not on the element. If
-        the model has a finite reach, the result equals that of ``forward`` up to rounding. Otherwise
+        the model has a finite reach, the result equals that of ``forward`` up to rounding. Otherwise,
         ``tiling_check`` measures the difference.
         """
 
@@ -150,8 +153,8 @@ class Printer(nn.Module):
             tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
 
         Returns:
-            The differences; None if there is nothing to compare: nominal heights, an element not larger than
-            one tile, or a print that depends on the position.
+            The differences. None if nothing can be compared, because heights are nominal, the element is not
+            larger than one tile, or the print depends on the position.
         """
         size, halo = self.layout.size_px, self.halo_px
         if self.simulator is None or size <= tile_px or self.depends_on_position:
@@ -195,7 +198,7 @@ class Printer(nn.Module):
         )
 
     def weights_sha256(self) -> str:
-        """Return the hash of the present values of all parameters and buffers, which a design run must not
+        """Return the hash of the current values of all parameters and buffers, which a design run must not
         change.
         """
         digest = hashlib.sha256()
@@ -240,7 +243,7 @@ def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
     pixels.
 
     A model that runs on tiles needs a whole tile around a patch. Two rows of pixels lie where two rows of
-    tiles are blended, and the mean of two tiles has a smaller error than one.
+    tiles are blended, and the mean of two tiles has a smaller error than one tile.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

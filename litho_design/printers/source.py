@@ -1,4 +1,4 @@
-"""Load printers: from a folder of a frozen model, the zoo, or a virtual fab, or nominal heights."""
+"""Load printers: frozen models from folders or the zoo, virtual fabs, and nominal heights."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# The zoo models that judge a design: one of each kind. Ridge regressions are left out, because they
-# extrapolate badly from smooth layouts.
+# These zoo models judge a design, one of each kind. Ridge regressions are left out, because they extrapolate
+# badly from smooth layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 
@@ -60,7 +60,8 @@ def load_printers(
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> dict[str, Printer]:
-    """Load printers by name, from a mapping, or from NAME=MODEL, MODEL, ``none`` and loaded printers.
+    """Load printers by name, from a mapping or from a list of NAME=MODEL, MODEL, ``none`` and loaded
+    printers.
 
     Raises:
         InputError: a printer has no name, two have the same name, or ``load_printer`` refuses one.
@@ -91,8 +92,8 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Return judges from the zoo that were trained on the same prints as the first ``known`` model, except
-    known models.
+    """Return the zoo's judges that were trained on the same prints as the first ``known`` model, except known
+    models.
 
     A model that was not calibrated for the layout is left out.
     """
@@ -101,7 +102,7 @@ def models_at_hand(
     dataset, weights = known[0].dataset_sha256, {one.sha256 for one in known}
     found = []
     for name in JUDGES if dataset else ():
-        # They are selected by their cards, so that models of another printer need not be loaded.
+        # Models are selected by their cards, so that those of another printer need not be loaded.
         card = zoo.card(name)
         if (card.get("dataset") or {}).get("sha256") != dataset:
             continue
@@ -122,18 +123,18 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
             raise InputError(
                 f"{name} of the layout",
                 got=f"{asked:g} µm",
-                wanted=f"{calibrated:g} µm, as the model was trained",
-                hint=f"design with --pitch-um {calibrated:g}, or take a model of {asked:g} µm"
+                wanted=f"{calibrated:g} µm, with which the model was trained",
+                hint=f"design with --pitch-um {calibrated:g}, or use a model with a pitch of {asked:g} µm"
                 if name == "pitch_um"
-                else "--extrapolate accepts a guess",
+                else "use --extrapolate to accept extrapolated heights",
             )
     highest, asked = card["calibrated_range_um"][1], (layout.levels - 1) * layout.level_height_um
     if asked > highest + 1e-6 and not extrapolate:
         raise InputError(
             "highest level of the layout",
             got=f"{layout.levels} levels of {layout.level_height_um:g} µm ({asked:g} µm)",
-            wanted=f"at most {highest:g} µm, what the model was calibrated for",
-            hint="use fewer levels, or --extrapolate to accept a guess",
+            wanted=f"at most {highest:g} µm, up to which the model was calibrated",
+            hint="use fewer levels, or --extrapolate to accept extrapolated heights",
         )
 
 

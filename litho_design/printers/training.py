@@ -1,4 +1,4 @@
-"""Compare a layout with a model's training layouts: its distance, a penalty, and the model's own error."""
+"""Compare a layout with a model's training layouts: distance, penalty, and the model's own error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 _FLAG_DISTANCE = 0.5
 # This limit is a tenth of all pairs of neighbours, because a few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
-# A layout may have a level or step this many times as often as the training layouts, or by this share more.
+# A level or step may be this many times as frequent as in the training layouts, or more frequent by this
+# share.
 ALLOWED_TIMES = 2.0
 _ALLOWED_SHARE = 0.005
 
@@ -28,11 +29,12 @@ class OutOfDistribution(Record):
     """The distance of a layout from the model's training layouts.
 
     The distance consists of two total-variation distances: between histograms of levels, and between
-    histograms of the steps of neighbouring pixels. ``unusual`` says what the layout has much more of than the
-    training layouts. Steps are absent if the model's card has none.
+    histograms of the steps of neighbouring pixels. ``unusual`` lists the levels and steps that are much more
+    frequent in the layout than in the training layouts. The distance of steps is absent if the model's card
+    has no steps.
     """
 
-    # Older designs also hold scores of a layout closer to the training layouts.
+    # Older records also contain scores of a layout that is closer to the training layouts.
     model_config = ConfigDict(extra="ignore")
 
     level_distance: float
@@ -71,7 +73,7 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """Return the excess of a layout over twice the tails of a model's training layouts, in levels.
+    """Return, in levels, by how much a layout exceeds twice the tails of a model's training layouts.
 
     For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
     neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
@@ -97,8 +99,8 @@ def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
-    """Return a histogram from a model's card, over at least ``levels`` values and with sum 1; None if the
-    card has none.
+    """Return a histogram from a model's card, with at least ``levels`` values and sum 1; None if the card has
+    none.
     """
     trained = np.asarray(card.get(name) or [], dtype=float)
     if trained.size == 0:
@@ -107,11 +109,12 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
 
 
 def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
-    """Return the expected rms error of a model, µm, on the print of a relief of this standard deviation, µm.
+    """Return the expected rms error of a model, µm, on the print of a relief with this standard deviation,
+    µm.
 
-    The error is that on the prints in the model's card, scaled up for a relief that is higher than those
-    prints, plus the scatter of the prints' gains. Errors are assumed to be normal, so the mean absolute error
-    is sqrt(2 / pi) of the rms error. If the card has no prints, the result is 0.
+    The error combines the error on the prints in the model's card, scaled up for a relief that is higher than
+    these prints, with the scatter of the prints' gains. Errors are assumed to be normal, so the mean absolute
+    error is sqrt(2 / pi) of the rms error. If the card has no prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:
@@ -129,7 +132,9 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """Describe what ``share`` has much more of than ``trained``; return an empty list if nothing."""
+    """Describe the values that are much more frequent in ``share`` than in ``trained``; return an empty list
+    if there are none.
+    """
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:
         return []

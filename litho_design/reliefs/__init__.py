@@ -1,1 +1,1 @@
-"""Design reliefs: layouts whose print comes closest to a wanted height map."""
+"""Design reliefs: layouts whose print comes closest to a target height map."""

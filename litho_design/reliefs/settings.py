@@ -1,4 +1,4 @@
-"""All settings of a relief."""
+"""The settings of a relief."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ReliefSettings(DesignSettings):
     )
     off_blur_um: float = setting(
         1.0,
-        "Blur (sd) of the measured deviation of a first print from its prediction, if there is one",
+        "Standard deviation of the blur of a first print's measured deviation, if there is a first print",
         unit="µm",
         ge=0,
     )
@@ -39,6 +39,6 @@ def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:
     """Return the settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
 
     Raises:
-        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+        InputError: a change names an unknown setting, or a value that the setting does not accept.
     """
     return changed(ReliefSettings(), dict(changes or {}))

@@ -1,4 +1,4 @@
-"""Draw wanted height maps by code, or read them from a file."""
+"""Draw target height maps, or read them from a file."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _PERIODS, _STEPS = 4, 6
 def load_relief(
     source: str | Path | np.ndarray, layout: LayoutSettings, height_um: float
 ) -> tuple[np.ndarray, TargetRecord]:
-    """Load a wanted height map, float32 (size, size), µm, and its record.
+    """Load a target height map, float32 (size, size), µm, and its record.
 
     Args:
-        source: lens (a spherical cap), blaze (four periods of a sawtooth along x) or staircase (six steps
-            along x), ``height_um`` high; a grey picture, whose brightest value stands for ``height_um``; or
-            heights in µm: a float TIFF, or an array.
+        source: a drawing ``height_um`` high: lens (a spherical cap), blaze (four periods of a sawtooth along
+            x) or staircase (six steps along x); a grey picture, whose brightest value stands for
+            ``height_um``; or heights in µm: a float TIFF, or an array.
 
     Raises:
         InputError: the source is neither a drawing nor a readable file, or the heights have another shape or
@@ -48,8 +48,8 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return the deviation of a print (size, size) from its expectation, µm, blurred and without its mean:
-    float32.
+    """Return a print's deviation from its expectation (size, size), float32, µm, blurred and without its
+    mean.
 
     The roughness of a second print differs from that of the first, so the blur removes the roughness.
     """
@@ -70,7 +70,7 @@ def _float_tiff(path: Path) -> np.ndarray | None:
 
 
 def _draw(name: str, size_px: int) -> np.ndarray:
-    """Draw a relief in [0, 1] on (size, size) pixels."""
+    """Draw a relief (size, size) with values in [0, 1]."""
     x = (np.arange(size_px) + 0.5) / size_px
     if name == "blaze":
         return np.tile(_PERIODS * x % 1, (size_px, 1))
@@ -84,7 +84,7 @@ def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
     found = np.ascontiguousarray(heights, np.float32)
     if found.shape != (size_px, size_px):
         raise InputError(
-            "relief", got=f"{found.shape} px", wanted=f"({size_px}, {size_px}) px, the element's"
+            "relief", got=f"{found.shape} px", wanted=f"({size_px}, {size_px}) px, the size of the element"
         )
     if not np.isfinite(found).all() or np.ptp(found) == 0:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The relief as a task: find the layout whose print comes closest to a wanted height map."""
+"""The task of a relief: find the layout whose print comes closest to a target height map."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# Gains of an affine layout relative to the inverse of the printer's gain; positions between the lowest and
-# the highest level.
+# Gains of the affine layouts that are tried, relative to the inverse of the printer's gain, and their
+# positions between the lowest and the highest level.
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
@@ -55,13 +55,13 @@ class _Bare(nn.Module):
 
 @register_task
 class ReliefTask(Task):
-    """A wanted height map (size, size), µm, as ``load_relief`` gives it with its record.
+    """The task of printing a height map (size, size), µm, as ``load_relief`` returns it with its record.
 
     The input ``off_um`` is the deviation of a first print from its expectation, without its mean. The search
-    expects the same deviation in the next print. Figures describe the print alone, as others will measure it.
+    expects the same deviation in the next print. Figures describe only the print, as others will measure it.
 
     Raises:
-        InputError: a start that is for light, or spreads beyond the range of any propagator.
+        InputError: the start is for tasks with light, or the spreads exceed the range of any propagator.
     """
 
     name = "relief"
@@ -84,19 +84,20 @@ class ReliefTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # The height that the model has to print for the printer to print the target.
+        # If the model prints this height, the printer is expected to print the target.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
         span_um, reach_um = float(np.ptp(self.inputs["relief_um"])), max(heights) - min(heights)
         if span_um > reach_um:
             self.notes.append(
-                f"the relief is {span_um:.3g} µm high, the levels print {reach_um:.3g} µm: its highest and "
-                f"lowest parts are cut off; take --height-um {reach_um:.2g} or less, or more levels"
+                f"the relief is {span_um:.3g} µm high, but the levels print only {reach_um:.3g} µm, so its "
+                f"highest and lowest parts are cut off; use --height-um {reach_um:.2g} or less, or more "
+                "levels"
             )
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return a bench that gives the print itself, whatever the light."""
+        """Return a bench that returns the print itself and ignores the light."""
         return _Bare(self.settings.layout).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> Tensor:
@@ -127,32 +128,32 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors without the offset. The zero is free and must not decide whether a print
+        """Return the errors without the offset, because the zero is free and must not decide whether a print
         passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose uniform print has the wanted height at the best zero, or the best affine
-        levels.
+        """Return the start with the lowest expected loss: levels whose uniform prints have the target
+        heights, or the best affine levels.
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
         return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return the layout with the wanted heights unchanged, and the best affine layout."""
+        """Return the layout whose nominal heights are the target heights, and the best affine layout."""
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two uncorrected layouts, and those of levels that are not rounded."""
+        """Return the errors of the two uncorrected layouts and of levels that are not rounded."""
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
 
     @property
     def _nominal(self) -> Tensor:
-        """Return the levels (size, size) of the wanted heights; a relief with heights below 0 is lifted to
+        """Return the levels (size, size) of the target heights; a relief with heights below 0 is lifted to
         0.
         """
         return self._affine(
@@ -161,8 +162,8 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels (size, size) of the gain * height + zero with the lowest loss over the
-        printers.
+        """Return the levels (size, size) of gain * height + zero, with the gain and zero of the lowest loss
+        over the printers.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
@@ -187,7 +188,7 @@ class ReliefTask(Task):
 
     @torch.no_grad()
     def _expected(self, levels: Tensor) -> float:
-        """Return the loss of real levels (*cells), rounded, over the printers of the search."""
+        """Round real levels (*cells), and return their loss over the printers of the search."""
         whole = self.cells(levels.round())[None, None].float()
         losses = torch.stack([self.loss_by(one, one(whole)[0, 0])[0] for one in self.printers])
         return float(self.over_models(losses))
@@ -197,13 +198,15 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the task's arrays, and the error with unrounded levels, which no layout can undercut."""
+        """Return the task's arrays, and the error that remains with unrounded levels, which no layout can
+        remove.
+        """
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
     def _free_print(self) -> Tensor:
-        """Return the print, µm, of unrounded levels with the lowest loss."""
+        """Return the print, µm, of the unrounded levels with the lowest loss."""
         free = DirectLevels(self.settings.layout).to(self.printer.device)
         free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
 

@@ -25,7 +25,7 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures that summarise a score, if it contains them: text, decimals, and a factor.
+# Figures that summarise a score if it contains them, with their text, decimals and factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -33,7 +33,7 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("si_psnr_db", "{} dB", 2),
     ("ssim", "SSIM {}", 3),
     ("si_psnr_window_db", "{} dB inside the signal window", 2),
-    ("rms_nm", "{} nm rms from the relief", 1),
+    ("rms_nm", "{} nm rms error", 1),
     ("mae_direct", "MAE {} on the sensor", 4),
     ("mae_design", "MAE {} with the designed PSF", 4),
     ("mae_calibrated", "MAE {} with the print's own PSF", 4),
@@ -58,7 +58,7 @@ def called(printer: str) -> str:
 def distribution_warning(design: Design) -> str:
     """Return a warning if a layout is far from the training layouts, or if its distance is unknown.
 
-    Otherwise return an empty text.
+    Otherwise, return an empty text.
     """
     gauge = design.out_of_distribution
     if gauge is None:
@@ -71,17 +71,17 @@ def distribution_warning(design: Design) -> str:
     if not gauge.flagged:
         return ""
     text = (
-        f"far from the training layouts of the model: {100 * gauge.level_distance:.0f} % of the pixels would "
-        "have to change level to match them, and the prediction is an extrapolation"
+        f"the layout is far from the model's training layouts: {100 * gauge.level_distance:.0f} % of the "
+        "pixels would have to change level to match them, so the prediction is an extrapolation"
     )
     text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
-    return f"{text}. --inside-weight keeps a search closer to them"
+    return f"{text}. Use --inside-weight to keep a search closer to them"
 
 
 def width_sentence(design: Design) -> str:
-    """Return a sentence on the predictions of all available models of the printer.
+    """Return sentences about the predictions of all available models of the printer.
 
-    The sentence is empty if there is only the design's own model.
+    The text is empty if there is only the design's own model.
     """
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
@@ -91,47 +91,52 @@ def width_sentence(design: Design) -> str:
     text += f" The search used {width.searched_with} of them."
     (low, high), (_, unit) = width.between, _parted(width.figure)
     if high > max(by_model.values()):
-        text += f" With their errors on their own training prints, expect {low:.3g} to {high:.3g}{unit}."
+        text += f" Including the models' own errors, expect {low:.3g} to {high:.3g}{unit}."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
-            f" They differ most in the height of level {level} ({low_um:.3f} to {high_um:.3f} µm): "
-            "a print with wide "
-            "fields of it would decide (litho-models next-print)."
+            f" The models differ most in the height of level {level} ({low_um:.3f} to {high_um:.3f} µm); a "
+            "print with wide fields of this level would decide between them (litho-models next-print)."
         )
     return text
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """Return a sentence with a figure by the first model, its median over models, and its worst value.
+    """Return a sentence with the figure that the first model predicts, its median over models, and its worst
+    value.
 
     The sentence also states whether the models differ too much.
 
     Args:
-        less: whether the figure is better when lower; ``gain``: gain of the design over doing nothing.
+        less: whether the figure is better when lower; ``gain``: gain of the design over the best uncorrected
+            layout.
     """
     name, unit = _parted(figure)
     stated, *_ = by_model
     worst = (max if less else min)(by_model, key=by_model.__getitem__)
     text = (
-        f"{len(by_model)} models of this printer predict its print ({', '.join(by_model)}): {name} "
-        f"{by_model[stated]:.3g}{unit} as stated by {stated}, {median(by_model.values()):.3g} in the median, "
-        f"{by_model[worst]:.3g} at worst, by {worst}."
+        f"{len(by_model)} models of this printer predict the print ({', '.join(by_model)}): {name} "
+        f"{by_model[stated]:.3g}{unit} according to {stated}, {median(by_model.values()):.3g} as the median, "
+        f"and {by_model[worst]:.3g} at worst (by {worst})."
     )
     apart = max(by_model.values()) - min(by_model.values())
     if gain is not None and apart > gain:
-        text += f" They disagree by {apart:.3g}{unit}, more than the {gain:.3g}{unit} won by the design."
+        text += f" The models disagree by {apart:.3g}{unit}, more than the design gains ({gain:.3g}{unit})."
     return text
 
 
 def _parted(figure: str) -> tuple[str, str]:
-    """Return the name of a figure, and its unit after a blank; the unit is empty if the figure has none."""
+    """Return the name of a figure, and its unit with a leading space; the unit is empty if the figure has
+    none.
+    """
     name, _, unit = named(figure).partition(" (")
     return name, f" {unit.rstrip(')')}" if unit else ""
 
 
 def thickness_warning(design: Design) -> str:
-    """Return a warning if the print performs clearly worse as a thick element; otherwise an empty text."""
+    """Return a warning if the print performs clearly worse as a thick element; otherwise, return an empty
+    text.
+    """
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
         return ""
@@ -139,9 +144,9 @@ def thickness_warning(design: Design) -> str:
     if thick >= (1 - _THICK_SHARE) * thin:
         return ""
     return (
-        f"as a thick element (wave propagation method, one reflection included) the same print sends "
-        f"{100 * thick:.1f} % where the thin element of these scores sends {100 * thin:.1f} %: its detail is "
-        "too fine for its height, so the scores are too good"
+        f"computed as a thick element (wave propagation method, including one reflection), the same print "
+        f"has an efficiency of {100 * thick:.1f} % instead of the {100 * thin:.1f} % in these scores; its "
+        "detail is too fine for its height, so the scores are too good"
     )
 
 
@@ -157,8 +162,8 @@ def stroke_advice(design: Design) -> str:
     if gauge is not None and gauge.training_extreme_level_share < _SEEN_SHARE:
         text += (
             " The lowest and the highest level make up only "
-            f"{100 * gauge.training_extreme_level_share:.2g} % of the training layouts: their "
-            "heights are an extrapolation, so compare several models."
+            f"{100 * gauge.training_extreme_level_share:.2g} % of the training layouts, so "
+            "their heights are an extrapolation; compare several models."
         )
     if stroke.levels_for_one_wave is None or stroke.level_height_for_one_wave_um is None:
         return text
@@ -170,7 +175,7 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """Return the summary of a score that a command prints at its end, with the uncertainty of a
+    """Return the summary of a score that a command prints when it ends, with the uncertainty of a
     measurement.
     """
     sd = uncertainty or {}

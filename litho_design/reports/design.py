@@ -62,16 +62,15 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         words=WORDS,
     )
     page.verdict(
-        f"As {design.printer.name} prints it: {headline(design.predicted)}. This is a prediction "
-        "of the model "
-        "used for the design, not a measurement: before printing, score the layout with another model "
+        f"As printed by {design.printer.name}: {headline(design.predicted)}. This is a prediction of the "
+        "model used for the design, not a measurement. Before printing, score the layout with another model "
         "(litho-design score, litho-design compare). " + width_sentence(design)
     )
     if design.baselines:
         page.paragraph(f"{capitalised(baseline_line(design.baselines))}.")
     page.figure(
         panels_figure(_panels(folder, design, task, height_um, seen)),
-        "Rows are y (down), columns x; lengths in µm." + _PSF * lens,
+        "Rows are y (down), and columns are x; lengths are in µm." + _PSF * lens,
     )
     notes = filter(None, (distribution_warning(design), thickness_warning(design), *design.notes))
     page.note(*(f"{capitalised(note)}." for note in notes))
@@ -83,7 +82,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         ]
         page.table(
             rows,
-            "The layout and the uncorrected layouts, printed by every available model",
+            "The searched and the uncorrected layouts, as printed by every available model",
             "width.csv",
             digits=4,
         )
@@ -106,8 +105,8 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.paragraph(stroke_advice(design))
     if tiling := design.tiling:
         page.paragraph(
-            f"Predicted as a whole or in {tiling.tiles} tiles of {tiling.tile_px} px with their halo, the "
-            f"print differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
+            f"The prints predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with halos "
+            f"differ by {tiling.rms_nm:.2g} nm rms and by at most {tiling.max_nm:.2g} nm."
         )
     if design.out_of_distribution is not None:
         distance = design.out_of_distribution.model_dump(exclude={"flagged"})
@@ -132,15 +131,15 @@ def _panels(
         error = 1000 * (height_um - task.inputs["relief_um"])
         limit = 2 * float(np.std(error)) + 1e-9
         maps = {
-            "error, offset free": error - error.mean(),
+            "error without its mean": error - error.mean(),
             "the part of the relief that no layout can print": 1000 * np.load(folder / UNPRINTABLE_FILE),
         }
         return [first, [Panel(*one, side, "nm", "RdBu_r", -limit, limit) for one in maps.items()]]
-    behind = "behind the predicted print", task.display(seen), window
+    behind = "image behind the predicted print", task.display(seen), window
     if isinstance(task, HologramTask):
-        wanted = Panel("wanted image", np.load(folder / TARGET_FILE), window, "intensity", high=1)
+        wanted = Panel("target image", np.load(folder / TARGET_FILE), window, "intensity", high=1)
         return [first, [wanted, Panel(*behind, "intensity, matched scale")]]
-    return [[*first, Panel(*behind, "over the brightest of each", high=1)]]
+    return [[*first, Panel(*behind, "relative to the brightest value", high=1)]]
 
 
 def _add_scores(page: Page, design: Design, task: Task) -> None:
@@ -156,13 +155,14 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
     ceiling, settings = baselines.get("continuous phase", {}).get("loss"), task.settings
     if ceiling is not None and not settings.fabrication.inside_weight and not settings.window.samples:
         page.paragraph(
-            f"The loss of the printed layout is {design.polished_loss:.4f}; a continuous phase on the same "
-            f"cells reaches {ceiling:.4f} ({100 * (design.polished_loss / ceiling - 1):+.1f} % against it)."
+            f"The loss of the printed layout is {design.polished_loss:.4f}, which is "
+            f"{100 * (design.polished_loss / ceiling - 1):+.1f} % relative to the {ceiling:.4f} that a "
+            "continuous phase reaches on the same cells."
         )
     if reference := design.reference_efficiency:
         page.paragraph(
-            f"A continuous phase optimised for power alone puts {100 * reference:.1f} % on the signal; the "
-            f"print reaches {design.predicted['eff_signal'] / reference:.2f} of that."
+            f"A continuous phase optimised for power alone puts {100 * reference:.1f} % of the light on the "
+            f"signal; the print reaches {design.predicted['eff_signal'] / reference:.2f} of this value."
         )
 
 
@@ -175,17 +175,17 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
     designed = "in the loss" if window.samples else "not in the loss"
     page.paragraph(
         f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
-        f"the axis. The search did not use these prints; the process window was {designed}. Standard "
-        f"deviations: {'; '.join(spreads(window))}."
+        f"the axis. The search did not use these prints; the process window was {designed}. Its standard "
+        f"deviations are: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
-    grown = f", and no error exceeds {100 / PASS_SHARE:.0f} %"
+    grown = f", and each error is at most {100 / PASS_SHARE:.0f} % of the modelled one"
     page.paragraph(
-        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval). In a "
-        f"print that passes, no figure in dB is more than {PASS_DROP_DB:g} dB below that of the print as "
-        f"modelled, all other figures reach at least {100 * PASS_SHARE:g} % of it"
+        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % confidence interval). In a "
+        f"print that passes, each figure in dB is at most {PASS_DROP_DB:g} dB below that of the print as "
+        f"modelled, every other figure is at least {100 * PASS_SHARE:g} % of the modelled one"
         f"{grown * bool(set(errors) & set(passed.figures))}. "
-        f"Figures: {', '.join(map(named, passed.figures))}."
+        f"These figures count: {', '.join(map(named, passed.figures))}."
     )
     chosen = [name for name in task.headline if name in passed.figures][:2] or passed.figures[:2]
     figures = {name: (design.predicted[name], named(name)) for name in chosen}

@@ -1,4 +1,6 @@
-"""Write the report of a comparison: tables with intervals, and the images in design and after printing."""
+"""Write the report of a comparison: tables with confidence intervals, and images as designed and as
+printed.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from litho_design.reports.tables import meanings
 from litho_design.tasks.design import Design
 from litho_design.tasks.task import registered_task
 
-# With fewer seeds, an interval over seeds is missing or meaningless.
+# With fewer seeds, a confidence interval over seeds is missing or meaningless.
 _FEWEST_SEEDS = 3
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
@@ -45,13 +47,13 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
     page.verdict(_verdict(result, shown[0]))
     page.figure(
         panels_figure(pictures),
-        f"Seed {result.seeds[0]}. Above each image: what it was designed with, and what printed it. "
-        + ("Square root of the PSF over its peak." if lens else "Scaled to match."),
+        f"Seed {result.seeds[0]}. Each title says what the layout was designed with and what printed it. "
+        + ("Each image is the square root of PSF over peak." if lens else "Images are at matched scale."),
     )
     page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
         "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
-        "(columns). On the diagonal a model judges its own design, so the score is its own "
+        "(columns). On the diagonal, a model judges its own design, so the score is its own "
         "prediction, not an independent result."
     )
     for figure in shown:
@@ -59,7 +61,7 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
         if figure == shown[0]:
             if own.baselines:
                 line = capitalised(baseline_line(own.baselines))
-                page.paragraph(f"{line}. No printer is involved in these.")
+                page.paragraph(f"{line}. These baselines involve no printer.")
             page.heading("Further figures", folded=True)
     page.heading("Reports of the designs", folded=True)
     page.links(
@@ -75,8 +77,8 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
     if result.paired:
         page.heading("Arm against arm", folded=True)
         page.paragraph(
-            "Differences under the same judge, paired by seed. If an interval includes 0, the "
-            "order is undecided."
+            "Differences between two arms under the same judge, paired by seed. If a confidence interval "
+            "includes 0, the order of the arms is undecided."
         )
         pairs = [
             one.model_dump(exclude={"ci95"})
@@ -90,12 +92,14 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
 
 
 def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
-    """Return the mean and interval of a figure under a judge, by arm."""
+    """Return the mean and confidence interval of a figure under a judge, by arm."""
     return {one.arm: one for one in result.summary if (one.judge, one.figure) == (judge, figure)}
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Return sentences that name the best arm under each judge that is not an arm; if none, under all."""
+    """Return sentences that name the best arm under each judge that is not an arm, or under all judges if
+    there is none.
+    """
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1
     unit = " dB" if figure.endswith("_db") else ""
@@ -121,15 +125,15 @@ def _verdict(result: GapResult, figure: str) -> str:
 
 def _chance(pair: PairedDifference, seeds: int) -> str:
     if pair.ci95 is None or seeds < _FEWEST_SEEDS:
-        return f"{seeds} seed{'s' * (seeds > 1)} cannot tell that from chance"
+        return f"{seeds} seed{'s' * (seeds > 1)} cannot tell this difference from chance"
     low, high = pair.ci95
-    sure = "more than chance" if low > 0 or high < 0 else "which may be chance"
-    return f"{sure} (95 % interval of the difference over {seeds} seeds {low:.3g} … {high:.3g})"
+    sure = "this is more than chance" if low > 0 or high < 0 else "this may be chance"
+    return f"{sure} (95 % confidence interval of the difference over {seeds} seeds: {low:.3g} to {high:.3g})"
 
 
 def _caption(task: str, figure: str) -> str:
-    better = "less" if figure in registered_task(task).errors else "more"
-    return f"{capitalised(_label(figure))}: mean over seeds [95 % interval]; {better} is better."
+    better = "lower" if figure in registered_task(task).errors else "higher"
+    return f"{capitalised(_label(figure))}: mean over seeds [95 % confidence interval]; {better} is better."
 
 
 def _label(figure: str) -> str:

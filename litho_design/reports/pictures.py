@@ -1,4 +1,4 @@
-"""Draw designs and scores: maps side by side, the curves of a lens, the loss during a search."""
+"""Draw designs and scores: maps side by side, the curves of a lens, and the loss during a search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map (m, m), ``side_um`` wide, in a colour map of matplotlib; if it has a unit, it has a colour
+    """A map (m, m), ``side_um`` wide, with a colour map of matplotlib; a map with a unit gets a colour
     bar.
     """
 
@@ -55,7 +55,7 @@ def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
 
 
 def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> Figure:
-    """Draw the loss against the iteration."""
+    """Draw the loss over the iterations."""
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     for name, label, colour in (
@@ -76,7 +76,7 @@ def decibels(psf: np.ndarray) -> np.ndarray:
 
 
 def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Figure:
-    """Draw the print along the central row, and PSF and MTF with those of a perfect lens."""
+    """Draw the print along the central row, the PSF and the MTF, each beside that of a perfect lens."""
     import torch
 
     from litho_design.lenses.score import mtf
@@ -112,7 +112,7 @@ def yield_figure(
 
     Args:
         draws: figures of each print.
-        figures: by name, the value of the print as modelled and a label.
+        figures: for each figure by name, its value for the print as modelled, and a label.
         falling: figures that are better when lower.
     """
     figure = new_figure(8, 3)

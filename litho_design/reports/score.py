@@ -27,14 +27,14 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     page.verdict(_verdict(result))
     page.figure(
         panels_figure([[Panel(*shown, judgement.side_um) for shown in judgement.pictures.items()]]),
-        "The wanted image, and behind each print the image at matched scale; of a lens the square root of "
+        "The target image, and the image behind each print at matched scale; for a lens, the square root of "
         "the PSF.",
     )
     if judgement.photos:
         page.figure(
             panels_figure([[Panel(*shown, judgement.frame_um) for shown in judgement.photos.items()]]),
-            "Photograph through the printed lens, each image at the scale with the smallest error. The "
-            "scores refer to this one object only.",
+            "The object, the photograph through the printed lens, and its deconvolutions, each at the scale "
+            "with the smallest error. The scores refer to this one object only.",
         )
     for score in result.scores:
         for remark in score.remarks():
@@ -62,7 +62,12 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
         for score in result.scores
         if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
     ]
-    page.table(heights, "Measured heights and the print that the design expected", "heights.csv", digits=1)
+    page.table(
+        heights,
+        "Differences between each print and the print that the design expected",
+        "heights.csv",
+        digits=1,
+    )
     return page.write(folder)
 
 
@@ -70,7 +75,7 @@ def _verdict(result: ScoreResult) -> str:
     expected = f"The design expects {headline(result.designed)}. "
     if not any(score.independent for score in result.scores):
         return expected + (
-            "No judge is independent of the design: these scores only repeat the prediction of its own model."
+            "No judge is independent of the design, so these scores only repeat its own model's prediction."
         )
     told = [
         f"{called(score.judge.name)}: {headline(score.figures, score.uncertainty)}"
@@ -82,9 +87,9 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """Return a sentence with the design's own figure and those of its judging models.
+    """Return a sentence with the figure that the design expects and those of the models that judge it.
 
-    The sentence is empty with fewer than two models.
+    The sentence is empty if fewer than two models judge.
     """
     task = registered_task(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
@@ -95,9 +100,9 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """Return the difference from the expectation, in the figure that compares holograms, as text."""
+    """Return as text the difference from the expectation, in the figure that compares holograms."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""
     more_db = judged[name] - expected[name]
-    return f" ({abs(more_db):.1f} dB {'more' if more_db > 0 else 'less'} than expected)"
+    return f" ({abs(more_db):.1f} dB {'higher' if more_db > 0 else 'lower'} than expected)"

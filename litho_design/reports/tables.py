@@ -19,7 +19,7 @@ def meanings(score: type[Record]) -> dict[str, str]:
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return a row for each figure, with its meaning and a column for each print or baseline."""
+    """Return one row per figure, with its meaning and its value for each print and baseline."""
     # Your own task need not describe its figures.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels
@@ -33,7 +33,9 @@ def score_table(
 
 
 def level_table(design: Design) -> dict[str, Any]:
-    """Return the level, nominal and printed height, and printed waves above level 0."""
+    """Return a table of the levels: nominal height, printed height, and printed height above level 0 in
+    waves.
+    """
     printed, step_um = design.stroke.printed_height_um, design.layout.level_height_um
     wave_um = design.optics.wave_height_um
     return {

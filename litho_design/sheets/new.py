@@ -1,4 +1,4 @@
-"""Make a sheet for a lab to print and scan: layouts, witness patterns, and two versions of a hologram."""
+"""Make a sheet that a lab prints and scans: layouts, witness patterns, and two versions of a hologram."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# Cut-offs of the random layouts, used in turn; the measured prints have the same, cycles per µm.
+# Cut-offs of the random layouts, cycles per µm, used in turn; the measured prints have the same ones.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 # The stair has few, wide steps, because it covers three fifths of a side and the printer rounds the edges.
 _TREADS = 10
 _WITNESSES = {
-    "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
-    "flat": "one level everywhere: the noise floor",
-    "steps": "a stair in a random frame: height against level",
+    "substrate": "bare substrate without a print, which shows zero, tilt and bow of the microscope",
+    "flat": "one level everywhere, which shows the noise floor",
+    "steps": "a stair in a random frame, which shows height against level",
 }
 _HOLOGRAMS = {
     "without": "the hologram, designed for a perfect printer",
@@ -56,15 +56,16 @@ def new_sheet(
 
     Args:
         out: folder of the sheet; an interrupted run in it resumes.
-        model: the hologram is designed once through this model and once without a model.
+        model: model through which one version of the hologram is designed; the other is designed without a
+            model.
         format: format of the printer's files, as for ``export``.
         target: target of the hologram; ``settings``: settings of both designs, by default of a small
             hologram. All fields have its size, pitch and levels.
-        layouts: number of random layouts to learn the printer from; ``seed``: their seed.
+        layouts: number of random layouts from which the printer model is learned; ``seed``: their seed.
         device, announce: as for ``design_hologram``.
 
     Raises:
-        InputError: ``compare`` or ``export`` refuses an argument, or the fields are too small for a stair.
+        InputError: ``compare`` or ``export`` refuses an argument, or the fields are too small for the stair.
     """
     made = settings or small_hologram()
     asked = {"model": str(model), "format": format, "layouts": layouts, "seed": seed}
@@ -118,7 +119,9 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Return the fields from which the printer is learned, by id: the witnesses, then random layouts."""
+    """Return the fields from which a model of the printer is learned, by id: first the witnesses, then random
+    layouts.
+    """
     shape = geometry.size_px, geometry.size_px
 
     def random(number: int) -> np.ndarray:
@@ -143,7 +146,7 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
 def _exported(
     source: np.ndarray | Path, format: Format, folder: Path, name: str, geometry: LayoutSettings
 ) -> str:
-    """Write the printer's file of a field; return its path within the sheet."""
+    """Write the file of a field for the printer; return its path within the sheet."""
     size = geometry.pitch_um, geometry.level_height_um
     file = export(source, format, folder / TO_PRINTER / name, pitch_um=size[0], level_height_um=size[1])
     return file.relative_to(folder).as_posix()

@@ -1,4 +1,6 @@
-"""Evaluate the scans of a sheet: make a dataset, a model with its card, a closed loop and a comparison."""
+"""Evaluate the scans of a sheet: build a dataset, freeze a model with its card, close the loop, and compare
+holograms.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ _BASE = "physics"
 
 
 def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
-    """Learn a model of the printer from a sheet's scans, find what it lacks, and compare both holograms.
+    """Fit a printer model to the scans of a sheet, find what the model lacks, and compare the two holograms.
 
     Args:
         sheet: folder of ``new_sheet``, with the scans in it.
@@ -34,7 +36,7 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
         device: where prints and waves are computed.
 
     Raises:
-        InputError: there is no sheet, the scan of a hologram is missing, or one of the steps refuses.
+        InputError: there is no sheet, the scan of a hologram is missing, or a step refuses its input.
     """
     source = Path(sheet)
     given = Sheet.read(source)
@@ -82,10 +84,10 @@ def sheet_text(result: ReadSheet) -> str:
     better = "better" if gain["measured"] >= 0 else "worse"
     return (
         f"Designed through {result.model}, the printed hologram is {abs(gain['measured']):.1f} dB {better} "
-        f"({result.measured_db['with']:.1f} instead of {result.measured_db['without']:.1f} dB; "
-        f"{gain['expected']:+.1f} dB were expected). "
-        f"{result.model} is {result.model_nm:.1f} nm off these prints; the model fitted to them "
-        f"{result.corrected_nm:.1f} nm on scans that it had not seen."
+        f"({result.measured_db['with']:.1f} instead of {result.measured_db['without']:.1f} dB; the expected "
+        f"gain was {gain['expected']:+.1f} dB). "
+        f"The mean absolute error of {result.model} on these prints is {result.model_nm:.1f} nm; that of the "
+        f"model fitted to them is {result.corrected_nm:.1f} nm on held-out scans."
     )
 
 
@@ -93,7 +95,11 @@ def _scan_of(sheet: Path, arm: Arm) -> MeasuredSource:
     found = sorted((sheet / SCANS_OF_HOLOGRAMS).glob(f"{arm}.*"))
     if len(found) != 1:
         got = ", ".join(path.name for path in found) or "none"
-        raise InputError(f"scan of the hologram {arm}", got=got, wanted=f"{SCANS_OF_HOLOGRAMS}/{arm}.txt")
+        raise InputError(
+            f"scan of the hologram designed {arm} the model",
+            got=got,
+            wanted=f"{SCANS_OF_HOLOGRAMS}/{arm}.txt",
+        )
     scan = load_card(sheet / CARD_NAME).scan
     stated = found[0].suffix != ".txt"
     return MeasuredSource(found[0], None if stated else scan.unit, None if stated else scan.size_um)
@@ -121,10 +127,12 @@ def _write_report(folder: Path, result: ReadSheet) -> None:
     errors = [
         {"model": result.model, "mae_nm": result.model_nm},
         {"model": f"{_BASE}, fitted to these prints", "mae_nm": result.own_nm},
-        {"model": "the same, with what the loop found", "mae_nm": result.corrected_nm},
+        {"model": "the same model with the effects that the loop found", "mae_nm": result.corrected_nm},
     ]
     page.table(
-        errors, "Mean absolute error, one offset per scan free; scans held out of the fits", "errors.csv"
+        errors,
+        "Mean absolute error on scans held out of the fits, with one free offset per scan",
+        "errors.csv",
     )
     found = ", ".join(result.found) or "nothing"
     page.paragraph(f"The loop adds {found}. Its verdict: {result.verdict.replace('-', ' ')}.")
@@ -133,7 +141,7 @@ def _write_report(folder: Path, result: ReadSheet) -> None:
             ("prints-report/report.html", "Report of the dataset"),
             ("loop/report.html", "What the model lacks"),
             ("evaluation/report.html", f"{result.model} on these prints"),
-            *((f"score-{arm}/report.html", f"The hologram {arm} the model") for arm in ARMS),
+            *((f"score-{arm}/report.html", f"The hologram designed {arm} the model") for arm in ARMS),
         ]
     )
     page.write(folder)

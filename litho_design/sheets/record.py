@@ -43,11 +43,11 @@ class ReadSheet(RunFacts, Result):
     """The evaluation of a sheet's scans.
 
     Attributes:
-        model_nm: mean absolute error of the model used for the design, on the new prints.
+        model_nm: mean absolute error, on the new prints, of the model used for the design.
         own_nm: mean absolute error of a model fitted to the new prints, by cross-validation in the loop;
-            ``corrected_nm``: that of this model with the effects that the loop found.
+            ``corrected_nm``: the error of this model with the effects that the loop found.
         found: effects that the loop added; ``verdict``: verdict of the loop.
-        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: its prediction.
+        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: the predicted SI-PSNR.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet-read/1"

@@ -16,8 +16,8 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ElementBench(nn.Module):
-    """Propagate the light of a source through a printed element onto the image plane; element and window have
-    equal size.
+    """Propagate the light of a source through a printed element onto a window of the same size in the image
+    plane.
 
     ``propagator`` belongs to the wave from the middle of the source.
     """
@@ -60,9 +60,7 @@ def _key(wavelength_um: float) -> str:
 
 
 class ViewsBench(nn.Module):
-    """Form the images behind one element under several optical conditions: colours, planes, angles of
-    incidence.
-    """
+    """Form the images behind one element for several colours, planes or angles of incidence."""
 
     def __init__(self, layout: LayoutSettings, views: Sequence[Optics]):
         super().__init__()

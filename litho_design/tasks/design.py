@@ -35,7 +35,7 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device and duration of a run, interrupted runs included."""
+    """Command, software, device and duration of a run, including earlier, interrupted runs."""
 
     device: str
     threads: int
@@ -57,8 +57,8 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """Findings of a task about its levels and their print; ``thick`` contains the figures as a thick
-    element.
+    """Findings of a task about its levels and their print; ``thick`` contains the figures of the print as a
+    thick element.
     """
 
     tiling: TilingCheck | None = None
@@ -70,7 +70,7 @@ class Findings(Record):
 
 
 class Design(Findings, Result):
-    """design.json."""
+    """The contents of design.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/design/1"
     FILE_NAME: ClassVar[str] = "design.json"
@@ -107,7 +107,7 @@ class Design(Findings, Result):
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
-    """Save arrays by file name, and levels also as a 16-bit grey PNG; return their SHA-256."""
+    """Save arrays by file name, and levels as a 16-bit grey PNG too; return the SHA-256 of all files."""
     hashes = {}
     for name, array in arrays.items():
         with atomic_file(folder / name) as temporary, open(temporary, "wb") as stream:
@@ -125,11 +125,11 @@ def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
 
 
 def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:
-    """Read one array of a design folder and check it against the hash in its record; ``on_disk`` maps the
-    file.
+    """Read one array of a design folder and check it against the hash in the record; ``on_disk`` only maps
+    the file.
 
     Raises:
-        InputError: there is no such file, or it changed after the design.
+        InputError: there is no such file, or the file changed after the design.
     """
     path = Path(folder) / name
     wanted = Design.read(folder).files.get(name)

@@ -24,7 +24,8 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# Number of layouts that every model prints (the searched and the uncorrected one), and seconds for a page.
+# Number of layouts that every model prints (the searched and the uncorrected one), and seconds to write a
+# page.
 _CANDIDATES, _PAGE_S = 2, 7.0
 # A function that writes the report into the folder of a design, from the record and the history of the
 # search.
@@ -39,7 +40,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
     before and after the run; if they changed, no design is written.
 
     Args:
-        report: called with the folder when the arrays are in it; the record is written afterwards.
+        report: function that is called when the arrays are in the folder; the record is written afterwards.
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
@@ -49,7 +50,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
     settings, folder = task.settings, Path(out)
     for printer in task.printers:
         if printer.only_judges:
-            hint = "a fab can only judge: --judge"
+            hint = "a fab can only judge; give it with --judge"
             raise InputError(f"model {printer.name}", got="a virtual fab", wanted="a frozen model", hint=hint)
     before = [printer.weights_sha256() for printer in task.printers]
     judged_by = [judge.weights_sha256() for judge in task.judges]
@@ -133,7 +134,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         searched: levels of the search on the pixels (size, size).
 
     Returns:
-        Its levels, and the width of the design; None if there is only one model and nothing to compare.
+        Its levels, and the width of the design, which is None if there is only one model and one candidate.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
     models = {printer.name: printer for printer in (*task.printers, *task.judges)}
@@ -165,7 +166,9 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
 
 
 class _Searched(NamedTuple):
-    """The levels per cell after search and polish with their loss, the search itself, and its costs."""
+    """The result of search and polish: levels per cell with their loss, the state of the search, and its
+    duration.
+    """
 
     levels: Tensor
     loss: float
@@ -204,8 +207,8 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate the time of choice, scores and yield, from one print by each model and one draw of the
-    yield.
+    """Estimate the time for choosing a layout, for scores and for the yield, from one print by each model and
+    one draw.
     """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()

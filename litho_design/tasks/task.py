@@ -1,4 +1,4 @@
-"""The interface of a task: what the light behind a printed element should do."""
+"""The interface of a task, which states what the light behind a printed element should do."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class Task:
     Attributes:
         name: unique name of the task in results.
         starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
-        headline: figures that reports and commands show first; if empty, all.
+        headline: figures that reports and commands show first; all figures if empty.
         errors: figures that are better when lower; ``loss_unit``: see ``Width``.
-        in_one_piece: whether the search ends with single-level changes, and the run writes a page.
+        in_one_piece: whether the search ends with single-level changes, and the run writes a report.
         ranks: the processes that share the task.
-        score_type: record of the scores, whose field descriptions are the meanings in reports.
+        score_type: record of the scores, whose field descriptions explain the figures in reports.
         settings, printer, printers, inputs: as given; ``notes``: notes for the record.
         bench: optics of the settings, which turn a height map into what is seen.
 
@@ -63,11 +63,12 @@ class Task:
         settings: geometry, optics, search, process window.
         printer: frozen model, or nominal heights.
         inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models; the loss is then the worst over all, plus a penalty on their disagreement.
+        ensemble: further models; the loss is then the worst loss over all models plus a penalty on their
+            disagreement.
         record: source of the inputs.
 
     Raises:
-        InputError: the task does not have this start, or the spreads exceed the range of the propagator.
+        InputError: the task does not support this start, or the spreads exceed the range of the propagator.
     """
 
     name: ClassVar[str]
@@ -92,7 +93,7 @@ class Task:
     ):
         start = settings.search.start
         if start not in self.starts:
-            wanted = f"{', '.join(map(repr, self.starts))} for {self.name}"
+            wanted = f"one of {', '.join(map(repr, self.starts))} for {self.name}"
             raise InputError("start", got=repr(start), wanted=wanted)
         self.settings, self.printer, self.printers = settings, printer, [printer, *ensemble]
         self.inputs = dict(inputs or {})
@@ -116,7 +117,8 @@ class Task:
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
-        """Return the loss of what is seen, by default shares of the incident power (views, size, size).
+        """Return the loss of what is seen, which is by default the shares of the incident power (views, size,
+        size).
 
         Returns:
             A scalar, or a scalar and its named parts.
@@ -138,7 +140,7 @@ class Task:
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels (*cells) at the start of a search that does not start at random.
+        """Return the levels (*cells) from which a search starts if it does not start at random.
 
         Args:
             level_phase: phase that each level prints, radian (levels,).
@@ -146,7 +148,7 @@ class Task:
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return uncorrected layouts (size, size) by name: the start for nominal heights."""
+        """Return uncorrected layouts (size, size) by name, by default the start for nominal heights."""
         if set(self.starts) == {"random"}:
             return {}
         layout = self.settings.layout
@@ -155,7 +157,7 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses through several models (models,) to one: return the largest."""
+        """Combine the losses of several models (models,) into one, by default the largest."""
         return losses.max()
 
     def check_printer(self, printer: Printer) -> None:
@@ -180,14 +182,14 @@ class Task:
         return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score a print (size, size), µm, whose design expected ``expected_um``, by default the print
-        itself.
+        """Score a print (size, size), µm; ``expected_um`` is the print that the design expected, by default
+        the same.
         """
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score a print as a thick element; return None if the settings already say thick, or without
+        """Score a print as a thick element; return None if the settings already say thick, or the task has no
         light.
         """
         if self.settings.optics.element == "thick":
@@ -227,7 +229,7 @@ class Task:
         return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Return the efficiency of an ideal element found from a print (size, size), µm; None if that is
+        """Return the efficiency of an ideal element found from a print (size, size), µm; None if it is
         undefined.
         """
         return None
@@ -238,8 +240,8 @@ class Task:
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Draw what is seen for reports: images divided by their brightest value, side by side in a
-        square.
+        """Draw what is seen, for reports: images side by side in a square, each divided by its brightest
+        value.
         """
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
@@ -254,8 +256,8 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Return the draws of the process window in the loss, with their benches; without draws, the print as
-        modelled.
+        """Return the draws of the process window in the loss, each with its bench; without draws, only the
+        print as modelled.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
@@ -278,8 +280,8 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models the loss is ``over_models`` plus the models' disagreement; with samples of the
-        process window it is the risk over the samples. The penalty on rare levels and steps is added.
+        With several models, the loss is ``over_models`` plus the models' disagreement; with samples of the
+        process window, it is the risk over the samples. The penalty on rare levels and steps is added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
@@ -342,7 +344,7 @@ def register_task(task: type[Task]) -> type[Task]:
     """Register your own task, so that its designs can be opened; also works as a class decorator.
 
     Raises:
-        InputError: the task has no name, or the name of another task.
+        InputError: the task has no name, or another task has this name.
     """
     name = getattr(task, "name", "")
     known = _TASKS.get(name)
@@ -363,7 +365,7 @@ def registered_task(name: str) -> type[Task]:
             "task",
             name,
             sorted(_TASKS),
-            also="one of your own, made known by register_task (--plugin names its file)",
+            also="your own task, registered by register_task in a file that --plugin names",
         )
     return _TASKS[name]
 
@@ -372,5 +374,5 @@ def _source(task: type) -> str:
     try:
         return inspect.getsource(task)
     except (OSError, TypeError):
-        # The class was typed into an interpreter, so there is no source to compare.
+        # If the class was typed into an interpreter, there is no source to compare.
         return ""

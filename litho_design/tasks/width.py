@@ -1,4 +1,4 @@
-"""The width of a design: the figures of its layout and of uncorrected layouts by every available model."""
+"""The width of a design: the figures that every available model gives its layout and uncorrected layouts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ _SURE = 2.0
 
 
 class Width(Record):
-    """Figures of a design by model: first the models of the search, then the judges, which it did not use.
+    """Figures of a design by model: first the models of the search, then the judges, which the search did not
+    use.
 
     Attributes:
         searched_with: how many of the models the search used.
@@ -21,7 +22,7 @@ class Width(Record):
         returned: the candidate with the smallest loss over all models (``Task.over_models``).
         figure: the first figure of the task; ``less``: whether it is better when lower.
         loss_unit: factor that converts the loss to the unit of the figure, if the loss is an error that
-            includes the model's own; otherwise None.
+            includes the model's own error; otherwise None.
         level_heights_um: printed height of a wide field of each level, by model.
     """
 
@@ -41,7 +42,7 @@ class Width(Record):
     @property
     def between(self) -> tuple[float, float]:
         """Return the expected range of a print's figure: the range over models, widened by twice their own
-        error.
+        errors.
         """
         values = self.values()
         if self.loss_unit is None:
@@ -53,7 +54,7 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Return the median over models of the figure's gain over the best uncorrected layout."""
+        """Return the gain of the figure over the best uncorrected layout, as the median over models."""
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
         return float(np.median(sign * self.values() - np.max(idle, axis=0))) if idle else None

@@ -64,20 +64,21 @@ def compare(
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
     All arms share every setting except the printer. Finished designs in ``out`` are reused, and interrupted
-    designs resume. The arms' own printers also judge, which completes the matrix.
+    designs resume. The arms' printers also judge, so the matrix of arms and judges is complete.
 
     Args:
         settings: settings of a hologram or a lens, which decide what is designed, or of ``task``; ``seeds``
-            replace the seed of the search.
-        arms: printers to design with: models by name, or NAME=MODEL, MODEL, ``none`` and loaded printers.
+            override the seed of the search.
+        arms: printers to design with, as a mapping of models by name, or as a list of NAME=MODEL, MODEL,
+            ``none`` and loaded printers.
         out: folder of the comparison.
         judges: further printers that only judge.
-        target: wanted image, for holograms.
+        target: target image, for holograms.
         task, inputs: a task of your own and its arrays, as for ``design``.
         objects, held_out_objects: as for ``design_lens``.
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
-        workers: number of local processes that design; ``dask``: address of a Dask scheduler instead.
+        workers: number of local processes that design; ``dask``: address of a Dask scheduler to use instead.
 
     Returns:
         The record written to ``out/gap.json``.
@@ -101,7 +102,7 @@ def compare(
     elif isinstance(settings, HologramSettings):
         if objects or held_out_objects:
             raise InputError(
-                "objects", got="the hoe task, which has a target", wanted="the lens task", hint="--target"
+                "objects", got="the hoe task, which has a target", wanted="the lens task", hint="use --target"
             )
         wanted = load_target(target, settings.layout.size_px)
         make = partial(HologramTask, inputs={"target": wanted.pixels}, record=wanted.record)
@@ -154,11 +155,13 @@ def _design(job: _Job) -> Design:
 def _judged(
     place: Path, arm: str, seed: int, printers: Mapping[str, Printer]
 ) -> tuple[list[GapEntry], list[Panel]]:
-    """Print a finished design with every printer; return entries, and pictures after the wanted one."""
+    """Print a finished design with every printer; return entries and pictures, beginning with the target
+    image.
+    """
     loaded = load_design(place, device=printers[arm].device)
     expected = loaded.printed_um(printers[arm])
     entries, side_um = [], loaded.window_um
-    panels = [] if loaded.target is None else [Panel("wanted", loaded.target.cpu().numpy(), side_um)]
+    panels = [] if loaded.target is None else [Panel("target", loaded.target.cpu().numpy(), side_um)]
     for name, printer in printers.items():
         printed = loaded.printed_um(printer)
         entries.append(
@@ -188,5 +191,5 @@ def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Se
             "judges",
             got=f"{both[0]!r} twice",
             wanted="judges with names that no arm has",
-            hint="the models of the arms are judges in any case",
+            hint="the models of the arms judge in any case",
         )

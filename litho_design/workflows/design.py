@@ -41,9 +41,9 @@ class How(TypedDict, total=False):
     """Arguments that all design functions share.
 
     Attributes:
-        judges: models, MODEL or NAME=MODEL, that print the finished layout to show the width of the design;
-            by default the zoo's models that were trained on the same prints.
-        robust: search also through those judges that have gradients: for the lowest loss over all models
+        judges: models (MODEL or NAME=MODEL) that print the finished layout to show the width of the design;
+            by default, the zoo's models that were trained on the same prints.
+        robust: search also through the judges that have gradients; the loss is then that over all models
             (``Task.over_models``), plus a penalty on the models' disagreement.
         device: device of the models.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
@@ -66,24 +66,24 @@ def design_hologram(
     band_px: int | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout of a hologram so that its print shows the wanted image.
+    """Optimise the layout of a hologram so that its print shows the target image.
 
     Args:
         target: a drawing by name, an image file, or an array (size_px, size_px) in [0, 1].
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        band_px: most rows of a band; designs in bands, for elements beyond the memory of a process. Processes
-            started by torchrun share the bands; with ``cuda`` each takes a GPU of its own. The model must
-            have a finite reach, and no judges print the layout.
+        band_px: largest number of rows of a band, to design in bands an element too large for the memory of
+            one process. Processes started by torchrun share the bands; with ``cuda``, each uses its own GPU.
+            The model must have a finite reach, and no judges print the layout.
         how: judges, robust, device, extrapolate, announce (see ``How``).
 
     Returns:
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: a target of another size or without dark and bright pixels, a model that does not
-            fit the layout, or a folder that holds another result.
+        InputError: the target has another size or lacks dark or bright pixels, the model does not fit the
+            layout, or the folder holds another result.
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
     if band_px is not None:
@@ -112,7 +112,7 @@ def design_lens(
     tile_px: int | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout of a lens so that its print focuses, or images after reconstruction.
+    """Optimise the layout of a lens so that its print focuses light, or images objects after reconstruction.
 
     Args:
         model: as for ``design_hologram``.
@@ -120,16 +120,17 @@ def design_lens(
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
-        tile_px: for a lens that focuses light: design its rings along a radius, in tiles of this length,
-            without computing the plane, up to 10 mm and more. The model must have a finite reach.
+        tile_px: length of the tiles, if the rings of a lens that focuses light are designed along a radius.
+            The plane is then not computed, so the lens may be 10 mm wide or more. The model must have a
+            finite reach.
         how: see ``How``.
 
     Returns:
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: as for ``design_hologram``; a radial search of a layout without rings or with a
-            square aperture; or objects that are not pictures.
+        InputError: as for ``design_hologram``; or the search is radial but the layout has no rings or the
+            aperture is square; or the objects are not pictures.
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
     if tile_px is not None:
@@ -155,15 +156,15 @@ def correct(
     scan: MeasuredSource | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout whose print comes closest to a wanted height map.
+    """Find the layout whose print comes closest to a target height map.
 
     Args:
-        relief: lens, blaze or staircase, a grey picture, a float TIFF in µm, or an array (size_px, size_px)
-            of heights in µm (see ``load_relief``).
+        relief: ``lens``, ``blaze`` or ``staircase``, a grey picture, a float TIFF of heights in µm, or an
+            array (size_px, size_px) of heights in µm (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
-        after: folder of a first correction whose print was measured; ``scan``: that measurement. The
-            same deviation from the expectation is expected in the next print.
+        after: folder of a first correction whose print was measured; ``scan``: that measurement. The next
+            print is expected to deviate from its expectation in the same way.
         how: see ``How``; robust by default.
 
     Returns:
@@ -172,8 +173,8 @@ def correct(
 
     Raises:
         InputError: ``load_relief`` refuses the relief; the model or the folder is refused as in
-            ``design_hologram``; ``after`` and ``scan`` are not given together; or the first element has
-            another layout, or the scan shows another element.
+            ``design_hologram``; ``after`` and ``scan`` are not given together; the first element has another
+            layout; or the scan shows another element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -189,7 +190,7 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """Return the deviation of a first element's measured print, as an input of the second element.
+    """Return the deviation of a first element's measured print as an input for the second element.
 
     Return no inputs if there is no first element.
     """
@@ -235,7 +236,7 @@ def design(
             ``design_hologram``.
     """
     if isinstance(task, str):
-        hint = "design_hologram, design_lens and correct design what the package knows"
+        hint = "for holograms, lenses and reliefs, use design_hologram, design_lens and correct"
         raise InputError("task", got=repr(task), wanted="a class derived from Task", hint=hint)
     registered_task(task.name)
     made = settings or DesignSettings()
@@ -272,12 +273,12 @@ def _designed(
 
 
 def _alone(how: How, *objects: Any) -> How:
-    """Refuse objects, judges and ``robust`` for a large element; return the remaining arguments, without
+    """Refuse objects, judges and ``robust`` for a large element; return the other arguments, without
     judges.
     """
     if how.get("robust") or objects or how.get("judges"):
-        got = "objects or judges"
-        raise InputError("large element", got=got, wanted="only one model and no judges")
+        got = "objects, judges or a robust search"
+        raise InputError("large element", got=got, wanted="one model, without objects or judges")
     return {**how, "judges": ()}
 
 

@@ -1,4 +1,6 @@
-"""A first result: one small hologram, designed without and with a printer model; this model prints both."""
+"""A first result: one small hologram, designed without and with a printer model, which prints both
+designs.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,14 @@ from litho_design.judging.gap import GapResult
 from litho_design.printers.source import Device
 from litho_design.workflows.compare import compare
 
-# Nominal heights for the first design, the model for the second, and a further judge.
+# Names of the nominal heights for the first design, the model for the second, and a further judge.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
 def small_hologram() -> HologramSettings:
-    """Return settings of a hologram that takes a minute on two cores.
+    """Return the settings of a hologram that takes a minute to design on two cores.
 
-    At its distance, the hologram can draw the letters.
+    At this distance, the hologram can resolve the letters of the target.
     """
     small = {
         "layout.size_px": 256,
@@ -43,12 +45,12 @@ def first(
     Args:
         out: folder of the result; its ``report.html`` shows target, prints and images side by side.
         target: as for ``design_hologram``.
-        settings: settings of both designs; by default a hologram that takes about a minute.
+        settings: settings of both designs; by default, those of ``small_hologram``.
         device, announce: as for ``design_hologram``.
 
     Returns:
-        The record written to ``out/gap.json``, as by ``compare``. Physics, which neither design used, also
-        judges both.
+        The record written to ``out/gap.json``, as from ``compare``. Physics, which neither design used,
+        judges both too.
 
     Raises:
         InputError: ``compare`` refuses an argument.

@@ -35,16 +35,16 @@ def score(
     A lens of rings (``lens --large``) is printed and scored along its radius.
 
     Args:
-        design: a design, as its folder or from ``load_design``.
+        design: the folder of a design, or a design from ``load_design``.
         out: folder of the score.
         judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Judges
-            with the weights of the design's own model are marked as not independent. Without judge, scan and
+            with the weights of the design's own model are marked as not independent. Without a judge, scan or
             photograph, the zoo's models that were trained on the same prints judge.
         scan: a measured height map of the printed part.
-        camera: a photograph of the printed hologram's image, or of an object through the printed lens;
-            with ``scan`` it is deconvolved with the PSF of the measured print too.
+        camera: a photograph of the printed hologram's image, or of an object through the printed lens; with
+            ``scan``, it is also deconvolved with the PSF of the measured print.
         element: ``thick`` judges every print by the wave propagation method; ignored for a loaded design.
-        band_px: most rows of a band, to print and score a large hologram band by band.
+        band_px: largest number of rows of a band, if a large hologram is printed and scored band by band.
         device: where prints and waves are computed; ignored for a loaded design.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
@@ -74,7 +74,7 @@ def score(
         fit: Any = {"device": loaded.device, "extrapolate": extrapolate}
         printers = list(load_printers(judges or (), record.layout, **fit).values())
     if not printers and scan is None and camera is None:
-        raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
+        raise InputError("score", got="no judge", wanted="a judge, a scan or a photograph")
     with growing_folder(out, ScoreResult.FILE_NAME):
         judgement = judge_design(loaded, printers, scan, camera)
         result = ScoreResult.of(loaded.folder, loaded.record, judgement.scores)

@@ -25,8 +25,8 @@ from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
-# All printers of singles are Physics models. Mixtures also have other printers, so the best base model is
-# chosen.
+# All printers of singles are Physics models. Mixtures also have other printers, so the loop chooses the best
+# base model for them.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
 # A function that maps a dataset store and an empty working folder to the loop's answer.
@@ -54,7 +54,7 @@ def new_board(
     n_scans: int = 12,
     size_px: int = 256,
 ) -> Draws:
-    """Make the stores of a board in ``out/stores`` and their answers in ``out/hidden``; resumable.
+    """Make the stores of a board in ``out/stores`` and write their causes to ``out/hidden``; resumable.
 
     Args:
         out: folder of the board.
@@ -103,7 +103,7 @@ def judge_board(
     Args:
         board: folder of ``new_board``.
         out: folder of the trials; each trial keeps the files that the loop wrote.
-        loop: function of a store and an empty folder that returns an answer; by default our closed loop.
+        loop: function that maps a store and an empty folder to an answer; by default our closed loop.
         name: name of the loop; an ``out`` with the trials of another loop is refused.
         report: function that receives the progress messages of the default loop.
 
@@ -136,17 +136,18 @@ def command_loop(command: str) -> Loop:
     FOLDER/answer.json.
 
     Raises:
-        InputError: a command that cannot be run. The loop raises it for a non-zero exit code or a missing
-            answer.
+        InputError: a command that cannot be run. The returned loop raises it if the exit code is not 0 or the
+            answer is missing.
     """
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
-        raise InputError("command of the loop", got=command or "nothing", wanted="a program with arguments")
+        wanted = "a program that can be run, with its arguments"
+        raise InputError("command of the loop", got=command or "nothing", wanted=wanted)
 
     def loop(store: Path, folder: Path) -> Answer:
         code = subprocess.run([*words, str(store), str(folder)], check=False).returncode
         if code:
-            raise InputError(command, got=f"exit code {code}", wanted="0")
+            raise InputError(command, got=f"exit code {code}", wanted="exit code 0")
         return Answer.read(folder / Answer.FILE_NAME)
 
     return loop
@@ -181,10 +182,10 @@ def cpu_s() -> float:
 
 
 def trial_line(trial: Trial) -> str:
-    """Describe a trial in one line: outcome of each cause, false names, error, reason of a failure."""
+    """Describe a trial in one line: the outcome of each cause, false names, the error, why it failed."""
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
-    false = [f"false: {name}" for name in trial.false_names]
+    false = [f"false name: {name}" for name in trial.false_names]
     ratio = trial.errors and trial.errors.ratio
-    errors = [f"{ratio:.2f} × the true models"] if ratio else []
+    errors = [f"error {ratio:.2f} × that of the true models"] if ratio else []
     reason = [trial.failure] if trial.failure else []
     return f"trial {trial.draw.number}: {', '.join([*causes, *false, *errors, *reason])}"

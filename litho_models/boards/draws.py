@@ -1,5 +1,5 @@
-"""Draw the planted causes, with one seed and before any run, from all causes that the virtual fab can
-simulate.
+"""Draw the causes to plant from all causes that the virtual fab can simulate, with one seed and before any
+run.
 
 There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. This module
 does not read the loop's catalogue of effects.
@@ -18,8 +18,8 @@ from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest drawn size. The strength is set on four scans. On all scans the size may be 13 % smaller, and the
-# cause must still count.
+# Smallest and largest drawn size. Strengths are set on four scans. On all scans, a size may be 13 % smaller,
+# and the cause must still count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
@@ -43,7 +43,7 @@ _OF_SINGLE_SCANS = {
 }
 # The measured prints may already have these causes, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
-# These knobs were added after the first boards and are left out there, so that the draws stay the same.
+# These knobs were added after the first boards. They are not drawn, so that those boards stay the same.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
 # Ranges of the printers' parameters, around the fab's defaults and within the bounds of Physics.
 _PRINTER_RANGES = {
@@ -70,7 +70,7 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
 
 
 def names_of(cause: str) -> tuple[str, ...]:
-    """Return the names in the catalogue that are right for a knob or a form."""
+    """Return the names of the catalogue that count as right for a knob or a form."""
     if cause in FORMS:
         return FORMS[cause].names
     effect = KNOBS[cause].effect
@@ -113,7 +113,7 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 
 
 def _draw_mixtures(rng: Rng) -> list[Draw]:
-    """Draw about as many causes with a form of the catalogue as causes of another form. No two causes of a
+    """Draw the trials of mixtures. About half of the causes have a form of the catalogue. No two causes of a
     trial share a right name.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)

@@ -1,4 +1,4 @@
-"""Make the scoreboard: all draws with their outcomes, and the headline figures."""
+"""Make the scoreboard: all draws with their outcomes, and the headline results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
 
 
 class Figure(NamedTuple):
-    """A headline figure in words, with the target set before the board was run; empty without a target."""
+    """A headline result in words. ``wanted`` is the target set before the board was run, or empty."""
 
     what: str
     value: str
@@ -45,8 +45,8 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Format the number of hits and the total, with the exact 95 % interval of the share (Clopper and
-    Pearson).
+    """Format the number of hits and the total, with the exact 95 % confidence interval of the share (Clopper
+    and Pearson).
     """
     known = [*hits]
     if not known:
@@ -66,7 +66,7 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline figures. In a failed trial no cause counts as found, and the error counts as too
+    """Compute the headline results. In a failed trial, no cause counts as found, and the error counts as too
     large.
     """
     trials = scoreboard.trials
@@ -84,7 +84,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         ratio = np.median(bias[:, 1] / bias[:, 0])
         figures.append(
             Figure(
-                "error of the base's values: without, with what was found; median of the ratios",
+                "error of the base's values without, with the findings; median of the ratios",
                 f"{100 * without:.1f} %, {100 * with_found:.1f} %; {ratio:.2f}",
                 "at most 1/3",
             )
@@ -92,14 +92,14 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
     minutes = [trial.dataset_cpu_s / 60 for trial in trials if trial.dataset_cpu_s is not None]
     if minutes:
         spent = f"{np.mean(minutes):.1f}, {max(minutes):.1f}"
-        figures.append(Figure("processor minutes of a data set: mean, longest", spent))
+        figures.append(Figure("processor minutes per data set: mean, longest", spent))
     return figures
 
 
 def figure_lines(scoreboard: Scoreboard) -> list[str]:
-    """Return the headline figures as lines for a terminal."""
+    """Return the headline results as lines for a terminal."""
     return [
-        f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else "")
+        f"{value:>24}  {what}" + (f" (target: {wanted})" if wanted else "")
         for what, value, wanted in figures_of(scoreboard)
     ]
 
@@ -114,18 +114,18 @@ def _of_singles(trials: Sequence[Trial]) -> list[Figure]:
     in_form, other = (_of_kind(trials, kind) for kind in ("in-form", "other-form"))
     rest = [trial for trial in trials if trial.draw.kind != "other-form"]
     return [
-        _causes("known form: named, single or in a set", counted(in_form), _NAMED, "all but one"),
+        _causes("known form: named, alone or in a set", counted(in_form), _NAMED, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in in_form), "none"),
         _causes("other form: correct name, or a law", counted(other), _LAWFUL),
-        _causes("… noticed, with or without name or law", counted(other), _SEEN, "all but one"),
+        _causes("… noticed, with or without a name or law", counted(other), _SEEN, "all but one"),
         Figure("… trials with a false name", share(bool(one.false_names) for one in other), "at most 1"),
         Figure(
-            f"all others: error after at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
+            f"all others: error of at most {TOLERANCE_OF_THE_REST:g} × that of the true models",
             share(map(reaches_floor, rest)),
             "at least 90 %",
         ),
         Figure(
-            f"of another form: at most {TOLERANCE['other-form']:g} ×",
+            f"other form: error of at most {TOLERANCE['other-form']:g} ×",
             share(map(reaches_floor, other)),
             "at least 90 %",
         ),
@@ -141,7 +141,7 @@ def _of_mixtures(trials: Sequence[Trial]) -> list[Figure]:
     simulated = [trial for trial in trials if trial.draw.kind != "measured"]
     return [
         _causes(
-            "causes of a known form: named, single or in a set",
+            "causes of a known form: named, alone or in a set",
             [one for one in causes if one.name not in FORMS],
             _NAMED,
             "at least 80 %",
@@ -157,7 +157,7 @@ def _of_mixtures(trials: Sequence[Trial]) -> list[Figure]:
         _causes("S-shaped axis in half of the scans: named or shared", s_shaped, _NAMED, "all"),
         Figure("trials with a false name", share(bool(one.false_names) for one in simulated), "at most 5 %"),
         Figure(
-            f"error after at most {TOLERANCE['mixture']:g} × that of the true models",
+            f"error of at most {TOLERANCE['mixture']:g} × that of the true models",
             share(map(reaches_floor, mixed)),
             "at least 80 %",
         ),

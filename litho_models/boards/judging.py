@@ -21,7 +21,7 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# The name found for these forms is right only if the found exponent includes this one.
+# For these forms, a name is right only if the interval of its exponent contains this value.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # This form consists of line offsets, so a loop that reports line offsets has noticed it.
@@ -70,10 +70,10 @@ def judge(
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """Return one outcome per planted cause, in their order, or one outcome for the whole trial if nothing was
-    planted.
+    """Return one outcome per planted cause, in the order of the causes, or one outcome for the whole trial if
+    nothing was planted.
 
-    Each finding counts for at most one cause; larger causes come first.
+    Each finding counts for at most one cause. Findings are assigned to larger causes first.
     """
     found = answer.found
     left = answer.left or bool(_beyond_noise(found))
@@ -104,8 +104,8 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the named sets of causes that contain no planted cause. The form of the base also counts as
-    planted.
+    """Return the sets of causes that the loop named but that contain no planted cause. The form of the base
+    also counts as planted.
     """
     return [
         " | ".join(named.names)
@@ -140,8 +140,8 @@ def _displacement_is_shared(
     return False
 
 
-# A model of all scans cannot predict values drawn anew in every scan (or line), rounding, and scars at random
-# positions. Bends are not listed, because the store's transform contains them.
+# A model of all scans cannot predict rounding, scars at random positions, or values that are drawn anew for
+# every scan or line. Bends are not listed, because the store's transform contains them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",

@@ -1,6 +1,6 @@
 """Causes whose form is not in the catalogue (other laws, axes, ranges, scales), and printers beyond Physics.
 
-Neither this module nor the drawing reads the loop's catalogue of effects. The seed of a trial determines
+Neither this module nor ``draws`` reads the loop's catalogue of effects. The seed of a trial determines the
 random values of its forms, such as a direction, a distance or a position.
 """
 
@@ -35,7 +35,7 @@ _MOST_SCANS = 256
 
 @dataclass(frozen=True)
 class Form:
-    """One form; ``draw`` fixes its random values and returns its law.
+    """One form; ``draw`` draws its random values and returns its law.
 
     Attributes:
         limit: largest strength, in ``unit``; the law of a form changes nothing at strength 0.
@@ -59,7 +59,7 @@ FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """Several forms with strengths, which the fab applies one after the other at each stage."""
+    """Several forms with their strengths. At each stage, the fab applies them one after the other."""
 
     def __init__(self, strengths: Mapping[str, float], seed: int):
         self._laws = [
@@ -160,7 +160,7 @@ def _halo_ring(rng: Rng) -> Law:
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
 def _fast_axis_memory(rng: Rng) -> Law:
-    """Share of the dose lost after earlier writing in the hatch line; fades over 3–8 µm."""
+    """Share of the dose lost by earlier writing in the same hatch line; fades over 3–8 µm."""
     decay_um = rng.uniform(3, 8)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -181,7 +181,7 @@ def _crowding(rng: Rng) -> Law:
 
 @_form("alternate-slices", "dose", "1", 2.0)
 def _alternate_slices(rng: Rng) -> Law:
-    """Slices too many or too few in every second level; the sign is random."""
+    """Surplus or missing slices in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -193,7 +193,7 @@ def _alternate_slices(rng: Rng) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: Rng) -> Law:
-    """Sd added to the spot from a random print near the middle on."""
+    """Blur (sd) added to the spot, starting at a random print near the middle."""
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
         blur(dose, canvas.pitch_um, strength) if job.order > first else dose
@@ -223,7 +223,7 @@ def _diagonal_slope_loss(rng: Rng) -> Law:
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall in one direction."""
-    # The change is a loss of half the amount on both flanks, plus a displacement, which registration removes.
+    # This equals a loss of half the amount on both flanks plus a displacement, which registration removes.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -232,7 +232,7 @@ def _lee_side_loss(rng: Rng) -> Law:
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: Rng) -> Law:
-    """Share of the height lost between two heights 0.15–0.25 µm apart; 1: a plateau."""
+    """Share of the height lost between two heights 0.15–0.25 µm apart; 1 makes a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
         surface - strength * np.clip(surface - lower_um, 0.0, width_um)
@@ -250,7 +250,7 @@ def _fringes(rng: Rng) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: Rng) -> Law:
-    """Gain of detail finer than 0.6–1.2 µm, so edges overshoot."""
+    """Gain of detail finer than 0.6–1.2 µm, so that edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
@@ -383,12 +383,12 @@ def _two_part_spot(rng: Rng) -> Law:
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
 def _hill_response(rng: Rng) -> Law:
-    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) beside the logistic one."""
+    """Weight of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) against the logistic one."""
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
-        # Doses at which the default printer's logistic curve gives the conversion that the Hill curve gives
-        # at ``dose``.
+        # These are the doses at which the default printer's logistic curve gives the same conversion as the
+        # Hill curve does at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
@@ -402,7 +402,7 @@ def _hill_response(rng: Rng) -> Law:
 
 @_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
 def _elliptical_blur(rng: Rng) -> Law:
-    """Sd added to the spot along one direction."""
+    """Blur (sd) added to the spot along one direction."""
     direction = rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: apply_transfer(
         dose, np.exp(-2 * (np.pi * strength * _frequency_along(canvas, direction)) ** 2)
@@ -438,7 +438,7 @@ def _seam(rng: Rng) -> tuple[int, float]:
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> Array:
-    """Return a mask that is True on one side of a seam; ``side`` gives the axis that the seam crosses, and
+    """Return a mask that is True on one side of a seam; ``side`` encodes the axis that the seam crosses and
     the side.
     """
     across = _across(canvas, axis=side // 2)

@@ -1,8 +1,8 @@
 """Plant the causes of a trial at their strengths, and print its fields.
 
-The size of a cause is the rms of the change that the best refitted base cannot absorb. The Physics model,
-which can represent the fab without causes, is fitted to the noise-free scans with the cause. Datum, gain,
-tilt, bow and an affine registration error are free in each scan.
+The size of a cause is the rms of the change that the best refitted base cannot absorb. To find it, the
+Physics model, which can represent the fab without causes, is fitted to the noise-free scans with the cause.
+Datum, gain, tilt, bow and an affine registration error are free in each scan.
 """
 
 from __future__ import annotations
@@ -87,12 +87,12 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength at which each cause alone has its drawn size on these fields, first for the form of
-    the base.
+    """Find the strength at which each cause, alone, has its drawn size on these fields. The form of the base
+    comes first.
 
     A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded.
-    The cause is not drawn again. The size of an alias is the change of the scans before a refit, because the
-    refit absorbs most of this change.
+    No other cause is drawn in its place. The size of an alias is the change of the scans before a refit,
+    because the refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [_sized(one, jobs, draw) for one in drawn]

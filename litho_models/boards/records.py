@@ -31,7 +31,7 @@ class CauseDraw(Record):
 
     Attributes:
         by: with ``batch``, scans after ``place`` in the printing order have ``weak`` times the strength. With
-            ``field``, scans whose id ends in none of the digits of ``place`` have it.
+            ``field``, this holds for scans whose id ends in none of the digits of ``place``.
     """
 
     name: str
@@ -77,8 +77,8 @@ class Planted(Record):
 
     Attributes:
         names: right names in the catalogue of effects.
-        strength: strength in ``unit``; ``at_limit``: whether its range ended before the wanted size was
-            reached.
+        strength: strength in ``unit``; ``at_limit``: whether this is the largest possible strength, which did
+            not reach the drawn size.
         rms_nm: rms residual that this cause alone leaves after a refit of base, scan terms and registration,
             without noise.
     """
@@ -134,7 +134,7 @@ class Found(Record):
         names: name of the finding in the catalogue, then the names of effects that look the same.
         by: grouping of scans between which the strength differs; ``scan``: one strength per scan; ``all``:
             one strength for all scans.
-        exponents: intervals of its exponent, if it is a power law.
+        exponents: confidence intervals of its exponent, if it is a power law.
     """
 
     names: list[str]
@@ -144,7 +144,7 @@ class Found(Record):
 
 
 class Answer(Result):
-    """A loop's answer about one store.
+    """The answer of a loop for one store.
 
     Attributes:
         found: causes, laws and descriptions.
@@ -172,10 +172,10 @@ class Answer(Result):
 
 # Older results also contain the loop's verdict and its base.
 class Trial(Result, extra="ignore"):
-    """The result of one trial; a failed trial has a reason and no errors.
+    """The result of one trial. A failed trial has no errors; ``failure`` says why it failed.
 
     Attributes:
-        false_names: named sets of causes that contain no planted cause.
+        false_names: sets of causes that the loop named but that contain no planted cause.
         bias: median relative error of the base's values, without and with the findings; None if the printer
             or the chosen base is not a Physics model.
         dataset_cpu_s: processor seconds of build and loop.

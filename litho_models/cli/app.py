@@ -28,22 +28,22 @@ app.command("close-loop")(close_loop)
 app.command("next-print")(next_print)
 app.command()(noise)
 app.command()(check)
-zoo = typer.Typer(help="The models that come with the package: list, or show NAME.", no_args_is_help=True)
+zoo = typer.Typer(help="List or show the models that come with the package.", no_args_is_help=True)
 app.add_typer(zoo, name="zoo")
 app.add_typer(board, name="board")
 
 ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME")]
 StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]
-Out = Annotated[Path, option("folder of the result; one that holds anything else is refused")]
+Out = Annotated[Path, option("folder for the result; a folder with other contents is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
     option("terms fitted to each scan for its datum-free error; by default offset, or none for films"),
 ]
-_BACKGROUND_HELP = "training: add to predictions the smooth background that the training scans share"
+_BACKGROUND_HELP = "training: add the smooth background that the training scans share to the predictions"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: the whole fitted measurement model"),
+    option(f"{_BACKGROUND_HELP}; shared: add the whole fitted measurement model"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -51,18 +51,18 @@ NoiseOption = Annotated[
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    option("fast: minutes; paper: 4,000 epochs of Adam"),
+    option("training recipe: fast takes minutes; paper runs 4,000 epochs of Adam"),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
-    option("ours, as printed in the paper, or as in the authors' code"),
+    option("default: our own settings; paper: those in the paper; authors: those of the authors' code"),
 ]
 Steps = Annotated[int | None, option("optimiser steps; by default those of the recipe", min=1)]
 Seed = Annotated[int, option("seed of weights and splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
-        "FIELD=VALUE of training or model, as in learning_rate=0.001; repeatable",
+        "setting FIELD=VALUE of the training or the model, such as learning_rate=0.001; repeatable",
         "--set",
     ),
 ]
@@ -88,7 +88,7 @@ def train(
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("also train on the locked scans; then no scan is left for a test", "--use-lock-box"),
+        option("also train on the locked scans, so that none is left for a last test", "--use-lock-box"),
     ] = False,
 ) -> None:
     """Train a model on all scans except the locked ones; resumable.
@@ -124,12 +124,12 @@ def evaluate(
     open_lock_box: Annotated[
         bool,
         option(
-            "also score the locked scans of the dataset that the model was trained on; once per release",
+            "also score the locked scans of the training dataset; do this only once per release",
             "--open-lock-box",
         ),
     ] = False,
 ) -> None:
-    """Score one frozen model on a store. On its training dataset the locked scans are left out.
+    """Score one frozen model on a store. If this is its training dataset, the locked scans are left out.
 
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
@@ -159,11 +159,11 @@ def benchmark(
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"], option("what is held out")
     ] = "grouped",
-    models: Annotated[str | None, option("names, separated by commas; by default all")] = None,
+    models: Annotated[str | None, option("names of models, separated by commas; by default all")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
-    folds: Annotated[int, option("folds of the grouped split", min=2)] = 5,
+    folds: Annotated[int, option("number of folds of the grouped split", min=2)] = 5,
     first_folds: Annotated[
         int | None,
         option("number of folds to fit; by default all", min=1),
@@ -172,7 +172,7 @@ def benchmark(
     background: SharedOption = None,
     noise: NoiseOption = None,
     open_lock_box: Annotated[
-        bool, option("also score the locked scans; do this once", "--open-lock-box")
+        bool, option("also score the locked scans; do this only once", "--open-lock-box")
     ] = False,
     seed: Seed = 0,
     set_: SetOption = None,
@@ -217,7 +217,7 @@ def benchmark(
 @app.command()
 def predict(
     model: ModelName,
-    layout: Annotated[Path, argument("TIFF, PNG, BMP or NPY of levels, or any exported file")],
+    layout: Annotated[Path, argument("layout: TIFF, PNG, BMP or NPY of levels, or any exported file")],
     out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     extrapolate: Annotated[
         bool, option("accept levels beyond the calibrated range", "--extrapolate")
@@ -250,8 +250,8 @@ def export(
     frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
-        f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs from the model by "
-        f"{NM_PER_UM * difference_um:.2g} nm at most"
+        f"{out} accepts layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; its heights differ "
+        f"from those of the model by at most {NM_PER_UM * difference_um:.2g} nm"
     )
 
 
@@ -287,7 +287,7 @@ def compare(
     first: Annotated[Path, argument("benchmark.json or evaluation.json")],
     second: Annotated[Path, argument("another result with the same protocol")],
 ) -> None:
-    """Compare two results, paired by scan; results with different data, folds or per-scan terms are refused.
+    """Compare two results scan by scan; results with different data, folds or per-scan terms are refused.
 
     Example: litho-models compare one/benchmark.json other/benchmark.json
     """
@@ -303,13 +303,13 @@ def freeze(
     attribute: Annotated[
         list[str] | None,
         option(
-            "side (printer or microscope) that is taken as the cause of effects of undetermined "
-            "role: of all, or of EFFECT; repeatable",
+            "attribute effects of undetermined role to the printer or to the microscope: all of them, or "
+            "only EFFECT; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,
 ) -> None:
-    """Write only the process model: weights, card and a page for people.
+    """Freeze only the process model: write its weights, its card and a page for readers.
 
     Example: litho-models freeze run --out printer
     """
@@ -325,7 +325,7 @@ def _attribution(given: Sequence[str]) -> Any:
         raise InputError(
             "--attribute",
             got=wrong[0],
-            wanted="EFFECT=microscope or EFFECT=printer for each, if there are several",
+            wanted="EFFECT=microscope or EFFECT=printer each time, if it is given more than once",
         )
     return dict(text.split("=", 1) for text in given)
 

@@ -17,7 +17,7 @@ board = typer.Typer(help="Blind boards: can a loop name the hidden causes?", no_
 
 @board.command("new")
 def new(
-    out: Annotated[Path, option("folder of the board")],
+    out: Annotated[Path, option("folder for the board")],
     kind: Annotated[
         Literal["singles", "mixtures"], option("one cause per store, or two to four")
     ] = "singles",
@@ -26,8 +26,8 @@ def new(
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
     size_px: Annotated[int, option("side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Print and scan fields with hidden causes in the virtual fab: stores for a loop, the truth for the
-    judge.
+    """Print and scan fields with hidden causes in the virtual fab. The loop gets the stores, the judge also
+    the causes.
 
     Example: litho-models board new --trials 8 --out board
     """
@@ -35,23 +35,24 @@ def new(
 
     draws = new_board(out, board=kind, seed=seed, trials=trials, n_scans=scans, size_px=size_px)
     typer.echo(
-        f"{len(draws.trials)} stores for the loop: {out / STORES}; for the judge alone: {out / HIDDEN}"
+        f"{len(draws.trials)} stores for the loop: {out / STORES}; "
+        f"their hidden causes, for the judge only: {out / HIDDEN}"
     )
 
 
 @board.command("judge")
 def judge(
     board: Annotated[Path, argument("folder of `board new`")],
-    out: Annotated[Path, option("folder of the trials, figures and table")],
+    out: Annotated[Path, option("folder for the trials, the scoreboard and its table")],
     loop: Annotated[
         str | None,
         option(
-            "command of the loop, called with STORE and FOLDER at its end; it writes FOLDER/answer.json; "
-            "by default close-loop of this package"
+            "command of the loop; it gets STORE and FOLDER as its last arguments and writes "
+            "FOLDER/answer.json; by default close-loop of this package"
         ),
     ] = None,
 ) -> None:
-    """Give every store of a board to a loop, and judge the causes that the loop names; resumable.
+    """Run a loop on every store of a board, and judge the causes that it names; resumable.
 
     Example: litho-models board judge board --loop "python my_loop.py" --out judged
     """

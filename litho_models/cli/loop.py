@@ -12,7 +12,7 @@ from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
 FixOption = Annotated[
-    list[str] | None, option("parameter of the model that no fit changes, such as eta; repeatable", "--fix")
+    list[str] | None, option("parameter of the model to hold fixed, such as eta; repeatable", "--fix")
 ]
 FreeOption = Annotated[
     list[str] | None, option("parameter to fit that is usually fixed; repeatable", "--free")
@@ -24,22 +24,22 @@ def close_loop(
     stores: Annotated[
         list[Path],
         argument(
-            "dataset store made by litho-data build; further stores, with later prints of the same "
-            "printer, decide the questions that the first leaves open"
+            "dataset store made by litho-data build; further stores contain later prints of the same "
+            "printer, which decide the questions that the first store leaves open"
         ),
     ],
-    out: Annotated[Path, option("folder for result, report, tables and the corrected model")],
+    out: Annotated[Path, option("folder for the result, report, tables and corrected model")],
     base: Annotated[
         str,
-        option("model to correct: its name, a frozen one (a folder, zoo:NAME), or auto: the best"),
+        option("model to correct: a name, a frozen model (a folder or zoo:NAME), or auto for the best"),
     ] = "auto",
     set_: Annotated[
         list[str] | None,
-        option("FIELD=VALUE of a small base, such as spot.sigma_um=0.3; repeatable", "--set"),
+        option("setting FIELD=VALUE of a small base, such as spot.sigma_um=0.3; repeatable", "--set"),
     ] = None,
     fix: FixOption = None,
     free: FreeOption = None,
-    folds: Annotated[int, option("number of folds, by scan", min=2)] = 5,
+    folds: Annotated[int, option("number of folds into which scans are divided", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
         option(
@@ -54,7 +54,7 @@ def close_loop(
         ),
     ] = None,
     open_lock_box: Annotated[
-        bool, option("also score the locked scans; do this once", "--open-lock-box")
+        bool, option("also score the locked scans; do this only once", "--open-lock-box")
     ] = False,
     steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
     cache: Annotated[
@@ -65,7 +65,7 @@ def close_loop(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm).
+    """Find the effects that a model lacks on measured prints, add them, and report the held-out error (nm).
 
     Example: litho-models close-loop prints.zarr --out loop
     """
@@ -114,16 +114,16 @@ def check(
     ] = None,
     new: Annotated[
         list[str] | None,
-        option("a new print in STORE; the other prints are the reference; repeatable"),
+        option("id of a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
     false_alarms: Annotated[
-        float, option("share of data sets of an unchanged printer that raise an alarm")
+        float, option("share of data sets from an unchanged printer that may raise an alarm")
     ] = 0.005,
     tolerance: Annotated[
         float | None,
-        option("largest accepted drift of a figure (0.05 is 5 %); by default three times its spread"),
+        option("largest accepted drift of a monitored value (0.05: 5 %); by default three times its spread"),
     ] = None,
-    strict: Annotated[bool, option(f"end with exit code {EXIT_ALARM} on an alarm", "--strict")] = False,
+    strict: Annotated[bool, option(f"exit with code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
     """Tell whether new prints differ from the reference prints of a model, and when to measure again.
 
@@ -148,8 +148,8 @@ def check(
 
 
 def next_print(
-    loop: Annotated[Path, argument("folder of litho-models close-loop")],
-    out: Annotated[Path, option("folder of the plan: card, layouts, table of scans, sheets, report")],
+    loop: Annotated[Path, argument("folder written by litho-models close-loop")],
+    out: Annotated[Path, option("folder for the plan: card, layouts, table of scans, sheets, report")],
     prints: Annotated[int, option("prints to plan, not counting references", min=1)] = 4,
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
@@ -178,9 +178,9 @@ def next_print(
     if plan is None:
         typer.echo(f"{loop} has no open questions: no print is needed")
         return
-    typer.echo(f"{plan.prints} print{'s' * (plan.prints > 1)}, {len(plan.scans)} scans with the references")
+    typer.echo(f"{plan.prints} print{'s' * (plan.prints > 1)}, {len(plan.scans)} scans including references")
     for question in plan.questions:
-        needed = f", {question.prints_needed} prints for 0.95" if question.prints_needed else ""
+        needed = f" (0.95 needs {question.prints_needed} prints)" if question.prints_needed else ""
         power = f"power {question.power[plan.prints - 1]:.2f}{needed}"
         told = question.text if question.kind == "fact" else power
         typer.echo(f"  {question.name}: {question.status}; {told}")

@@ -16,9 +16,9 @@ def noise(
     store: Annotated[
         Path | None, argument("dataset store; its scans marked substrate, flat or steps are used")
     ] = None,
-    substrate: Annotated[Path | None, option("scan of the bare substrate, without a store")] = None,
-    flat: Annotated[Path | None, option("scan of a flat print, without a store")] = None,
-    steps: Annotated[Path | None, option("scan of a step print, without a store")] = None,
+    substrate: Annotated[Path | None, option("scan of the bare substrate, instead of a store")] = None,
+    flat: Annotated[Path | None, option("scan of a flat print, instead of a store")] = None,
+    steps: Annotated[Path | None, option("scan of a step print, instead of a store")] = None,
     unit: Annotated[str | None, option("height unit of these scans, for files that state none")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
@@ -35,7 +35,7 @@ def noise(
         ),
     ] = None,
     model: Annotated[str | None, option("which model of the benchmark; by default the best")] = None,
-    seed: Annotated[int, option("seed of the choice of pixels", min=0)] = 0,
+    seed: Annotated[int, option("seed for the choice of pixels", min=0)] = 0,
 ) -> None:
     """Estimate roughness, dose matrix, noise budget, and σ(x) with its calibration; lengths in µm, noise in
     nm.
@@ -58,7 +58,7 @@ def noise(
         wanted = "a store, or --flat and its scan"
         raise InputError("noise", got=given or "nothing to analyse", wanted=wanted)
     elif of_a_store:
-        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
+        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store with {of_a_store}")
     elif level_height_um is not None and steps is None:
         raise InputError(
             "noise", got="--level-height-um without --steps", wanted="--steps with the scan of the step print"

@@ -1,4 +1,4 @@
-"""Apply effects before and after a base model, and select the part of this chain that designs may use."""
+"""Apply effects before and after a base model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_models.effects.effect import ActsOn, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
 from litho_models.simulator import Simulator, Tile
 
-# Whether an effect turns with the print or with the scan.
+# Whether an effect rotates with the print or with the scan.
 Frame = Literal["scan", "print"]
 # What a field depends on: the effects before it, with their values, and the base.
 Key = tuple[object, ...]
@@ -24,8 +24,8 @@ class EffectChain(nn.Module):
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
         effects: parameter values by the name of the effect; parameters that are not given are off.
-        frames: whether a height effect turns with the print or with the scan, if that differs from the
-            default: effects of stage ``measurement`` turn with the scan, all others with the print.
+        frames: whether a height effect rotates with the print or with the scan, if that differs from the
+            default: effects of stage ``measurement`` rotate with the scan, all others with the print.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class EffectChain(nn.Module):
         return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
-        """Return the height (b, 1, y, x), µm. Without a context the field is one write field."""
+        """Return the height (b, 1, y, x), µm. Without a context, the layout is taken as one write field."""
         if context is None:
             assert isinstance(self.base, Simulator)
             geometry = self.base.config
@@ -68,8 +68,8 @@ class EffectChain(nn.Module):
         """Apply the height effects to the base model's height.
 
         Args:
-            known: the fields after each effect that were computed before, for the same scan and base; new
-                ones are added.
+            known: fields after each effect that were already computed for the same scan and base; new ones
+                are added.
             key: what ``height_um`` depends on.
         """
         return self._run_stage("height", height_um, context, known, key)[0]

@@ -35,8 +35,8 @@ class Parameter:
         lower, upper: physical range; an estimate outside it contradicts the effect.
         typical: a usual value, used for screening and as the starting value of fits.
         kind: at its ``null``, an ``amplitude`` switches the effect off. A ``shape`` (a length, a position)
-            has no meaning while all amplitudes are null. A ``choice`` is a shape with few values (a
-            direction) that is never fitted.
+            has no meaning while all amplitudes are null. A ``choice`` is a shape with few possible values
+            (a direction) that is never fitted.
         null: value of an amplitude at which the effect changes nothing.
         tried: values that screening tries; if empty, it tries ``typical``.
     """
@@ -75,7 +75,7 @@ class FieldContext:
         order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
         scan_shape: (rows, columns) of the whole scan, if this field is only a part of a scan.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        quarter_turns: number of quarter turns (as by ``rot90``) by which the array was turned under the
+        quarter_turns: number of quarter turns (as by ``rot90``) by which the array was rotated under the
             microscope.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip.
@@ -107,7 +107,7 @@ class FieldContext:
         return self._kept[name]
 
     def in_scan_frame(self) -> FieldContext:
-        """Turn the field into the frame of the scan, with the fast axis along x."""
+        """Rotate the field into the frame of the scan, with the fast axis along x."""
         if not self.quarter_turns % 4:
             return self
         (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
@@ -123,7 +123,7 @@ class FieldContext:
         )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
-        """Return each pixel's (y, x) from the centre of the write field: shapes (y, 1) and (1, x), µm."""
+        """Return each pixel's position from the centre of the write field: shapes (y, 1) and (1, x), µm."""
         rows, columns = self._pixels()
         (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
         return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
@@ -133,7 +133,7 @@ class FieldContext:
         return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
-        """Return each pixel's (y, x), from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
+        """Return each pixel's position, from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
         rows, columns = self._pixels()
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
         return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
@@ -266,8 +266,8 @@ class Effect:
         off.
 
         Args:
-            scanned: apply the effect as one of the microscope: in the frame and direction of the scan, with
-                the tip of the scan.
+            scanned: apply it as an effect of the microscope: in the frame and direction of the scan, and
+                with the tip of the scan.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)

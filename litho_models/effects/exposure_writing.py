@@ -18,7 +18,7 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# Frequency of the longest ripple. Longer ripples cannot be told from smooth maps of the field.
+# Frequency of the longest ripple. Longer ripples cannot be distinguished from smooth maps of the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 

@@ -17,8 +17,8 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp, gradient
 from litho_models.models.parts import FLATTEST, etch
 
-# Standard deviation of the blur that defines the normals of a film's edges; of the blur that locates a sharp
-# rim; and the range of a diffusion.
+# Standard deviations of the blur that defines the normals of a film's edges and of the blur that locates a
+# sharp rim, and the range of a diffusion.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
 
 _of_films = partial(entry, role="process", of_films=True)
@@ -55,7 +55,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
-        # A sharp rim does not locate its edge within a pixel, so both films are slightly blurred.
+        # A sharp rim does not show where in a pixel its edge lies, so both films are slightly blurred.
         blurred = add_blur(height / full, variance_px2 + _RIM_PX**2, 1.0, _DIFFUSION_REACH_PX)
         return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, 1.0)
 
@@ -94,9 +94,7 @@ edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges by the shift times the film within the length: outwards in dense places, inwards in sparse
-    ones.
-    """
+    """Move edges outwards in dense places and inwards in sparse ones, by the shift times 2 M̄ - 1."""
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
     return _moved(height, values["bias_px"] * (2 * nearby[0, 0] - 1), context)
@@ -106,7 +104,7 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
-    """Move edges along their normals, by taking the film's value this far inwards."""
+    """Move edges along their normals: each pixel gets the film's value at this distance inwards."""
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)

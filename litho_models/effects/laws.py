@@ -34,7 +34,7 @@ _COPIES_UM = {
 _LAST_KNOT = 16
 _KNOTS = [f"level_{knot}_of_{_LAST_KNOT}" for knot in range(_LAST_KNOT + 1)]
 _POWERS = {f"y{i}_x{j}": (i, j) for i in range(5) for j in range(5 - i) if i + j}
-_TURNED = "print and scan the same layouts turned by 90 degrees"
+_TURNED = "print and scan the same layouts rotated by 90 degrees"
 _SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y", 1)}
 
 
@@ -51,8 +51,8 @@ class Surface:
     values: Values
 
     def along(self, axis: str, y: Tensor, x: Tensor) -> Tensor:
-        """Return the component of a vector along an axis. If the law has a turn, the axis is turned from x
-        towards y.
+        """Return the component of a vector along an axis. If the law has ``turn_deg``, the axis is rotated by
+        this angle from x towards y.
         """
         angle = torch.deg2rad(self.values.get("turn_deg", self.h.new_zeros(())))
         sine, cosine = angle.sin(), angle.cos()
@@ -92,8 +92,8 @@ class Surface:
         return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
     def trailing(self, *sides: str) -> Tensor:
-        """Return the exponentially weighted mean height on one side or both, decaying over the law's
-        length.
+        """Return the mean height on one side or on both sides, with weights that decay exponentially over the
+        law's length.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 
@@ -221,7 +221,7 @@ def _law(
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
-    """Make the wave that slices leave in the dose, or standing waves of light in the height. The wave is zero
+    """Make a wave: in the dose it describes slices, in the height standing waves of light. The wave is zero
     where the field is zero.
     """
 
@@ -250,7 +250,7 @@ def _nameless(
         apply=apply,
         source="found in the residual; h and the dose D in µm, h̄ the Gaussian mean of h over a length; "
         "x and y from -1 to 1 over the scan, r² = x² + y², rim = e^(-distance to the edge / length), the "
-        "order t from -0.5 to 0.5; slopes and sides are along axes turned by turn_deg",
+        "order t from -0.5 to 0.5; slopes and sides are along axes rotated by turn_deg",
         separating=_TURNED,
         knowledge="law",
     )

@@ -35,8 +35,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """Let the probe lag along the fast axis: z += (H - z) / (1 + l / dx), without the mean delay.
 
     The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
-    If ``rising`` is 1 the probe is a linear filter; below 1 it parachutes off falling edges. The delay is a
-    constant time, so smaller pixels make the length shorter.
+    If ``rising`` is 1, the probe is a linear filter. Below 1, the probe parachutes off falling edges. The
+    delay is a constant time, so smaller pixels make the length shorter.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -79,14 +79,14 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Blur the finished scan with a Gaussian, as interpolation or the microscope's low-pass filter does.
 
-    The width of the blur is a number of pixels, so smaller pixels blur less.
+    The width of the blur is a fixed number of pixels, so smaller pixels give less blur.
     """
     variance_um2 = values["variance_um2"] * context.pixel_size**2
     return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
 
 
 @of_microscope(
-    "tip of finite radius widening tops",
+    "tops widened by a tip of finite radius",
     {
         "radius_um": Parameter("µm", 0.0, 2.0, 0.04),
         "along": Parameter("1", _SHARPER, 1.0, 1.0, "choice"),
@@ -99,7 +99,8 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
         {"radius_um": 0.4, "along": _SHARPER},
     ),
     source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
-    separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
+    separating="scan again with a new tip, or with the print rotated if the tip is asymmetric; "
+    "scan a tip characteriser",
     of_tip=True,
     needs=("probe",),
 )

@@ -1,4 +1,4 @@
-"""The catalogue: all effects by name, in the order light, resist, developer, microscope."""
+"""The catalogue: all effects by name, in the order in which light, resist, developer and microscope act."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STEP = "scan a step standard and a bare substrate before and after the print"
 EFFECTS = (
     Effect(
         "line-roughness",
-        "height of the single written line",
+        "height of each written line",
         stage="exposure",
         role="nuisance",
         acts_on="height",
@@ -44,21 +44,21 @@ EFFECTS = (
     ),
     _of_microscope(
         "z-gain",
-        "height calibration of the single scan",
+        "height calibration of each scan",
         parameters={"gain": Parameter("1", -0.2, 0.2, 0.02)},
         source="calibration of the z-scanner",
         separating=_STEP,
     ),
     _of_microscope(
         "datum-offset",
-        "zero of the single scan",
+        "zero height of each scan",
         parameters={"offset_um": Parameter("µm", -0.5, 0.5, 0.03)},
         source="levelling without a reference surface",
         separating="leave bare substrate in every field",
     ),
     _of_microscope(
         "tilt-bow",
-        "tilt and bow of the single scan",
+        "tilt and bow of each scan",
         parameters={
             name: Parameter("µm", -0.5, 0.5, 0.02)
             for name in ("tilt_x_um", "tilt_y_um", "bow_xx_um", "bow_xy_um", "bow_yy_um")
@@ -85,9 +85,9 @@ EFFECTS = (
 
 # Effects of the catalogue that are not visible in a residual map on the layout's grid.
 UNTESTABLE = {
-    "min-to-zero-datum": "an order statistic per scan; datum-offset contains its effect",
+    "min-to-zero-datum": "it is an order statistic of each scan; datum-offset covers its effect",
     "quantisation": "the raw files are not in the store",
-    "scars-and-spikes": "a mask, not a term; the loop looks for it among the outliers",
+    "scars-and-spikes": "it is a mask, not a term; the loop looks for it among the outliers",
 }
 
 # Per-scan effects are not included here, because they are never part of a model.
@@ -179,7 +179,7 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Return the effects that screening tests, whose parameters are common to all scans.
+    """Return the effects that screening tests. Their parameters are common to all scans.
 
     Args:
         tip_radius_um: radius of the tip or its upper bound, if the store states one; it is tried in addition.

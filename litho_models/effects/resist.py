@@ -69,7 +69,7 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
 
 
 @of_development(
-    "the whole print losing height on development",
+    "the whole print losing height in development",
     {"fraction": Parameter("1", 0.0, 0.7, 0.05)},
     source="Meisel 2006, cited in the paper",
     separating="a step standard for the microscope, then a printed staircase",
@@ -80,7 +80,7 @@ def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) ->
 
 
 @of_development(
-    "thin surroundings shrinking more than thick ones",
+    "print shrinking more where its surroundings are thin",
     {
         "fraction": Parameter("1", 0.0, 0.5, 0.1),
         "length_um": Parameter("µm", 0.3, 6.0, 1.0, "shape", tried=(0.5, 1.5, 4.0)),
@@ -160,8 +160,8 @@ def _closed_by(height: Tensor, half_px: int) -> Tensor:
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel whose square lies inside the field, computed
-    axis by axis.
+    """Return the largest value in the square around each pixel, one axis after the other. Pixels whose square
+    extends beyond the field are left out.
     """
     return _running_maximum(_running_maximum(field, half_px, -2), half_px, -1)
 
@@ -178,7 +178,7 @@ def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
 
 
 @of_development(
-    "height missing on slopes",
+    "height lost on slopes",
     {
         "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
         "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
@@ -192,14 +192,15 @@ def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
         for turn in (0.0, 45.0)
         for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
     ),
-    source="empirical: loss along a power of the slope, an ellipse of coefficients in a turned frame",
+    source="empirical: loss by a power of the slope, with an ellipse of coefficients in a rotated frame",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), with turned axes x',
+    """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), with rotated axes x',
     y'.
 
-    With cx = cy = c the loss is c |grad H|^p in any direction. With p = 1 each edge moves inwards by about c.
+    With cx = cy = c, the loss is c |grad H|^p in any direction. With p = 1, each edge moves inwards by
+    about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)

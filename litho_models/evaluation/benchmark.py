@@ -55,27 +55,30 @@ def benchmark(
     workers: int = 1,
     dask: str | None = None,
 ) -> Benchmark:
-    """Train ``models`` without each fold and score them on it; write ``benchmark.json``, a report and CSV
-    tables.
+    """Cross-validate ``models``: fold by fold, train each model on the other folds and score it on this one.
+    Write ``benchmark.json``, a report and CSV tables.
 
     Args:
         store: dataset store.
         out: result folder; ``out/cache`` keeps every fit.
-        split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of quadrants
-            over all scans. The split ``paper`` leaks, so use it only for comparison with the paper.
+        split: ``grouped`` (whole scans are held out), ``leave-one-print-out``, or ``paper`` (one random 75/25
+            split of the quadrants of all scans). The split ``paper`` leaks, so use it only for comparison
+            with the paper.
         models: names of models.
-        settings: fields of ``TrainingConfig`` that replace the recipe's.
-        folds: number of folds of ``grouped``, at most the number of development scans.
+        settings: fields of ``TrainingConfig`` whose values override those of the recipe.
+        folds: number of folds of the split ``grouped``, at most the number of development scans.
         first_folds: fit and score only this many folds, to compare seeds or settings; None for all.
-        policy: nuisances of ``mae_datum_free_nm``; ``offset`` by default, for films ``none``.
-        background: by default ``training``, for films ``none``. With ``training``, the smooth background that
-            each fit learns on its training scans is added to its predictions. With ``shared``, the
+        policy: nuisances fitted to each scan before ``mae_datum_free_nm`` is computed; by default ``offset``,
+            or ``none`` for films.
+        background: by default ``training``, or ``none`` for films. With ``training``, the smooth background
+            that each fit learns on its training scans is added to its predictions. With ``shared``, the
             measurement model, learned together with the fit, is applied to its predictions.
-        noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors. By
-            default the floor is estimated from the held-out residuals of the best model.
-        open_lock_box: also train on all development scans and score this training on the locked scans.
+        noise: ``noise.json`` of this dataset, or the folder of this file. Its noise floor is shown beside the
+            errors. By default, the floor is estimated from the held-out residuals of the best model.
+        open_lock_box: also train each model on all development scans and score it on the locked scans.
         seed: seed of the split, the nuisance blocks and the training.
-        workers: local processes that fit and predict; ``dask``: address of a Dask scheduler instead.
+        workers: number of local processes that fit and predict; ``dask``: address of a Dask scheduler to use
+            instead.
 
     Raises:
         InputError: no model, an unknown or repeated model, a store that cannot be read or is too small for
@@ -94,7 +97,7 @@ def benchmark(
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     made = sum(not fold.locked for fold in plan)
     if split == "grouped" and made < folds:
-        say(f"{made} folds instead of {folds}: one for each scan that is not locked")
+        say(f"{made} folds instead of {folds}: one for each of the scans that are not locked")
     if first_folds is not None:
         if not 1 <= first_folds <= made:
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")
@@ -188,19 +191,19 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored_ids: Sequence[str]) -> None:
-    """Refuse to replace a benchmark that contains models or scans that this one lacks. The same benchmark may
-    be repeated or extended.
+    """Refuse to replace a benchmark that contains models or scans that the new one lacks. A benchmark may be
+    repeated or extended.
     """
     if not (folder / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(folder)
     lost = [score.model for score in old.scores if score.model not in models]
     more = set(old.split.scored_ids) - set(scored_ids)
-    held = [f"model {', '.join(lost)}"] * bool(lost) + [f"{len(more)} scans more"] * bool(more)
+    held = [f"model {', '.join(lost)}"] * bool(lost) + [f"{len(more)} other scans"] * bool(more)
     if held:
         raise InputError(
             "output",
-            got=f"{folder}, which holds a benchmark of {'; '.join(held)}",
+            got=f"{folder}, which holds a benchmark that also contains {' and '.join(held)}",
             wanted="another folder",
             hint="choose another --out",
         )

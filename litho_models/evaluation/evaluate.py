@@ -48,11 +48,12 @@ def evaluate(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances to remove from each scan; ``offset`` by default, for films ``none``.
+        policy: nuisances to remove from each scan; by default ``offset``, or ``none`` for films.
         background: ``training`` adds the background in the model's card to the predictions (the default), and
-            ``none`` does not (the default for films). A card without a background, or with one for fields of
-            another size, adds none, and the result says so.
-        noise: ``noise.json`` of this dataset, or its folder, whose floor is shown beside the errors.
+            ``none`` does not (the default for films). If the card has no background, or one for fields of
+            another size, none is added, and the result says so.
+        noise: ``noise.json`` of this dataset, or the folder of this file. Its noise floor is shown beside the
+            errors.
         extrapolate: accept layouts beyond the model's calibrated range.
         open_lock_box: also score the locked scans of the prints that the model was trained on.
 
@@ -74,7 +75,7 @@ def evaluate(
         locked_too = open_lock_box or not made_of_these_prints(frozen, dataset)
         scans = [scan for scan in every if locked_too or scan.id not in locked]
         if not scans:
-            raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
+            raise InputError(f"scans of {store} to score", got="none", wanted="at least one")
         ids = [scan.id for scan in scans]
         learned = card_background(frozen, scans) if background == "training" else None
         predictions = [

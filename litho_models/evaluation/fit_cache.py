@@ -28,7 +28,7 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-# Older results also state the cost of a prediction, and how much a prediction differs in another crop.
+# Older results have more fields, which are ignored: the cost of a prediction, and its change in another crop.
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training scans and on held-out scans.
 
@@ -49,8 +49,8 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(FitFacts):
-    """The record of one fit: its scans, cost, and errors in nm. An error is None for a model without training
-    steps.
+    """The record of one fit: its scans, its cost, and its errors in nm. Validation errors are None without
+    validation scans.
     """
 
     model: str
@@ -66,12 +66,12 @@ class FitRecord(FitFacts):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """Return a fit and the heights (ny, nx), µm, that it predicts for the held-out scans, from the cache or
-    newly fitted.
+    """Read a fit from the cache, or fit the model now. Return the record of the fit and the heights (ny, nx),
+    µm, that it predicts for the held-out scans.
 
     Args:
-        measured: learn the measurement model from a first fit, subtract it from the training scans, repeat
-            the fit, and learn the measurement model again.
+        measured: whether to learn the measurement model from a first fit, subtract it from the training
+            scans, repeat the fit, and learn the measurement model again.
 
     Raises:
         InputError: a cached fit that cannot be read.
@@ -99,7 +99,9 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the expected scan: the print (ny, nx), µm, and the part that the training scans share."""
+    """Return the predicted scan: the printed height (ny, nx), µm, with the measurement model or background
+    that the training scans share.
+    """
     found = record.diagnostics
     if background == "none":
         return Prediction(height_um)
@@ -109,7 +111,7 @@ def expected(
 
 
 def fit_folder(cache: Path, name: str, key: str) -> Path:
-    """Return the folder of a fit."""
+    """Return the folder in which a fit is cached."""
     return cache / f"{name}-{key[:16]}"
 
 

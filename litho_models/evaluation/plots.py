@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
-# A function that maps a row of a model to x and one or two y.
+# A function that maps the scores of one model to a list of x values and one or two lists of y values.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
 def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
-    """Draw both headline errors of each model with their intervals over scans, the noise floor and the
+    """Draw both headline errors of each model with their confidence intervals, the noise floor and the
     paper's error.
     """
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
@@ -31,7 +31,7 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
     colours = [model_colour(s.model) for s in scores]
     bars = [
         (-0.17, "nothing fitted", 0.4, "mae_abs"),
-        (0.17, "own terms of each scan fitted", 1.0, "leading"),
+        (0.17, "each scan's own terms fitted", 1.0, "leading"),
     ]
     if scores[0].seen_by == "sem":
         bars, floor_nm = [(0.0, "distance of predicted from measured edges", 1.0, "leading")], None
@@ -57,15 +57,15 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
         )
     axes.set_yticks(position, [s.model for s in scores])
     axes.invert_yaxis()
-    axes.set_xlabel("error over scans, nm (bars: 95 % interval over scans)")
+    axes.set_xlabel("mean error over scans, nm (error bars: 95 % confidence interval)")
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axes.grid(axis="x", alpha=0.3)
     return figure
 
 
 def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the measured height of one scan and, for each model, the measured minus the predicted height
-    without the scan's terms.
+    """Draw the measured height of one scan and the residual of each model: the measured minus the predicted
+    height, after the scan's terms are removed.
     """
     panels = len(residuals_um) + 1
     columns = min(4, panels)
@@ -108,7 +108,7 @@ def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def level_bias(scores: Sequence[ModelScores]) -> Figure:
-    """Draw bias and spread of the datum-free error per printed level."""
+    """Draw the bias and the spread of the datum-free error for each printed level."""
 
     def of(name: str) -> Lines:
         return lambda score: [[getattr(one, key) for one in score.by_level] for key in ("level", name)]
@@ -139,8 +139,8 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """Draw one panel for each label, with a solid and perhaps a dashed line against x in the colour of each
-    model.
+    """Draw one panel for each label. Each model has a solid line against x in its colour and, if a second y
+    is given, a dashed line.
     """
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]

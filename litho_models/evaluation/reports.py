@@ -23,24 +23,24 @@ _OF_FIT = (
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
-    "leave-one-print-out": "all scans of one print are held out at a time; the lock box is in no fold",
-    "paper": "a random quarter of the quadrants is held out: quadrants of one scan lie on both sides, so "
-    "errors are too small; use this split only for comparison with the paper",
+    "leave-one-print-out": "all scans of one print are held out together; scans of the lock box never are",
+    "paper": "a random quarter of the quadrants is held out. Quadrants of one scan are in both training and "
+    "test set, so errors are too small: use this split only for comparison with the paper",
 }
 
 
 def write_evaluation_report(
     result: Evaluation, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], out: str | Path
 ) -> Path:
-    """Render the result into ``out``; return the page."""
+    """Write the report of an evaluation into ``out``; return its path."""
     scores = result.scores
     page = _page(f"{result.model.name} on {result.dataset.name}", result, {"model": result.model.sha256})
     page.verdict(evaluation_verdict(result))
     if count := len(result.trained_on_scored_scans):
-        page.note(f"{count} of the scored scans were used in training: this is not a held-out error.")
+        page.note(f"The model was trained on {count} of the scored scans, so this is not a held-out error.")
     if result.model.extrapolated:
-        page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
-    _errors(page, result, [scores], "Error over scans.", "headline.csv")
+        page.note("Layouts beyond the calibrated range were accepted (option extrapolate).")
+    _errors(page, result, [scores], "Mean error over scans.", "headline.csv")
     page.paragraph(lock_box_text(result.split))
     worst = int(np.nanargmax(list(scores.leading_of_scans_nm.values())))
     _one_scan(page, "The worst scan", scans[worst], {scores.model: predictions_um[worst]}, result.nuisance)
@@ -54,8 +54,8 @@ def write_benchmark_report(
     predictions_um: Mapping[str, Sequence[np.ndarray]],
     out: str | Path,
 ) -> Path:
-    """Render the result into ``out``; ``predictions_um`` contains the map that each model expects for each
-    scan.
+    """Write the report of a benchmark into ``out``; return its path. ``predictions_um`` contains the map that
+    each model predicts for each scan.
     """
     scores, split = sorted(result.scores, key=lambda s: -s.leading_nm), result.split
     best = scores[-1]
@@ -64,7 +64,7 @@ def write_benchmark_report(
     if split.first_folds is not None:
         page.note(f"Only {split.first_folds} of {split.folds} folds were fitted and scored.")
     if len(best.scans) < 8:
-        page.note(f"Only {len(best.scans)} scans: intervals over scans are rough.")
+        page.note(f"Only {len(best.scans)} scans were scored, so confidence intervals are rough.")
     caption = f"Held-out error of every model. Split '{split.kind}': {_SPLIT_TEXT[split.kind]}."
     _errors(page, result, scores, caption, "benchmark.csv")
     if result.dataset.name == _PAPER_DATASET:
@@ -80,17 +80,17 @@ def write_benchmark_report(
         page.heading("Lock box", folded=True)
         page.table(
             tables.headline_table(result.locked_scores, result.nuisance, result.noise_floor),
-            "Trained on all development scans, scored once on the locked scans.",
+            "The models were trained on all development scans and scored once on the locked scans.",
             "lock_box.csv",
         )
     middle = int(np.argsort(list(best.leading_of_scans_nm.values()))[len(scans) // 2])
     shown = {s.model: predictions_um[s.model][middle] for s in scores}
-    _one_scan(page, "The scan of median error", scans[middle], shown, result.nuisance)
+    _one_scan(page, "The scan with the median error", scans[middle], shown, result.nuisance)
     page.heading("Training", folded=True)
     page.table(
         result.fits,
-        "Errors of every fit on its training, inner-validation and held-out scans, to show over-fitting, and "
-        "the time of training. No background is used, and the zero height of each scan is fitted.",
+        "Training time of every fit, and its errors on training, inner-validation and held-out scans, whose "
+        "differences show over-fitting. No background is used; the zero height of each scan is fitted.",
         "fits.csv",
         digits=3,
         columns=_OF_FIT,
@@ -126,7 +126,7 @@ def _one_scan(
     page.heading(title, folded=True)
     page.figure(plots.residual_maps(scan, residuals), f"{scan.id}: measured height and error.")
     last = dict(list(residuals.items())[-2:])
-    page.figure(plots.line_profiles(scan, last), "Its middle row.")
+    page.figure(plots.line_profiles(scan, last), "The middle row of this scan.")
 
 
 def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelScores]) -> None:
@@ -136,7 +136,7 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
     page.heading("With other terms fitted", folded=True)
     page.table(
         tables.policy_table(scores, result.nuisance, result.noise_floor),
-        "Mean absolute error by what is fitted to each scan, with and without the background, nm.",
+        "Mean absolute error in nm for each set of terms fitted to a scan, with and without background.",
         "policies.csv",
     )
     for sentence in said("protocol", protocol=result.nuisance, floor=result.noise_floor):
@@ -153,10 +153,10 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
 
 
 def lock_box_text(split: ScoredSplit) -> str:
-    """Describe the treatment of the locked scans of the dataset."""
+    """Return a sentence that says whether the locked scans of the dataset were scored."""
     if not split.lock_box:
         return "The dataset is too small for locked scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
-        return f"Locked scans, which no training on this dataset uses, are left out: {len(split.lock_box)}."
-    return f"Locked scans, which no training on this dataset uses, are scored too: {', '.join(scored)}."
+        return f"{len(split.lock_box)} locked scans, on which no model is trained, are not scored."
+    return f"Locked scans, on which no model is trained, are scored too: {', '.join(scored)}."

@@ -33,7 +33,7 @@ class ModelRecord(Record):
 
 
 class Evaluation(Result):
-    """``evaluation.json``."""
+    """The content of ``evaluation.json``: the scores of one frozen model."""
 
     SCHEMA = "litho-models/evaluation/1"
     FILE_NAME = "evaluation.json"
@@ -49,7 +49,7 @@ class Evaluation(Result):
 
 
 class Benchmark(Result):
-    """``benchmark.json``."""
+    """The content of ``benchmark.json``: the scores of several cross-validated models."""
 
     SCHEMA = "litho-models/benchmark/1"
     FILE_NAME = "benchmark.json"
@@ -69,8 +69,8 @@ class Benchmark(Result):
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     """Compare the datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
 
-    Two benchmarks are compared model by model; an evaluation has one model. A negative
-    difference means that the first is better.
+    Benchmarks are compared model by model; an evaluation has only one model. A negative difference means that
+    the first is better.
 
     Raises:
         InputError: files that cannot be read; results with different data, folds, scans or nuisances; or only
@@ -99,7 +99,9 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Return the facts that must agree if this result is compared with another, and its scores by model."""
+    """Return the facts that must agree between this result and one compared with it, and its scores by
+    model.
+    """
     file = Path(path)
     if file.is_dir():
         names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# One mapping per row, from column to value.
+# Each row is a mapping from column to value.
 Rows = list[dict[str, Any]]
 
 
 def headline_table(
     scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
 ) -> pd.DataFrame:
-    """Return one row per model, with both errors and their intervals, excess over the noise floor, spread and
-    bias.
+    """Return one row per model, with both errors and their confidence intervals, the excess over the noise
+    floor, the RMS error and the bias.
 
     The last row is the noise floor, computed in each column with the same scan terms as the errors. For films
     the table lists errors of edges and features instead.
@@ -75,8 +75,8 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """Return one row per model and background and one column per policy. For line offsets, also give the
-    number of terms.
+    """Return one row per model and background and one column per policy. The policy with line offsets has a
+    second column, the number of terms.
 
     The last row is the noise floor under each policy.
     """
@@ -100,7 +100,7 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
-    """Return one row per model: phase error, and all metrics of ``metric_registry``."""
+    """Return one row per model, with the phase error and all metrics of ``metric_registry``."""
     keys = _measured(scores)
     return [
         {
@@ -137,13 +137,13 @@ def level_table(scores: Sequence[ModelScores]) -> Rows:
 
 
 def interval_text(interval: Interval) -> str:
-    """Format an interval."""
+    """Format an interval as text; a dash if there is none."""
     return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
 
 
 def metric_text(scores: Sequence[ModelScores]) -> str:
     """Explain the columns of ``metric_table``."""
     return (
-        f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
-        f"(index step {INDEX_STEP:g}). {metrics_text(_measured(scores))}"
+        f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes through the "
+        f"print (index step {INDEX_STEP:g}). {metrics_text(_measured(scores))}"
     )

@@ -6,7 +6,8 @@ from litho_data.reports.page import filled
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scoring.records import ModelScores
 
-# A difference is more than chance if its interval excludes zero and its sign-flip p is at most this.
+# A difference is more than chance if its confidence interval excludes zero and its sign-flip p is at most
+# this value.
 _CHANCE = 0.05
 
 
@@ -14,7 +15,7 @@ def benchmark_verdict(result: Benchmark) -> str:
     """State which model predicts best, by how much, whether the difference is more than chance, and the noise
     floor.
 
-    A difference is judged over prints if there are several.
+    If there are several prints, the difference is tested over prints instead of scans.
     """
     best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
     assert best is not None
@@ -24,9 +25,7 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """State the error of the model, the part of this error that comes from the zero height, and the noise
-    floor.
-    """
+    """State the error of the model, with and without the terms fitted to each scan, and the noise floor."""
     return _verdict(result, result.scores)
 
 

@@ -1,4 +1,4 @@
-"""Store checkpoints of a training: weights, optimiser moments, best weights, history."""
+"""Store checkpoints of a training run: weights, optimiser moments, best weights, history."""
 
 import json
 from collections.abc import Iterator
@@ -51,7 +51,8 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Read the files that an earlier call stored in ``folder``; they are always written as a whole.
+    """Raise an InputError if the block cannot read the files that an earlier run stored in ``folder``. Such
+    files are always written as a whole.
 
     Raises:
         InputError: a missing or damaged file.
@@ -63,9 +64,9 @@ def reading_kept(folder: Path) -> Iterator[None]:
     except (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, UnpicklingError) as error:
         said = str(error).partition("\n")[0]
         raise InputError(
-            f"cannot read what an earlier call kept in {folder}",
+            f"cannot read the files of an earlier run in {folder}",
             got=f"{type(error).__name__} ({said})",
-            wanted="the files unchanged",
+            wanted="unchanged files",
             hint=f"delete {folder} and run again",
         ) from error
 
@@ -93,14 +94,14 @@ class CheckpointFolder:
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     def load(self, state: TrainingState) -> None:
-        """Continue from the checkpoint, if there is one.
+        """Load the checkpoint into ``state``, if there is one.
 
         Raises:
             InputError: its tensors are damaged.
         """
         if self._kept:
             with reading_kept(self.path):
-                # Only tensors and numbers are loaded: nothing in the file is run.
+                # Only tensors and numbers are loaded. No code in the file is run.
                 kept = torch.load(self.path / "state.pt", map_location="cpu", weights_only=True)
                 weights, state.best, moments = kept
                 state.model.load_state_dict(weights)

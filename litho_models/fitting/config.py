@@ -1,4 +1,4 @@
-"""The settings of a training, in a frozen, explicit record that every run saves."""
+"""Define the settings of a training run, an immutable record that every run saves."""
 
 from typing import Any, Literal, Self, get_args
 
@@ -13,12 +13,12 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
-# In a default PBL the steps train only the chain, which the feature networks then correct. A short training
-# is therefore enough, and no scan is needed to choose between rounds.
+# In the default PBL, the steps train only the chain, which the feature networks then correct. A short
+# training is therefore enough, and no validation scan is needed to choose between rounds.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # Settings on which a fit by least squares depends.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance"}
-# Upper limit of all counts. No real case needs larger counts, and with them sums lose digits or overflow.
+# Upper limit on all counts. No real case needs more, and sums over larger counts lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
@@ -27,8 +27,8 @@ class TrainingConfig(Record):
     """Settings of one fit. Fits by least squares use only the seed and the nuisances.
 
     ``nuisance`` names the per-scan terms that are fitted jointly with the model and are never part of it. The
-    gain is not among them, because a part of the gain comes from the layout. The offset is pinned to a mean
-    of zero over the training scans.
+    gain is not among them, because part of it depends on the layout. The offset is pinned to a mean of zero
+    over the training scans.
     """
 
     FORMER = frozenset({"free_gain"})
@@ -43,11 +43,11 @@ class TrainingConfig(Record):
         4,
         ge=1,
         le=_MOST,
-        description="rounds; after each, nuisances are re-estimated and a checkpoint is kept",
+        description="number of rounds; after each, nuisances are estimated again and a checkpoint is written",
     )
     batch: int = Field(4, ge=1, le=_MOST, description="crops per step")
     crop_px: int = Field(
-        128, ge=8, le=_MOST, description="scored width and height of a crop; a model on tiles uses its tile"
+        128, ge=8, le=_MOST, description="scored side of a crop, px; a model on tiles uses its tile size"
     )
     crops: Literal["random", "quadrants"] = "random"
     optimiser: Literal["adamw", "adam"] = "adamw"
@@ -56,13 +56,13 @@ class TrainingConfig(Record):
     weight_decay: float = Field(1e-3, ge=0, le=_MOST)
     nuisance: Policy = "full+rows"
     validation_scans: int = Field(
-        2, ge=0, le=_MOST, description="training scans that only choose the checkpoint"
+        2, ge=0, le=_MOST, description="training scans used only to choose the checkpoint"
     )
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
-        """Return the settings of a named recipe for a model; ``settings`` override single fields.
+        """Return the settings of a named recipe for a model; ``settings`` override individual fields.
 
         ``paper``: Adam, batch 4, L1, 4,000 epochs of 72 quadrants, the paper's learning rates, no per-scan
         terms. ``fast``: AdamW with a one-cycle schedule, random crops, per-scan terms fitted jointly, and
@@ -93,16 +93,16 @@ class TrainingConfig(Record):
         return cls(**{"recipe": recipe, **paper, **settings})
 
     def takes_steps(self, model: Simulator) -> bool:
-        """Return whether the model is trained by stochastic gradient rather than by least squares.
+        """Return whether the model is trained by stochastic gradient descent rather than by least squares.
 
-        Large models are trained this way unless they are linear in their parameters; small models only in the
-        paper's recipe.
+        Large models are trained by gradient descent unless they are linear in their parameters. Small models
+        are trained by gradient descent only in the paper's recipe.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
 
     def used_by(self, model: Simulator) -> dict[str, Any]:
-        """Return the settings that decide a fit of ``model``, for its record."""
+        """Return the settings on which a fit of ``model`` depends, for the record of the fit."""
         if self.takes_steps(model):
             return self.model_dump(mode="json")
         optimiser = "gauss-newton" if is_small(model) else "ridge"

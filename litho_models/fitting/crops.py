@@ -10,13 +10,13 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# Number of pixels per pass, limited because a network keeps hundreds of bytes per pixel for its gradient.
+# Largest number of pixels per pass. A network keeps hundreds of bytes per pixel to compute its gradient.
 _PASS_PX = 256**2
 
 
 @dataclass(frozen=True)
 class Window:
-    """A square of ``size_px`` pixels of scan number ``scan`` with its corner at (y, x)."""
+    """A square of side ``size_px`` in scan number ``scan``, with its first pixel at (y, x)."""
 
     scan: int
     y: int
@@ -25,8 +25,8 @@ class Window:
 
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
-    """Cut the window of a field (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels
-    are repeated.
+    """Cut a window with a margin of ``margin_px`` on each side out of a field (ny, nx). Beyond the edge of
+    the field, its outermost pixels are repeated.
     """
     (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
     ny, nx = field.shape
@@ -39,7 +39,7 @@ def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
 
 
 def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
-    """Cut one window from each field and stack them as a float32 batch (b, 1, y, x)."""
+    """Cut each window from the field of its scan and stack the crops as a float32 batch (b, 1, y, x)."""
     crops = [cut(fields[window.scan], window, margin_px) for window in windows]
     return torch.from_numpy(np.stack(crops)[:, None].astype(np.float32))
 
@@ -73,7 +73,9 @@ def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Wind
 
 
 def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:
-    """Return all squares of a regular grid that fit: four quadrants of 256 px in a scan of 512 px."""
+    """Return all whole squares of a regular grid on each scan, such as the four quadrants of 256 px of a 512
+    px scan.
+    """
     return [
         Window(scan, y, x, size_px)
         for scan, (ny, nx) in enumerate(shapes)

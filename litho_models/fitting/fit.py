@@ -27,15 +27,16 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# A model fitted in closed form that is close to the data. A network's first scan terms are estimated from its
-# predictions.
+# A model that is fitted in closed form and is close to the data. Its predictions give the first estimate of
+# the scan terms for a network.
 FIRST_MODEL = "linear"
 
 
 class FitFacts(Record):
-    """The scans to which a model was fitted and on which it was chosen, its size and its cost.
+    """The scans on which a model was trained and validated, its number of parameters, and the time of the
+    fit.
 
-    ``at_bounds`` maps each fitted value on a bound of its range to that bound.
+    ``at_bounds`` lists the fitted values that lie on a bound of their range, each with that bound.
     """
 
     parameters: int
@@ -60,13 +61,13 @@ def fit(
 
     Args:
         model_name: one of ``litho_models.models.MODELS``.
-        scans: scans to learn from, all of one pitch, level height and number of levels.
+        scans: training scans, all with the same pitch, level height and number of levels.
         config: recipe, variant, seed, nuisances, settings of the model.
         checkpoint: folder of checkpoints, from which an interrupted run continues.
 
     Raises:
-        InputError: unknown model, no scans, scans that do not belong together, or a folder with a damaged
-            checkpoint or with that of another run.
+        InputError: an unknown model, no scans, scans that differ in these properties, or a checkpoint that is
+            damaged or belongs to another run.
     """
     geometry = common_geometry(scans)
     started = time.monotonic()
@@ -76,7 +77,7 @@ def fit(
             f"setting {name}", got=config.model[name], wanted=f"{geometry[name]}, as in the scans"
         )
     model = build_model(model_name, config.variant, **geometry, **config.model)
-    # The folder is checked even if the model writes no checkpoint, because it may contain another model's.
+    # The folder is checked even if this model writes no checkpoint: it may contain that of another model.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
@@ -121,8 +122,8 @@ def fit_in_cache(
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Return the heights of a small model fitted to the scans, from which a network's first scan terms
-    come.
+    """Return the heights that a small model fitted to the scans predicts. They give the first estimate of the
+    scan terms for a network.
     """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
@@ -133,8 +134,8 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
 def run_key(
     model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
 ) -> str:
-    """Return the hash of everything that determines a fit: model, hyper-parameters, settings, scans,
-    predicted scans.
+    """Return the hash of everything that determines a fit: model, hyper-parameters, settings, training scans
+    and held-out scans.
     """
     record = {
         "held_out_ids": list(held_out_ids),
@@ -147,7 +148,7 @@ def run_key(
 
 
 def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, str]:
-    """Return the key of each scan by its id."""
+    """Return the SHA-256 of each scan, by scan id."""
     return {scan.id: scan_sha256(scan) for scan in scans}
 
 
@@ -162,7 +163,7 @@ def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:
     found = sorted({(scan.pitch_um, scan.level_height_um, scan.levels) for scan in scans})
     if len(found) > 1:
         raise InputError(
-            "pitch_um, level_height_um, levels of the scans", got=found, wanted="the same for all"
+            "pitch_um, level_height_um, levels of the scans", got=found, wanted="the same in all"
         )
     pitch, level_height, levels = found[0]
     return {"pitch_um": pitch, "level_height_um": level_height, "levels": levels}

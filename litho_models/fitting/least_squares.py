@@ -1,8 +1,9 @@
-"""Fit all small models by least squares: damped Gauss-Newton that also solves for the terms of single scans.
+"""Fit small models by least squares: a damped Gauss-Newton method that also solves for the terms of each
+scan.
 
-The loss is a sum of squares, or of absolute values with the weights 1/sqrt(r² + δ²). The problem provides
-residuals and derivatives (of a model of the zoo, or of the loop's model with effects), and the ``room`` in
-which the parameters may move.
+The loss is a sum of squares, or of absolute values, minimised as squares with the weights 1/sqrt(r² + δ²). A
+``Problem`` provides the residuals and derivatives of a model (one of the zoo, or the loop's model with
+effects), and the ``room``: the smallest and largest allowed step of each parameter.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from litho_data.foundation.kinds import Array
 Loss = Literal["absolute", "squares"]
 Room = tuple[Array, Array]
 
-# δ: the loss of smaller residuals is nearly quadratic. This limit is far below the noise of a print (16 nm).
+# δ: for smaller residuals, the loss is nearly quadratic. δ is far below the noise of a print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
 # A combination of unit columns with a smaller squared norm is rounding error.
@@ -29,7 +30,7 @@ _WEAKEST_INFLUENCE = 1e-8
 
 @dataclass(frozen=True)
 class Linearised:
-    """One scan at given parameters, µm, at n pixels.
+    """One scan, linearised at given parameters: values in µm at n pixels.
 
     Attributes:
         residual: measured minus predicted, (n,).
@@ -43,7 +44,7 @@ class Linearised:
 
 
 class Problem(Protocol):
-    """The interface of a fit, scan by scan."""
+    """The interface that a model must provide to be fitted, scan by scan."""
 
     def linearise(self, vector: Array) -> list[Linearised]:
         """Linearise all scans at these parameters."""
@@ -60,15 +61,16 @@ class Rules:
     """Settings of a fit.
 
     Attributes:
-        loss: what is minimised.
+        loss: the quantity that is minimised.
         term_weight: with ``squares``, the weight of the part of a residual that scan terms can explain. It is
-            large enough to determine the common part of the terms (the datum), and so small that no scan
+            large enough to determine the common part of the terms (the datum) and small enough that no scan
             biases the parameters.
-        pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
+        pinned: with ``absolute``, the number of leading scan terms whose mean over the scans is held at zero.
         steps: largest number of steps; ``relative_gain``: a smaller gain of one step ends the fit.
-        tries: attempts at one step, each with ten times the damping; ``lowest_damping``: its lower limit.
-        kept_above: derivatives are reused while the gain of a step is at least this share of the predicted
-            gain; None: never.
+        tries: attempts at one step, each with ten times the damping of the previous one; ``lowest_damping``:
+            lower limit on the damping.
+        kept_above: derivatives are reused while the gain of a step is at least this fraction of the predicted
+            gain; with None they are never reused.
     """
 
     loss: Loss
@@ -93,7 +95,7 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown`` may wrap the
+    """Fit the parameters of a problem, beginning at ``start`` and keeping its dtype. ``shown`` may wrap the
     range of the steps to show progress.
     """
     vector, linear = start, problem.linearise(start)
@@ -122,7 +124,7 @@ def fit_least_squares(
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
         small = gained < rules.relative_gain * loss
-        # Only derivatives at this point can show convergence.
+        # A small gain shows convergence only if the derivatives were not reused from an earlier point.
         ends = small and fresh
         if rules.kept_above is None:
             kept = False
@@ -140,10 +142,10 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations. Their rows belong first to the parameters, then to the terms of each scan, and then
-    to the equations that pin leading terms.
+    """Normal equations, with rows for the parameters, then for the terms of each scan, and last for the
+    conditions that pin leading terms.
 
-    With ``squares`` the terms of the scans are eliminated, and only the parameters remain.
+    With ``squares``, the terms of the scans are eliminated, and only rows for the parameters remain.
     """
 
     matrix: Array
@@ -154,7 +156,7 @@ class NormalEquations:
 
     @classmethod
     def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
-        """Make the equations at linearised scans with the present ``terms`` (scans, k)."""
+        """Set up the equations for linearised scans with the present ``terms`` (scans, k)."""
         count = len(linear[0].jacobian)
         if terms is None:
             matrix, right, squares = eliminated_sum(linear, rules.term_weight)
@@ -187,8 +189,8 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # These terms are computed for the limited step, because the terms of the unlimited step do not fit
-        # it.
+        # The terms are solved for again with the limited step, because those of the unlimited step do not
+        # match it.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -208,7 +210,9 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Return the decrease of the squares that a step (p,) promises, by the normal equations (p, p), (p,)."""
+    """Return by how much the normal equations, (p, p) and (p,), predict that a step (p,) reduces the sum of
+    squares.
+    """
     return float(2 * right @ step - step @ matrix @ step)
 
 
@@ -218,15 +222,15 @@ def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
-    """Return normal matrix, right side and weighted sum of squares of one scan, with its own terms
-    eliminated.
+    """Return the normal matrix, right side and weighted sum of squares of one scan, after eliminating its own
+    terms.
     """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
 
 
 def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Array, Array, float]:
-    """Sum ``eliminated`` over scans."""
+    """Return the results of ``eliminated``, summed over scans."""
     parts = [eliminated(part, term_weight) for part in linear]
     normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
     return normal, right, sum(p[2] for p in parts)
@@ -234,7 +238,7 @@ def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Ar
 
 def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
     """Return the sum of squares of the residuals (n,) of these scans. The part that the terms of a scan can
-    explain is weighted down.
+    explain has the weight ``term_weight``.
     """
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
@@ -243,7 +247,8 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 
 
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
-    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box. Parameters without effect are allowed.
+    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box. Parameters that have no effect are
+    allowed.
 
     If the unlimited step were computed first and then cut to its bounds, the other parameters would still be
     those of the uncut step, and fits with an optimum on a bound would converge slowly.
@@ -251,7 +256,7 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).
         damping: relative to the diagonal.
-        room: lowest and highest x, (p,) each; none by default.
+        room: lowest and highest allowed x, (p,) each; no limits by default.
     """
     diagonal = np.diag(normal).copy()
     floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
@@ -269,7 +274,9 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
 
 
 def orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
+    """Return an orthonormal basis (n, k') of the span of the columns, which may be zero or linearly
+    dependent.
+    """
     if not columns.shape[1]:
         return columns
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
@@ -279,8 +286,8 @@ def orthonormal(columns: Array) -> Array:
 
 
 def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
-    """Return inner products (m, m) of the columns (n, m), with the part inside the basis (n, k) weighted
-    down.
+    """Return inner products (m, m) of the columns (n, m), with the part inside the basis (n, k) multiplied by
+    ``weight_in_basis``.
     """
     return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
 

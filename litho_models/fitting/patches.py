@@ -1,4 +1,4 @@
-"""Draw patches of a store for your own training loop: a PyTorch ``Dataset`` without the lock box."""
+"""Draw patches from a store for your own training loop, as a PyTorch ``Dataset`` without the locked scans."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from litho_models.fitting.crops import Window, cut
 
 
 class Patch(TypedDict):
-    """One patch: the layout with its margin, the measured height, the mask of pixels that count, the scan,
+    """One patch: the layout with its margin, the measured height, the mask of valid pixels, the scan's id,
     and the patch's corner.
     """
 
@@ -28,16 +28,17 @@ class Patch(TypedDict):
 
 
 class PatchDataset(Dataset[Patch]):
-    """Squares drawn from the scans of a store. Each square depends only on the seed and on its index.
+    """Square patches drawn at random from the scans of a store. Each patch depends only on the seed and on
+    its index.
 
     ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
-    sees what lies beyond its edge. ``height_um`` (1, s, s) float32 is 0 where not measured, and ``valid`` (1,
-    s, s) bool marks the pixels that count. Patches are neither turned nor flipped, because the two axes of a
-    print differ, and a lag of the beam or of the microscope acts to one side.
+    sees the surroundings of the patch. ``height_um`` (1, s, s) float32 is 0 where nothing was measured, and
+    ``valid`` (1, s, s) bool marks the valid pixels. Patches are neither rotated nor flipped, because the two
+    axes of a print differ, and a lag of the beam or the microscope acts in one direction only.
 
     Args:
         store: dataset store or its path. Locked scans are left out.
-        size_px: side s of a patch; ``margin_px``: m.
+        size_px: side s of a patch; ``margin_px``: width m of the margin.
         per_scan: number of patches from each scan.
         ids: scans to draw from; by default all that are not locked.
         seed: decides the positions of the patches.
@@ -60,7 +61,7 @@ class PatchDataset(Dataset[Patch]):
         self._layouts_um = [scan.layout_um for scan in self._scans]
         smallest = min(min(scan.shape) for scan in self._scans)
         if not 1 <= size_px <= smallest:
-            raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the smallest scan")
+            raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, a scan's side")
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
             raise InputError(
@@ -98,7 +99,9 @@ def _chosen(store: Store, ids: Sequence[str] | None) -> list[PrintedScan]:
     open_ids = [scan_id for scan_id in store.ids if scan_id not in store.locked_ids]
     if refused := [scan_id for scan_id in ids or () if scan_id not in open_ids]:
         got = ", ".join(f"{one} ({'locked' if one in store.locked_ids else 'unknown'})" for one in refused)
-        raise InputError("ids of patches", got=got, wanted="scans of the store that are not locked")
+        raise InputError(
+            "scans to draw patches from", got=got, wanted="scans of the store that are not locked"
+        )
     wanted = [store.scan(scan_id) for scan_id in (open_ids if ids is None else ids)]
     if not wanted:
         raise InputError("patches", got="no scan", wanted="at least one scan that is not locked")

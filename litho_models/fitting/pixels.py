@@ -1,4 +1,4 @@
-"""Fit networks of fixed features to single pixels; the features are computed once for each scan."""
+"""Fit networks on fixed features, pixel by pixel. The features are computed once for each scan."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
-# Number of fitted pixels of all scans together, on a square grid in each: 100 MB of features.
+# Number of fitted pixels in all scans together, on a square grid in each scan. Their features take 100 MB.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
 # Number of passes over all pixels between estimates of the scan terms.
@@ -28,8 +28,8 @@ EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """One scan: features (n, all), measured height minus the chain's (n,) µm, and the scan's own terms (m,
-    n).
+    """The fitted pixels of one scan: features (n, all), measured height minus the height of the chain (n,)
+    µm, and the scan's own terms (m, n).
     """
 
     features: Tensor
@@ -40,13 +40,14 @@ class _Pixels(NamedTuple):
 def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
-    """Fit the feature networks of ``model`` in place to the chain's residual, by mean absolute error.
+    """Fit the feature networks of ``model`` in place to the residual of the chain, minimising the mean
+    absolute error.
 
     Line offsets are left out of the terms of the scans, because they average out.
 
     Returns:
-        the record of one round, with the error after the terms of the scans are removed; ``validation``
-        scans do not influence the fit.
+        The record of one round, with the error after the terms of the scans are removed. ``validation`` scans
+        do not influence the fit.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance)
@@ -93,7 +94,9 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """Return the targets of the networks at all pixels, (all n,) µm, without the scan terms."""
+    """Return the heights that the networks should add at all pixels, (all n,) µm, after the scan terms are
+    removed.
+    """
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]
     own = np.array([least_squares(part.terms, rest) for part, rest in zip(parts, rests, strict=True)])

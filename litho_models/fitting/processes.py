@@ -1,4 +1,4 @@
-"""The processes of ``torchrun`` that share a training; without torchrun there is one process."""
+"""Share a training among the processes of ``torchrun``; without torchrun, there is only one process."""
 
 import os
 from collections.abc import Iterable
@@ -9,11 +9,11 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Join the processes of torchrun: by gloo on CPUs, or by NCCL on GPUs, where each process uses a separate
-    GPU.
+    """Join the processes of torchrun with gloo on CPUs, or with NCCL on GPUs, where each process uses a
+    separate GPU.
 
     Returns:
-        The number of this process, from 0, and how many processes there are.
+        The number of this process, counted from 0, and the number of processes.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return 0, 1

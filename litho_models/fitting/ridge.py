@@ -14,20 +14,20 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Ridge, relative to the mean square of each feature after the terms of the scans are removed. It affects only
-# weights that the scans cannot distinguish. On the measured prints all values from 1e-6 to 1e-4 give the same
-# result.
+# Strength of the ridge relative to the mean square of each feature, after the terms of the scans are removed.
+# It affects only weights that the scans cannot distinguish. On the measured prints, all values from 1e-6 to
+# 1e-4 give the same result.
 RIDGE = 1e-5
-# Number of fitted pixels of each scan, on a square grid; twice as many predict the measured prints equally
-# well. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take at most
-# KEPT_BYTES; otherwise each pass computes them again. The maps of one tile take another 0.3 GB.
+# Number of fitted pixels of each scan, on a square grid. Twice as many do not improve the predictions of the
+# measured prints. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take
+# at most KEPT_BYTES; otherwise each pass computes them again. The maps of one tile need another 0.3 GB.
 FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
-# The first pass minimises squares; the second reweights them to absolute values, so that blobs have little
-# weight.
+# The first pass minimises squares. The second reweights them to absolute values, so that blobs have little
+# influence.
 PASSES = 2
-# Weight of the scan terms, which determines the common datum.
+# Weight of the part of a residual that scan terms can explain. It determines the common datum.
 _TERM_WEIGHT = 1e-3
 
 
@@ -36,7 +36,7 @@ def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> 
 
     Args:
         model: the model; ``scans``: training scans.
-        policy: free terms of each scan, without line offsets, which average out.
+        policy: terms that are fitted to each scan. Line offsets are left out, because they average out.
     """
     terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):

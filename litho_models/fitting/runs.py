@@ -1,4 +1,4 @@
-"""Train a model on a store in a run folder; interrupted runs resume."""
+"""Train a model on a store and write a run folder. Interrupted runs resume."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -34,7 +34,7 @@ CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(FitFacts, Result):
-    """The record of a training, ``run.json``."""
+    """The record of a training run, ``run.json``."""
 
     SCHEMA = "litho-models/run/1"
     FILE_NAME = "run.json"
@@ -59,13 +59,13 @@ def train(
 ) -> TrainingRun:
     """Train a model on a store and write it to a run folder; repeating the call continues an interrupted run.
 
-    The scans of the lock box are left out unless ``use_lock_box``. Under ``torchrun`` the processes share
-    each step, and the first one writes.
+    The scans of the lock box are left out unless ``use_lock_box`` is set. Under ``torchrun``, the processes
+    share each step, and only the first one writes files.
 
     Args:
         store: dataset store; ``model``: name of a model; ``out``: run folder.
         recipe, variant: see ``TrainingConfig`` and the model's config.
-        settings: fields of ``TrainingConfig`` that replace the recipe's.
+        settings: fields of ``TrainingConfig`` whose values override those of the recipe.
 
     Raises:
         InputError: unknown names or settings, or a folder that holds another run.
@@ -118,14 +118,15 @@ def train(
                 "lock_box_sha256": ids_sha256(locked),
                 "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
             },
-            limitations=["Not evaluated yet: see the evaluation of this model for its error."],
+            limitations=["Not evaluated in training: an evaluation of this model gives its error."],
         )
         record.write(folder)
     return record
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """Return the checked settings of a recipe; settings unknown to training go to the model.
+    """Return the checked settings of a recipe. Settings that are not fields of ``TrainingConfig`` are passed
+    to the model.
 
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.
@@ -151,7 +152,7 @@ def level_share(scans: Sequence[PrintedScan]) -> list[float]:
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the share of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
+    """Return the shares of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )

@@ -1,4 +1,4 @@
-"""Fit small models of the zoo to a window of each scan, with derivatives in forward mode."""
+"""Fit small models of the zoo to one window of each scan, with forward-mode derivatives."""
 
 import copy
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from litho_models.simulator import Simulator
 # One quadrant of each scan is enough to fit a small model; successive scans use different quadrants.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Largest step of a parameter. Parameters are heights in µm and raw numbers of ranges, for which larger steps
-# leave the region of a valid linearisation.
+# Largest step of a parameter, which is a height in µm or the raw number of a range. The linearisation is not
+# valid for larger steps.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
@@ -47,7 +47,7 @@ def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Poli
 
 
 class ModelProblem:
-    """A model on windows of scans; the problem works on its own copy of the model.
+    """The problem of fitting a model to windows of scans. It works on its own copy of the model.
 
     Args:
         model: the model; ``scans``: training scans; ``terms``: free terms of each scan.
@@ -69,13 +69,15 @@ class ModelProblem:
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
     def room(self, vector: Array) -> Room | None:
-        """Return the steps within the ranges of the model; a linear model may take any step."""
+        """Return the smallest and largest step within the ranges of the model; None for a linear model, which
+        may take any step.
+        """
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
-    """Return the smallest and largest step (p,) of a model's trainable numbers, which their ranges and
-    ``STEP_LIMIT`` allow.
+    """Return the smallest and largest step (p,) that ranges and ``STEP_LIMIT`` allow for the trainable
+    numbers of a model.
     """
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)
@@ -90,7 +92,7 @@ def parameter_room(model: nn.Module, vector: Array) -> Room:
 
 
 class _Sample:
-    """One window of a scan on every second row and column."""
+    """Every second row and column of one window of a scan."""
 
     def __init__(self, scan: PrintedScan, number: int):
         size = min(WINDOW_PX, *scan.shape)
@@ -106,7 +108,9 @@ class _Sample:
         self._expansion: tuple[Array, Array, Array] | None = None
 
     def linearise(self, model: Simulator, terms: Terms) -> Linearised:
-        """Linearise the scan at the model's present values; a linear model is differentiated only once."""
+        """Linearise the scan at the model's present parameters; a linear model is differentiated only
+        once.
+        """
         if model.is_linear and self._expansion is not None:
             height, jacobian = self.height_um(model), self._expansion[2]
         else:
@@ -169,7 +173,9 @@ def _load(model: Simulator, vector: Array) -> None:
 
 
 class _WindowPrediction(nn.Module):
-    """``sample.predict`` as a module, because torch can swap parameters for tangents only in modules."""
+    """Wrap ``sample.predict`` as a module, because torch can replace parameters by tangents only in
+    modules.
+    """
 
     def __init__(self, model: Simulator, sample: _Sample):
         super().__init__()

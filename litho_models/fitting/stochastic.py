@@ -1,9 +1,9 @@
-"""Train models with many parameters by stochastic gradient on random crops, in rounds.
+"""Train models with many parameters by stochastic gradient descent on random crops, in rounds.
 
-Between rounds the scan terms are estimated from whole-scan predictions, the inner validation scans are
-scored, and a checkpoint is written. Within a round the targets are fixed. Random choices depend only on seed
-and step, so an interrupted run continues to the same result. Processes share the crops of each step and add
-their gradients. Between rounds every process does the same computations.
+Between rounds, the scan terms are estimated from whole-scan predictions, the inner validation scans are
+scored, and a checkpoint is written. Within a round, the targets are fixed. Random choices depend only on seed
+and step, so an interrupted run gives the same result after it is continued. Processes share the crops of each
+step and add their gradients. Between rounds, every process does the same computations.
 """
 
 import math
@@ -43,11 +43,11 @@ def train_network(
     first_predictions_um: Callable[[], Sequence[np.ndarray]],
     checkpoints: CheckpointFolder | None = None,
 ) -> list[RoundRecord]:
-    """Train ``model`` in place, on a GPU if there is one; it ends with the weights of the best round.
+    """Train ``model`` in place, on a GPU if there is one, and give it the weights of the best round.
 
-    The best round is the one with the smallest error on ``validation``; without validation scans it is the
-    last. ``first_predictions_um`` computes the heights of a small model on the training scans, from which the
-    first scan terms are estimated. A continued run needs no first predictions.
+    The best round is the one with the smallest error on ``validation``; without validation scans, it is the
+    last round. ``first_predictions_um`` computes the heights of a small model on the training scans, from
+    which the first scan terms are estimated. A continued run needs no first predictions.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -93,7 +93,7 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Run steps up to ``last``; raise InputError if numbers become infinite or NaN."""
+    """Guard the steps up to ``last``: raise InputError if weights of the model became infinite or NaN."""
     try:
         yield
         error = None
@@ -109,7 +109,7 @@ def _diverged(model: Simulator, step: int) -> InputError:
     return InputError(
         f"training of {model.name}",
         got=f"weights or errors that became infinite or NaN at step {step}",
-        wanted="steps that converge",
+        wanted="finite weights and errors",
         hint="try a smaller learning_rate",
     )
 
@@ -118,8 +118,8 @@ class _Targets:
     """The layouts of the training scans, and their heights without scan terms; unmeasured pixels have no
     weight.
 
-    Around each scan the outermost pixels of its layout are repeated for ``overhang_px``; the added pixels
-    have weight zero.
+    Each layout is extended by ``overhang_px`` on each side by repeating its outermost pixels. The added
+    pixels have weight zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
@@ -136,8 +136,8 @@ class _Targets:
 def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
-    """Do one step; return the weighted absolute error, µm, and the weight as one tensor (2,), which a GPU may
-    still be computing.
+    """Take one optimiser step. Return the weighted absolute error, µm, and the weight as one tensor (2,),
+    which a GPU may still be computing.
     """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
@@ -146,7 +146,7 @@ def _step(
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    # A process without a crop in this step computes the gradients of some crop with weight 0.
+    # A process that has no crop in this step computes the gradients of another crop with weight 0.
     for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
         share = len(some) / len(batch) if own else 0.0
@@ -163,7 +163,8 @@ def _losses(
     """Return the loss of some windows and, for the record, a tensor (2,) with their weighted absolute error,
     µm, and their weight.
 
-    A random crop includes its surroundings or is one tile of the model; a quadrant is an image of its own.
+    A random crop includes its surroundings or is one tile of the model. A quadrant is treated as a separate
+    image.
     """
     tile = model.tile if config.crops == "random" else None
     # The receptive radius changes during training if the width of a blur is learned.
@@ -203,8 +204,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Return how many pixels tiles may reach beyond a scan: as far as in prediction, and at least one
-    tile.
+    """Return by how many pixels tiles may reach beyond a scan: at least as many as in prediction, and enough
+    that one tile fits.
     """
     if model.tile is None or config.crops != "random":
         return 0
@@ -213,8 +214,8 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Return the learning rate of one step: constant, or rising along a cosine for a tenth of the steps and
-    falling for the rest.
+    """Return the learning rate of one step. It is constant, or it rises along a cosine for a tenth of the
+    steps and then falls along another.
     """
     if config.schedule == "constant":
         return config.learning_rate

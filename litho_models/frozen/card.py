@@ -28,9 +28,9 @@ _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported error or other figure, with the scans, nuisances and background for which it holds.
+    """One reported error or other value, with the scans, nuisances and background for which it holds.
 
-    ``ci95`` is the 95 % interval over scans.
+    ``ci95`` is the 95 % confidence interval over scans.
     """
 
     name: str
@@ -52,11 +52,11 @@ class ModelCard(RunFacts, Result):
     """Everything needed to load, use and judge a frozen model.
 
     ``background`` is the mean contribution of the microscope to the training scans. This background is used
-    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each
-    fitted value on a bound of its range to that bound. ``baseline`` contains the figures (``ScanFigures``) of
-    the scans from which the model was made; ``litho-models check`` compares new prints with them.
-    ``attributed`` says to which side each effect of undetermined role was attributed when the model was
-    frozen.
+    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` lists the
+    fitted values that lie on a bound of their range, each with that bound. ``baseline`` contains the gain and
+    error (``ScanFigures``) of the scans from which the model was made; ``litho-models check`` compares new
+    prints with them. ``attributed`` says to which side each effect of undetermined role was attributed when
+    the model was frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -96,7 +96,9 @@ class ModelCard(RunFacts, Result):
 
     @property
     def held_out(self) -> CardMetric | None:
-        """Return the error on held-out scans; None for a model outside any benchmark."""
+        """Return the error on held-out scans; None if the card has none, because the model was not
+        benchmarked.
+        """
         return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 
     @field_validator("training", "split")
@@ -105,7 +107,7 @@ class ModelCard(RunFacts, Result):
         for key in _LISTS_OF_NAMES:
             names = facts.get(key, [])
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise ValueError(f"{key} has to be a list of names")
+                raise ValueError(f"{key} must be a list of names")
         return facts
 
     @classmethod
@@ -126,7 +128,7 @@ class ModelCard(RunFacts, Result):
                 f"model in {folder}",
                 got=f"no {CARD_FILE}",
                 wanted="the folder of a frozen model",
-                hint=f"take {inside[0]}" if inside else "`litho-models freeze RUN --out FOLDER` writes one",
+                hint=f"use {inside[0]}" if inside else "`litho-models freeze RUN --out FOLDER` writes one",
             )
         return super().read(folder)
 
@@ -140,4 +142,4 @@ class ModelCard(RunFacts, Result):
 def bounds_text(at_bounds: dict[str, float]) -> str:
     """Return a sentence that names the fitted values that lie on their bounds."""
     named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
-    return f"On a bound of its range, so that the fit may want more than the model allows: {named}."
+    return f"These values lie on a bound of their range, so the best fit may lie outside: {named}."

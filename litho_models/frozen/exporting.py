@@ -29,10 +29,11 @@ _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um"
 
 
 def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) -> float:
-    """Write a frozen model as a program for layouts of one size; return the largest difference, µm.
+    """Write a frozen model as a program for layouts of one size; return its largest deviation from the model,
+    µm.
 
     The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. The program
-    checks neither pitch nor range. The program's metadata contains both (``card.json`` of a ``.pt2``,
+    checks neither pitch nor range, but its metadata contains both (``card.json`` of a ``.pt2``,
     ``metadata_props`` of ONNX).
 
     Args:
@@ -40,12 +41,12 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
         size_px: side of the layout.
 
     Raises:
-        InputError: another suffix; ``onnx`` is not installed; the format lacks an operation of the model; or
-            the program would predict other heights.
+        InputError: a different suffix; ``onnx`` is not installed; the format lacks an operation of the model;
+            or the program would predict other heights.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:
-        raise InputError(f"export to {out}", got=repr(target.suffix), wanted=" or ".join(SUFFIXES))
+        raise InputError(f"suffix of the export {out}", got=repr(target.suffix), wanted=" or ".join(SUFFIXES))
     if size_px < 1:
         raise InputError("size_px", got=size_px, wanted="a positive number")
     generator = torch.Generator().manual_seed(0)
@@ -61,8 +62,10 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
             printed = write(program, temporary, layouts[1], facts)
             difference = float((printed - wanted).abs().max())
             if not difference <= LARGEST_DIFFERENCE_UM:
-                got = f"a print that differs by {difference:g} µm"
-                raise InputError(f"export of {model.name}", got=got, wanted=f"{LARGEST_DIFFERENCE_UM:g} µm")
+                got = f"heights off by {difference:g} µm"
+                raise InputError(
+                    f"export of {model.name}", got=got, wanted=f"at most {LARGEST_DIFFERENCE_UM:g} µm"
+                )
     return difference
 
 
@@ -98,7 +101,7 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
             simulator(layout)
         noted.append(numbers.noted)
     if noted[0] != noted[1]:
-        raise InputError("model to export", got="steps that depend on the layout", wanted="fixed steps")
+        raise InputError("model to export", got="operations that depend on the layout", wanted="fixed ones")
 
     def run(layout_um: Tensor) -> Tensor:
         with _Numbers(noted[0]):
@@ -109,7 +112,7 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
 
 
 class _Program(nn.Module):
-    """Names the input of a program."""
+    """A module that gives the input of a program the name ``layout_um``."""
 
     def __init__(self, traced: Callable[[Tensor], Tensor]):
         super().__init__()
@@ -139,11 +142,11 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
         except torch.onnx.errors.OnnxExporterError as error:
             complex_numbers = "complex" in str(error)
             raise InputError(
-                f"model {facts['name']} to export to ONNX",
+                f"export of model {facts['name']} to ONNX",
                 got="complex numbers, which ONNX does not support"
                 if complex_numbers
                 else type(error).__name__,
-                hint="the .pt2 format can hold every model",
+                hint="export to .pt2, which supports every model",
             ) from None
     assert written is not None
     written.model.metadata_props.update({key: json.dumps(value) for key, value in facts.items()})

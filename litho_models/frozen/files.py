@@ -1,5 +1,5 @@
-"""Write and load frozen models: folders with weights and a plain card, which are loaded without running any
-code.
+"""Write and load frozen models: folders with weights and a card. Loading a model runs no code from its
+folder.
 
 ``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card in readable
 form. Only numbers and names of known classes are read; nothing is unpickled.
@@ -42,14 +42,14 @@ def save_frozen(
     process_effects: EffectValues | None = None,
     **card_fields: Any,
 ) -> Path:
-    """Write a process model for design; return the folder.
+    """Write a process model as a frozen model for design; return its folder.
 
     Args:
         simulator: the fitted model.
-        folder: output folder; an older model there is replaced as a whole.
-        name: name in reports; the model's own by default.
-        process_effects: effects of the printer that become part of the model: parameter values by the name of
-            the effect.
+        folder: output folder; an older model in this folder is replaced completely.
+        name: name in reports; by default, the name of the model.
+        process_effects: effects of the printer that become part of the model, as a mapping from name to
+            parameter values.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); fields that
             follow from the model are always computed from it.
 
@@ -60,8 +60,8 @@ def save_frozen(
     _check_numbers(state, f"weights of {simulator.name}")
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
-        # The file has no metadata, because safetensors writes its entries in no fixed order, which would
-        # change the hash.
+        # The file has no metadata, because safetensors writes metadata in no fixed order, so that the hash
+        # would change.
         (temporary / WEIGHTS_FILE).write_bytes(save(state))
         try:
             own = {
@@ -88,8 +88,7 @@ def save_frozen(
 def load_frozen(
     source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
-    """Load a frozen model, including its effects of the printer, in eval mode and without gradients for the
-    weights.
+    """Load a frozen model with its printer effects, in eval mode and without gradients for the weights.
 
     Args:
         source: folder that ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for a model that
@@ -98,8 +97,8 @@ def load_frozen(
         extrapolate: accept heights beyond the calibrated range.
 
     Raises:
-        InputError: no such folder or model of the zoo, or a card or weights that are damaged, foreign or
-            do not fit.
+        InputError: no such folder or zoo model, or a card or weights that are damaged, of another format, or
+            do not belong together.
     """
     path = zoo.model_folder(source)
     card = ModelCard.read(path)
@@ -115,7 +114,7 @@ def load_frozen(
 
 
 def push(source: str | Path, repository: str, *, private: bool = False) -> str:
-    """Share a frozen model on the Hugging Face Hub; return the address that ``load_frozen`` takes.
+    """Share a frozen model on the Hugging Face Hub; return the address that ``load_frozen`` accepts.
 
     Args:
         source: as for ``load_frozen``.
@@ -143,7 +142,7 @@ def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
         raise InputError(
             f"SHA-256 of {weights}",
             got=f"{found[:12]}…",
-            wanted=f"{card.weights_sha256[:12]}…, as its card says",
+            wanted=f"{card.weights_sha256[:12]}…, as stated in its card",
             hint="the file is damaged or belongs to another model",
         )
     try:
@@ -156,7 +155,7 @@ def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
     simulator = _empty_simulator(card, weights)
     wanted = simulator.state_dict()
     for key in sorted(wanted.keys() | state.keys()):
-        found, fits = (str(tuple(part[key].shape)) if key in part else "no such" for part in (state, wanted))
+        found, fits = (str(tuple(part[key].shape)) if key in part else "absent" for part in (state, wanted))
         if found != fits:
             raise InputError(
                 f"weights in {weights}", got=f"{key} {found}", wanted=f"{fits}, as in {card.model}"
@@ -173,13 +172,13 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
         raise InputError(f"hyper_parameters beside {weights}", got=first_error(error)) from error
     stated = (card.pitch_um, card.level_height_um, card.levels)
     if stated != (config.pitch_um, config.level_height_um, config.levels):
-        raise InputError("card", got=f"geometry {stated}", wanted="the same in hyper_parameters")
+        raise InputError("card", got=f"geometry {stated}", wanted="that of the hyper_parameters")
     lowest, highest = card.calibrated_range_um
     if not 0 <= lowest < highest <= config.full_height_um:
         raise InputError(
             f"calibrated_range_um beside {weights}",
             got=f"{lowest:g} to {highest:g} µm",
-            wanted=f"a range within 0 to {config.full_height_um:g} µm, the heights of its levels",
+            wanted=f"a range within 0 to {config.full_height_um:g} µm, the range of its levels",
         )
     try:
         return known(config)
@@ -193,7 +192,7 @@ def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
     for key, value in state.items():
         if value.dtype != torch.float32 or not torch.isfinite(value).all():
             got = f"{value.dtype}" if value.dtype != torch.float32 else "non-finite values"
-            raise InputError(what, got=f"{got} in {key}", wanted="finite numbers in float32")
+            raise InputError(what, got=f"{got} in {key}", wanted="finite float32 numbers")
 
 
 def _check_effects(card: ModelCard) -> None:
@@ -207,6 +206,6 @@ def _check_effects(card: ModelCard) -> None:
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",
                 wanted="an effect of the printer",
-                hint="`litho-models freeze --attribute printer` gives an undetermined effect to the printer",
+                hint="`litho-models freeze --attribute printer` attributes undetermined effects to it",
             )
         effect.require_in_range(values)

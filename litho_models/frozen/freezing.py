@@ -11,10 +11,10 @@ from litho_models.frozen.files import load_simulator, save_frozen
 
 # Folder of the model in the run folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
-# Name of the part that `Simulator.printer` leaves out, among the effects of undetermined role.
+# Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
-    f"Stated errors are those with {SCAN_AXIS}, which belongs to measured maps and is left out here."
+    f"The stated errors include {SCAN_AXIS}, a part for measured maps that is left out of this model."
 )
 
 
@@ -24,12 +24,12 @@ def freeze(
     """Write the process model of a run folder, or of a model folder, as a frozen model.
 
     Args:
-        source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
+        source: a folder that ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
         out: folder of the frozen model.
-        attribute: the side to which effects of undetermined role are attributed: one side for all effects, or
-            one by name. Effects of the printer become part of the model, those of the microscope do not. The
-            card records the attribution. ``scan-axis`` is the part of a base model that acts along the lines
-            of the scan.
+        attribute: the side to which effects of undetermined role are attributed: one side for all of them, or
+            a mapping from effect to side. Effects of the printer become part of the model; those of the
+            microscope do not. The card records the attribution. ``scan-axis`` is the part of a base model
+            that acts along the lines of the scan.
 
     Raises:
         InputError: ``source`` has no model, an effect is not among the undetermined ones, a side is unknown,
@@ -38,7 +38,7 @@ def freeze(
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER
     if not (folder / CARD_FILE).exists():
-        raise InputError(f"no model in {source}", wanted="a folder of `litho-models train` or a frozen model")
+        raise InputError(f"no model in {source}", wanted="a folder that `train` wrote, or a frozen model")
     card = ModelCard.read(folder / CARD_FILE)
     simulator = load_simulator(folder, card)
     decided = card.attributed.get(SCAN_AXIS) == "printer"
@@ -53,7 +53,7 @@ def freeze(
             raise InputError("--attribute", got=side, wanted=" or ".join(get_args(Attribution)))
         if name not in undetermined:
             raise InputError(
-                "effect to attribute",
+                "undetermined effect to attribute",
                 got=name or f"{card.name}, which has none",
                 wanted=", ".join(undetermined) or "a model with an effect of undetermined role",
             )
@@ -61,9 +61,9 @@ def freeze(
     taken = sides["printer"].pop(SCAN_AXIS, None) is not None
     if taken and printer is simulator:
         raise InputError(
-            f"{SCAN_AXIS} for the printer",
+            f"attributing {SCAN_AXIS} to the printer",
             got=f"{card.name}, which was frozen without it",
-            wanted="the folder of `train` or `close-loop`",
+            wanted="a folder that `train` or `close-loop` wrote",
         )
     kept = card.model_dump(mode="json", by_alias=True, exclude={"name", "process_effects", "versions"})
     kept["undetermined_effects"], kept["measurement_effects"] = undetermined, sides["microscope"]

@@ -14,7 +14,7 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Return the folder of a model, which is downloaded unless the cache of huggingface_hub contains it.
+    """Download a model, unless the cache of huggingface_hub contains it, and return its folder.
 
     Args:
         address: ``hf://owner/name``, or ``hf://owner/name@revision``.
@@ -28,7 +28,8 @@ def fetched(address: str) -> Path:
 
 
 def upload(folder: Path, repository: str, *, private: bool) -> str:
-    """Make the repository if necessary and put the three files of a frozen model into it; return its address.
+    """Upload the three files of a frozen model to a repository, which is created if necessary; return its
+    address.
 
     Raises:
         InputError: no such address, a repository that refuses the upload, or huggingface_hub is not
@@ -43,7 +44,7 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
 
 @contextmanager
 def _hub(repository: str) -> Iterator[Any]:
-    """Yield the library, and turn each of its errors into one line."""
+    """Yield huggingface_hub, and convert each of its errors to a one-line InputError."""
     what = f"model {ADDRESS}{repository}"
     if not _REPOSITORY.fullmatch(repository):
         raise InputError(what, wanted=f"{ADDRESS}OWNER/NAME")

@@ -23,7 +23,8 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
         out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
 
     Raises:
-        InputError: a layout that cannot be read or has levels beyond the calibrated range, or another suffix.
+        InputError: a layout that cannot be read or has levels beyond the calibrated range, or an ``out`` with
+            another suffix.
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])

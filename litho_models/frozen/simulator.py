@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# Rounded to float32, the highest level may exceed the range a little; the next level exceeds it by 100 nm.
+# Rounding to float32 may put the highest level slightly out of the range; the next level exceeds it by 100
+# nm.
 _ROUNDING_UM = 1e-5
 
 
@@ -31,7 +32,7 @@ Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
 
 
 class FrozenSimulator(nn.Module):
-    """A process model for design, with fixed weights and gradients only to its input.
+    """A process model for design, with fixed weights and with gradients only for its input.
 
     ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
     """
@@ -42,7 +43,7 @@ class FrozenSimulator(nn.Module):
         self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
         self.sha256 = sha256
         self.extrapolate = extrapolate
-        # Receptive radius, µm; None where a pixel depends on the whole image.
+        # Receptive radius, µm; None if a pixel depends on the whole image.
         self.reach_um = simulator.reach_um if isinstance(simulator, Simulator) else None
         self._lowest_um, self._highest_um = card.calibrated_range_um
         self._precision: Precision = "float32"
@@ -65,7 +66,8 @@ class FrozenSimulator(nn.Module):
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
-        """Predict in ``precision`` inside the block, see ``network_precision``; otherwise in float32.
+        """Predict in ``precision`` inside the block (see ``network_precision``). Outside such a block,
+        float32 is used.
 
         A line on stderr warns if this precision is slower than float32.
         """
@@ -83,17 +85,16 @@ class FrozenSimulator(nn.Module):
     def forward(
         self, layout_um: Tensor, pitch_um: float | None = None, level_height_um: float | None = None
     ) -> Tensor:
-        """Print a layout; return the height (b, 1, y, x), µm.
+        """Predict the print of a layout; return its height (b, 1, y, x), µm.
 
         Args:
             layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
                 ``double()``.
-            pitch_um: sampling of the layout, and ``level_height_um`` its level height; each is checked if
-                given.
+            pitch_um: sampling of the layout; ``level_height_um``: its level height. Each is checked if given.
 
         Raises:
-            InputError: another pitch or level height, a layout that is no tensor or has another shape or
-                dtype, or heights beyond the calibrated range without ``extrapolate``.
+            InputError: a pitch or level height other than the model's, a layout that is not a tensor or has
+                the wrong shape or dtype, or heights beyond the calibrated range without ``extrapolate``.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -101,17 +102,18 @@ class FrozenSimulator(nn.Module):
         return self._in_precision(self.simulator, layout_um)
 
     def predict(self, layout_um: Field, pitch_um: float | None = None) -> Field:
-        """Predict the print of a layout given as any kind of array with any number of dimensions; return the
-        height, µm, as the same kind of array with the same shape.
+        """Predict the print of a layout given as an array or tensor of any number of dimensions. Return the
+        height, µm, with the same type and shape.
 
         Args:
-            layout_um: nominal height (..., y, x), µm, of any float type: an array of NumPy or xarray (whose
-                coordinates y_um and x_um, if any, are checked), or a tensor, through which gradients flow.
-            pitch_um: sampling of the layout, if the caller wants it checked.
+            layout_um: nominal height (..., y, x), µm, of any float type: a NumPy array, an xarray array
+                (whose coordinates y_um and x_um, if any, are checked), or a tensor, through which gradients
+                flow.
+            pitch_um: sampling of the layout; it is checked if given.
 
         Raises:
-            InputError: as ``forward``; also for whole numbers, which would be levels, and for fewer than two
-                dimensions.
+            InputError: as for ``forward``, and also for integers, which would be levels, and for fewer than
+                two dimensions.
         """
         self.check_geometry(pitch_um)
         if isinstance(layout_um, Tensor):
@@ -123,7 +125,7 @@ class FrozenSimulator(nn.Module):
         import xarray as xr
 
         if not isinstance(layout_um, xr.DataArray):
-            kinds = "an array of NumPy or xarray, or a tensor"
+            kinds = "a NumPy or xarray array, or a PyTorch tensor"
             raise InputError("layout", got=f"a {type(layout_um).__name__}", wanted=kinds)
         _check_sampling(layout_um, self.pitch_um)
         printed = layout_um.copy(data=self.predict(layout_um.to_numpy())).rename("height_um")
@@ -133,9 +135,9 @@ class FrozenSimulator(nn.Module):
         if not layout_um.is_floating_point():
             raise InputError(
                 "layout",
-                got="whole numbers",
+                got="integers",
                 wanted="heights in µm",
-                hint=f"levels * {self.card['level_height_um']:g} are heights",
+                hint=f"multiply levels by {self.card['level_height_um']:g} to get heights",
             )
         if layout_um.ndim < 2 or not layout_um.numel():
             shape = tuple(layout_um.shape)
@@ -157,22 +159,22 @@ class FrozenSimulator(nn.Module):
         return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
-        """Predict as ``forward`` does, but leave out the outermost ``border_px``: (b, 1, y - 2 border, x - 2
+        """Predict as ``forward`` does, but crop ``border_px`` on each side; return (b, 1, y - 2 border, x - 2
         border) µm.
 
         If the border is at least as wide as the receptive radius, or if the model runs on tiles, only the
-        pixels that the result needs are computed. In the first case nothing is assumed about the layout
+        pixels that the result needs are computed. In the first case, nothing is assumed about the layout
         beyond its edge.
 
         Raises:
-            InputError: as ``forward``, or a border that leaves nothing.
+            InputError: as for ``forward``, or a border that leaves no pixels.
         """
         self._check_layout(layout_um, pitch_um, None)
         if not 0 <= 2 * border_px < min(layout_um.shape[-2:]):
             raise InputError(
                 f"border of a print by {self.name}",
                 got=f"{border_px} px of a layout of {tuple(layout_um.shape[-2:])} px",
-                wanted="0 or more, less than half the layout",
+                wanted="0 px or more, and less than half the layout",
             )
         if isinstance(self.simulator, Simulator):
             inside = partial(predict_inside, border_px=border_px)
@@ -191,7 +193,7 @@ class FrozenSimulator(nn.Module):
             raise InputError(
                 "layout",
                 got=f"a {type(layout_um).__name__}",
-                wanted="a tensor of PyTorch",
+                wanted="a PyTorch tensor",
                 hint="torch.from_numpy converts a NumPy array",
             )
         if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
@@ -206,13 +208,13 @@ class FrozenSimulator(nn.Module):
                 "layout",
                 got=layout_um.dtype,
                 wanted=f"{wanted}, like the weights",
-                hint=f"layout.to({wanted})",
+                hint=f"use layout.to({wanted})",
             )
         if not self.extrapolate:
             self._check_range(layout_um)
 
     def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
-        """Refuse a pitch or level height other than the model's; None is not checked.
+        """Refuse a pitch or level height that differs from the model's; None is not checked.
 
         Raises:
             InputError: they differ.
@@ -232,7 +234,7 @@ class FrozenSimulator(nn.Module):
                 f"layout for model {self.name}",
                 got=f"heights from {lowest:g} to {highest:g} µm",
                 wanted=f"{self._lowest_um:g} to {self._highest_um:g} µm, the calibrated range",
-                hint="load it with extrapolate=True to accept a guess",
+                hint="load the model with extrapolate=True to accept less certain heights",
             )
 
 

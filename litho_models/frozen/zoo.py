@@ -1,4 +1,4 @@
-"""Names and folders of the frozen models in the package. They are the models in the benchmark's table.
+"""Names and folders of the frozen models in the package. These models are the ones in the benchmark table.
 
 ``load_frozen("zoo:pbl")`` opens one of them, and ``load_frozen("zoo:best")`` the one that predicts held-out
 scans best.
@@ -25,8 +25,7 @@ def list() -> builtins.list[str]:
 
 
 def folder(name: str) -> Path:
-    """Return the folder of the frozen model of that name, or of the best one, for commands that take a
-    folder.
+    """Return the folder of the zoo model with this name, or of the best one, for commands that take a folder.
 
     Raises:
         InputError: no such model.
@@ -36,7 +35,7 @@ def folder(name: str) -> Path:
         name = min(known, key=_held_out_nm)
     if name not in known:
         names = [*known, BEST] if known else []
-        raise unknown_name("zoo model", name, names, "" if known else "`make zoo` trains it")
+        raise unknown_name("zoo model", name, names, "" if known else "run `make zoo` to train it")
     return ZOO_FOLDER / name
 
 
@@ -44,7 +43,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
     """Return the folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
 
     Args:
-        source: what the user typed.
+        source: the path or name that the user typed.
         other: further names that the caller accepts, which the error message lists too.
 
     Raises:
@@ -73,6 +72,6 @@ def card(name: str) -> dict[str, Any]:
 
 
 def _held_out_nm(name: str) -> float:
-    """Return the first figure of a card: the error on held-out scans."""
+    """Return the first metric of a card: the error on held-out scans."""
     metrics = card(name)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")

@@ -1,7 +1,7 @@
 """Blur with a separable, normalised Gaussian, cut at four sigma and differentiable in its width.
 
 Along each axis, blocks of pixels are multiplied by a band matrix of the kernel. For fields up to a few
-thousand pixels this is faster than a Fourier transform, and it needs no periodic padding.
+thousand pixels, this is faster than a Fourier transform and needs no periodic padding.
 """
 
 import math
@@ -19,7 +19,7 @@ _SMALLEST_SIGMA_PX = 0.1
 # Block sizes in pixels for kernels with a radius below 64 px, and for wider ones. Wider blocks multiply more
 # zeros of the band matrix; products of narrower blocks are slower.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
-# This radius is wider than any printed field; a larger one would exhaust memory.
+# No printed field is wider than this radius, and a larger one would exhaust memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
@@ -45,9 +45,9 @@ def gaussian_blur(
         sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. Tensors
             carry gradients.
         pitch_um: sampling of the field, µm.
-        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside; the size stays the
-            same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).
-        radius_px: reach r of the kernel to each side, or a pair; four sigma by default.
+        edge: ``replicate`` repeats the outermost pixels, and ``zero`` assumes zeros outside; the size stays
+            the same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).
+        radius_px: radius r of the kernel, or a pair (along y, along x); four sigma by default.
 
     Raises:
         InputError: a pitch that is not positive, or a field without pixels or narrower than the support.
@@ -81,11 +81,11 @@ def gaussian_blur(
 
 
 def kernel_radius_px(sigma_px: float) -> int:
-    """Return the radius, in whole pixels, of a kernel that contains ``SUPPORT_SIGMAS`` standard deviations;
+    """Return the radius, in whole pixels, of a kernel that extends to ``SUPPORT_SIGMAS`` standard deviations;
     at least 1.
 
     Raises:
-        InputError: a Gaussian wider than any field, or without a width.
+        InputError: a Gaussian that is wider than any field, or whose width is not a number.
     """
     if not SUPPORT_SIGMAS * sigma_px <= _LARGEST_RADIUS_PX:
         raise InputError(
@@ -97,7 +97,9 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Return the radius of a kernel by the rule ``support`` of a model, limited to ``cap_px`` if given."""
+    """Return the radius of a kernel according to a model's rule ``support``, limited to ``cap_px`` if
+    given.
+    """
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 
@@ -114,7 +116,8 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 
 
 class _Blur(torch.autograd.Function):
-    """Blur samples (s, y, x) along one axis (-1 or -2) with the band of a symmetric kernel; linear in both.
+    """Blur samples (s, y, x) along one axis (-1 or -2) with the band of a symmetric kernel. The result is
+    linear in samples and band.
 
     PyTorch's own backward pass through overlapping windows takes three times as long.
     """

@@ -1,4 +1,4 @@
-"""Evaluate functions of single pixels block by block, to limit the memory for hidden values."""
+"""Evaluate pixelwise functions block by block, to limit the memory for hidden values."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -14,11 +14,11 @@ _PIXELS_AT_ONCE = 2**13
 
 
 def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters: Iterable[Tensor]) -> Tensor:
-    """Evaluate ``function`` at all pixels, (n,); gradients flow to the features.
+    """Return the values of ``function`` at all pixels, (n,). Gradients flow to the features.
 
     Args:
         function: maps the features of m pixels, (m, ...) each, to m values, (m,), for any m.
-        features: (n, ...) each.
+        features: tensors (n, ...), one row for each pixel.
         parameters: parameters of the function; gradients flow to those that are trained.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
@@ -64,13 +64,13 @@ def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
 
 
 def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: float) -> Tensor:
-    """Evaluate a piecewise-linear function at ``values``, any shape; differentiable in the values and in the
-    knots.
+    """Evaluate a piecewise-linear function at ``values`` of any shape. The result is differentiable in the
+    values and in the heights of the knots.
 
     Args:
-        values: where to evaluate.
+        values: points at which the function is evaluated.
         knot_heights: function values at ``len(knot_heights)`` equally spaced knots from ``lowest`` to
-            ``highest``; beyond the knots the outermost segment is extrapolated.
+            ``highest``; beyond the knots, the outermost segment is extrapolated.
     """
     last = knot_heights.numel() - 1
     position = (values - lowest) * (last / (highest - lowest))
@@ -82,10 +82,11 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 
 
 class PointwiseNet(nn.Module):
-    """A network of one scalar, 1 -> hidden layers -> 1, the same for all pixels (1 x 1 convolutions).
+    """A network that maps one number to one number, 1 -> hidden layers -> 1, in the same way at all pixels (1
+    x 1 convolutions).
 
     The network is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points and
-    interpolated. Interpolation takes a thousand evaluations instead of one per pixel.
+    interpolated. This takes a thousand evaluations instead of one per pixel.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):
@@ -108,12 +109,12 @@ class PointwiseNet(nn.Module):
         return self.exact(points)
 
     def exact(self, values: Tensor) -> Tensor:
-        """Evaluate the network itself at every value, any shape."""
+        """Evaluate the network itself, without interpolation, at values of any shape."""
         with torch.autocast(device_type=values.device.type, enabled=False):
             return self.layers(values.reshape(-1, 1)).reshape(values.shape)
 
     def start_at_zero(self) -> None:
-        """Make the network the zero function, but keep its hidden layers random."""
+        """Set the last layer to zero, so that the network returns zero. The hidden layers stay random."""
         last = cast(nn.Linear, self.layers[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

@@ -24,7 +24,7 @@ def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
 def warn_where_slower(precision: Precision, device_type: str) -> None:
     """Warn once on stderr that float32 would be faster, if this processor has no unit for ``precision``."""
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
-        _say("networks in bfloat16: float32 is faster on this processor, which has no bfloat16 unit")
+        _say("networks run in bfloat16, but this processor has no bfloat16 unit: float32 is faster")
 
 
 def has_bfloat16_unit() -> bool:

@@ -1,8 +1,9 @@
-"""Ranges of fitted values, and the rule that says when a value is on its bound.
+"""Define ranges of fitted values, and the rule for when a value is on its bound.
 
-A fit changes a raw number, and the model uses the corresponding value inside its range. Near a bound the
-value hardly changes with the raw number, so a fit that reached the bound could not return. Fits therefore
-keep raw numbers within ``FLAT_FROM``. A value whose raw number is at that limit counts as on its bound.
+A fit changes a raw number, and the model uses the corresponding value inside its range. Near a bound, the
+value hardly changes with the raw number, so a fit that reached the bound could not leave it again. Fits
+therefore keep raw numbers within ``FLAT_FROM``. A value whose raw number is at that limit counts as on its
+bound.
 """
 
 import math
@@ -14,8 +15,8 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# At this raw number a sigmoid has 7 % of its largest slope, and its value is 2 % of the range away from the
-# bound.
+# At this raw number, the slope of a sigmoid is 7 % of its maximum, and the value is 2 % of the range away
+# from the bound.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 
@@ -46,7 +47,9 @@ class Range:
             InputError: a value outside the range, or on a bound.
         """
         if not self.lower < value < self.upper:
-            raise InputError(self.name, got=value, wanted=f"between {self.lower:g} and {self.upper:g}")
+            raise InputError(
+                self.name, got=value, wanted=f"a value between {self.lower:g} and {self.upper:g}"
+            )
         above = value - self.lower
         if math.isinf(self.upper):
             return torch.tensor(math.log(math.expm1(above)))

@@ -20,7 +20,7 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# Base models that compete by default. The first has the form of the paper's physics.
+# Base models that compete by default. The first has the same form as the paper's Physics model.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
@@ -32,7 +32,7 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
 ) -> dict[str, nn.Module]:
-    """Return the models that may be corrected, by name. A network is trained once without each fold.
+    """Return the models that may be corrected, by name. A network is trained anew without each fold.
 
     Args:
         base: name of a model, a frozen model (its folder, ``zoo:NAME``), or ``auto``, which lets small
@@ -50,7 +50,7 @@ def bases_for(
     named = _built(base, scans[0], fields) if base in MODELS else None
     if fields and not (named and is_small(named)):
         raise InputError(
-            f"settings of {base}", got=", ".join(fields), wanted="a small model as base, given by its name"
+            f"settings of {base}", got=", ".join(fields), wanted="no settings, or the name of a small model"
         )
     if base == AUTO:
         return {name: _built(name, scans[0]) for name in _COMPETING}
@@ -80,5 +80,6 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
     folder = zoo.model_folder(base, other=[AUTO, *MODELS])
     card = ModelCard.read(folder)
     if abs(card.pitch_um - pitch_um) > 1e-9:
-        raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=f"{pitch_um:g} µm")
+        wanted = f"{pitch_um:g} µm, the pitch of the scans"
+        raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=wanted)
     return {card.name: load_simulator(folder, card)}

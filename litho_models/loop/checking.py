@@ -1,8 +1,8 @@
-"""Check whether the name of a cause is right when everything else is in the model.
+"""Check whether a cause is named correctly, with everything else in the model.
 
-If the name is right, the residual no longer depends on the named change. If the name only resembles the true
-cause, the residual contains variants of the change: scaled with height or position, blurred, displaced or
-squared.
+If the name is right, the residual no longer depends on the change that the cause makes. If the named effect
+only resembles the true cause, the residual contains variants of this change: scaled with height or position,
+blurred, displaced or squared.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from litho_models.loop.search import Cause, describe, with_table
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-# Largest further gain that variants of a cause's change may have, as a share of the cause's gain. In trials
-# on the virtual fab, variants of true causes gain less than 1 % (layer-stacking 10 %), and variants of
-# effects that only resemble the cause gain 20 % and more.
+# A name is refused if variants of the cause's change would add more than this share to its gain. In trials on
+# the virtual fab, variants of true causes add less than 1 % (layer-stacking: 10 %). Variants of effects that
+# only resemble the true cause add 20 % or more.
 FORM_SHARE = 0.15
 
 
@@ -36,8 +36,8 @@ class Check:
     Attributes:
         state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all candidates that could
             replace a cause.
-        left_nm2: part of the squared residual of the model that features of layout and position explain.
-        secants: changes that the laws make in the scans.
+        left_nm2: part of the model's squared residual that features of layout and position can explain.
+        secants: changes that the laws would make in the scans.
     """
 
     state: State
@@ -66,28 +66,28 @@ class Check:
         unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
         larger = "" if unneeded else self._larger(cause, without)
         if unneeded:
-            reason = f"not needed if the others are in the model: {unneeded}"
+            reason = f"not needed when the other effects are in the model: {unneeded}"
         elif larger:
-            reason = f"may only correct the formula of {larger}"
+            reason = f"it may only correct an error in the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
-            reason = f"beside {', '.join(self.laws_in)} it gains less than half of what it gains without them"
+            reason = f"with {', '.join(self.laws_in)} in the model, its gain falls to less than half"
         elif outgrown := self.state.twin.outgrows(cause.name):
-            reason = f"its best length is outside the range of this effect: {', '.join(outgrown)}"
+            reason = f"its best-fitting length is outside the range of this effect: {', '.join(outgrown)}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
-            reason = f"its best strength exceeds the largest possible one: {', '.join(exhausted)}"
+            reason = f"its best-fitting strength exceeds the largest possible value: {', '.join(exhausted)}"
         # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
         # that is small relative to the unexplained error therefore proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
-            taken = f"variants of its change gain another {100 * share:.0f} %"
-            reason = f"only resembles the cause: {taken}"
+            added = f"variants of the change that it makes would add {100 * share:.0f} % to its gain"
+            reason = f"it only resembles the true cause: {added}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
         """Return the name of a much larger law, or of a much larger cause whose variants replace this cause.
 
-        A cause that gains less than a tenth of a larger one may only correct the formula of the larger one.
+        If a cause gains less than a tenth of a larger one, it may only correct the larger one's formula.
         Every law is approximate, so a larger law is always returned. A larger cause is returned if its
-        variants gain at least half of what this cause gains. Return an empty name if there is neither.
+        variants gain at least half as much as this cause. Return an empty name if there is neither.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -100,9 +100,9 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Refuse the name of a cause that passed all other checks if short laws fit better.
+        """Refuse the name of a cause if short laws fit better, even if it passed all other checks.
 
-        At most two laws are used, with no more parameters than the cause has.
+        At most two laws are tried. Together they have no more parameters than the cause.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -112,14 +112,14 @@ class Check:
             numbers -= law.numbers
             laws.append(law.name)
             if judge_states(self.state, state).passed():
-                return replace(cause, reason=f"short laws fit better instead: {', '.join(laws)}")
+                return replace(cause, reason=f"short laws fit better than it: {', '.join(laws)}")
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Refuse the name of a cause that passed all other checks if a table explains more.
+        """Refuse the name of a cause if a table explains more, even if it passed all other checks.
 
-        The cause is refused if a table in its place gains over twice as much, and the cause gains nothing in
-        addition to the table.
+        The name is refused if a table in place of the cause gains more than twice as much, and the cause
+        gains nothing in addition to the table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -127,7 +127,7 @@ class Check:
                 both = with_table(self.state, table)
                 judged = judge_states(both.without(cause.name), both)
                 if reason := judged.reason(grouped=cause.by != ALL):
-                    return replace(cause, reason=f"{table.name} explains this effect and more: {reason}")
+                    return replace(cause, reason=f"not needed when {table.name} is in the model: {reason}")
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:

@@ -3,8 +3,8 @@
 The search for causes is run with each base model, and the base models are compared with their causes
 included.
 
-``close`` is an estimator. The function makes choices and fits on the given scans, and its result predicts any
-other scan. To judge the choices on some scans, call ``close`` on the others.
+``close`` is an estimator: it makes all choices and fits on the given scans, and its result can predict any
+other scan. To judge its choices on held-out scans, call ``close`` without these scans.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from litho_models.loop.search import Cause, Found, describe, search, untestable,
 from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL
 
-# Ratio of the time of a loop to the time of its first fits: 11 to 33 in four datasets.
+# Duration of a loop divided by that of its first fits. In four datasets this ratio was between 11 and 33.
 _OVER_FIRST_FITS = 20
 
 
@@ -41,12 +41,12 @@ class Closed:
 
     Attributes:
         base_name: name of the chosen base; ``rivals``: results of the same search with the other bases.
-        plain: the base fitted to the original scans; ``base``: the base fitted to the scans after the
-            measurement errors that groups of scans share are subtracted.
+        plain: the base fitted to the original scans; ``base``: the base fitted to the scans from which the
+            measurement errors shared by groups of scans have been subtracted.
         named: result of the search among causes; ``lawful``: result of the search for short laws in addition
             to the causes.
         described: tables over a covariate, which describe the remaining error; they act last in the model.
-        rests: the part of the residual that features of layout and position still explain after each stage.
+        rests: by stage, the part of the residual that features of layout and position still explain.
         untestable: effects that could not be tested, with reasons.
     """
 
@@ -96,17 +96,17 @@ class Closed:
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find what a base model lacks on these scans.
+    """Find the effects that a base model lacks on these scans.
 
     Args:
         study: development scans.
-        bases: simulators by name. Base models with few parameters are refitted.
+        bases: base models by name. Those with few parameters are refitted.
     """
     plain, began_s = {}, time.monotonic()
     for name, base in bases.items():
         study.report(f"fitting {name} to {len(study.scans)} scans")
         plain[name] = fit_state(Twin.bare(base), study)
-    study.report("fitting what groups of scans share")
+    study.report("fitting the measurement errors that groups of scans share")
     nearest = min(plain.values(), key=lambda state: state.mse_nm2)
     freed = replace(study, scans=prepare_scans(freed_scans(nearest)))
     excluded = untestable(freed)
@@ -120,8 +120,8 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         study.report(told)
     searches: dict[str, Found] = {}
     for name, state in starts.items():
-        study.report(f"looking for what {name} lacks")
-        # What one base lacks the others probably lack too, so they start there.
+        study.report(f"searching for effects that {name} lacks")
+        # The other bases probably lack the same causes as the first, so their searches start from its causes.
         searches[name] = search(state, candidates, seed=next(iter(searches.values()), None))
     chosen = _simplest(searches)
     start, named = starts[chosen], searches.pop(chosen)
@@ -164,8 +164,8 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose the simplest base model among those with nearly the smallest error.
 
-    The choice is the base with the fewest causes that were not found with all other bases. Among equals, it
-    is the base with the fewest parameters.
+    The simplest base has the fewest causes that were not found with all other bases. If several bases are
+    equal in this, the one with the fewest parameters is chosen.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -180,13 +180,13 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Search for laws, then tables, in addition to the causes, and check each cause together with everything
-    else.
+    """Search for laws, then for tables, in addition to the causes. Then check each cause together with all
+    of them.
 
-    A cause that fails is removed, and the search for laws is repeated without it.
+    A cause that fails its check is removed, and the search for laws is repeated without it.
 
     Args:
-        start: the base; ``named``: its causes; refused causes are removed from it.
+        start: the base; ``named``: its causes, from which refused causes are removed.
     """
     study = start.study
     # Tables describe heights, not films.
@@ -195,11 +195,11 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
-        # A law with the formula of a named cause would only replace its name.
+        # A law with the same formula as a named cause would only rename the cause.
         formulas = {get_effect(name).apply for name in named.names}
         laws = [law for law in families if law.apply not in formulas]
         lawful = search(named.state, laws, 4, secants)
-        study.report("describing the residual")
+        study.report("searching for tables that describe the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
             in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
@@ -211,8 +211,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # Causes that may only correct another formula are removed first, so that the other formula is
-        # judged without them.
+        # Causes that may only correct another formula are removed first. The other formula is then judged
+        # without them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -236,7 +236,7 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
     """Add the table with the largest gain to the model if it gains more than all causes together.
 
-    A table fits almost anything, so to gain more than a single cause is not enough.
+    A table fits almost anything, so a larger gain than that of a single cause is not enough.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

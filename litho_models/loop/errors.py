@@ -90,9 +90,9 @@ class HeldOut:
     def errors(self) -> list[ErrorRow]:
         """Return the errors of all models.
 
-        Each scan is predicted by a fit to the scans outside its fold. The base and the final model also
-        predict it by a fit to the other prints. The model with only the causes is listed between the base and
-        the final model if it differs from both.
+        Each scan is predicted by a fit to the scans outside its fold. The base and the final model are also
+        scored on scans whose whole print was left out of the fit. The model with only the causes is listed
+        between the base and the final model if it differs from both.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
@@ -120,7 +120,7 @@ class HeldOut:
     def left_out_nm(self) -> dict[str, float]:
         """Return how much the error (k = 1) grows without each cause or law, after the model is refitted.
 
-        The measurement model is then fitted again, at these parameters of the printer.
+        The measurement model is then fitted again, with these parameters of the printer held fixed.
         """
 
         def error_nm(state: State) -> float:
@@ -165,7 +165,8 @@ class HeldOut:
         Also return the largest number of parameters of these fits.
 
         Args:
-            starts: model from which the fit without a part starts, by part; ``part_of``: part of each scan.
+            starts: by part, the model from which the fit without this part starts; ``part_of``: part of each
+                scan.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():

@@ -1,6 +1,6 @@
-"""Fit a model of the printer to all scans, and once without each fold in order to predict that fold.
+"""Fit a model of the printer to all scans, then refit it without each fold to predict that fold.
 
-Per-scan terms are projected out, so they do not bias the parameters of the printer.
+Per-scan terms are projected out, so that they do not bias the parameters of the printer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# Terms that are free for each scan in a fit. The gain is not free, because long-range effects change it.
+# Terms that are free for each scan in a fit. The gain is not free, because long-range effects also change it.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
 # Terms that are free for each scan when errors are compared.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
@@ -67,14 +67,14 @@ class Study:
         workers: Workers = HERE,
         report: Callable[[str], None] = _silent,
     ) -> Study:
-        """Deal the scans of a store into at most ``folds`` folds."""
+        """Divide the scans of a store into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
         lists = grouped_folds(ids, min(folds, len(ids)), seed)
         fold = {one: number for number, members in enumerate(lists) for one in members}
         return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
 
     def of_others(self, scans: Sequence[PrintedScan]) -> Study:
-        """Deal other scans in the same way, without progress messages."""
+        """Divide other scans into folds in the same way, without progress messages."""
         return Study.dealt(scans, len(self.folds), self.seed, self.workers)
 
     def __getstate__(self) -> dict[str, object]:
@@ -83,7 +83,7 @@ class Study:
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
-        """Return for each fold the indices of the scans outside and inside it."""
+        """Return, for each fold, the indices of the scans outside it and of those inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
@@ -180,7 +180,7 @@ class TwinProblem:
         rows = np.zeros((len(steps), len(window.sample)))
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
             if slot is None or twin.is_of(slot, window):
-                # Only the effects from the changed one on are computed again.
+                # Only the changed effect and the effects after it are computed again.
                 there = other.height(window, known=ChainMap({}, fields))
                 rows[at] = (window.at_sample(there) - value) / steps[at]
         return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
@@ -201,8 +201,8 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     """Fit a model to all windows of a study, then once per fold without the windows of that fold.
 
     Args:
-        from_here: start at the current values. Otherwise, start at these values or at the base's default
-            values, whichever lead to the smaller error.
+        from_here: start at the current values. Otherwise, try these values and the base's default values,
+            and use the start that leads to the smaller error.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -223,12 +223,12 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Return the start of a fit: the current values or the base's default values.
+    """Return the better start of a fit: the current values or the base's default values.
 
-    The choice is the start from which a fit to some of the scans leads to the smaller error.
+    The better start is the one from which a fit to some of the scans reaches the smaller error.
 
-    A base that was fitted without an effect has absorbed part of it, and may be stuck in a local optimum when
-    the effect is added.
+    A base that was fitted without an effect has absorbed part of it. When the effect is added, a fit from
+    the current values may therefore be stuck in a local optimum.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
@@ -253,7 +253,7 @@ def without_terms(
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
     """Fit the model to some of the windows, using the derivatives of the common fit.
 
-    The fit starts from the common fit, which used all windows, so it must be iterated to convergence.
+    The fit starts from the common fit, which used all windows. It must therefore be iterated to convergence.
     """
     twin = common.of_fold(fold)
     problem, vector = TwinProblem(twin, windows), twin.vector

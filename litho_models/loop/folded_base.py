@@ -19,7 +19,7 @@ class FoldedBase(nn.Module):
     """One trained model per fold; each scan is predicted by the model that was trained without it.
 
     Args:
-        models: one per fold; ``fold_of``: fold of each scan id; ``common``: model for scans of no fold.
+        models: one per fold; ``fold_of``: fold of each scan id; ``common``: model for scans in no fold.
     """
 
     def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):

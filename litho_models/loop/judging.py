@@ -1,7 +1,7 @@
-"""Decide whether held-out scans confirm a change of the model; scans are the units of the tests.
+"""Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-First, the change must have the right sign: its inner product with the residual before the change is positive
-in every scan that contains the effect. A sign-flip test checks this. Second, the change at its common
+First, the change must have the right sign: in every scan that contains the effect, the inner product of the
+change with the residual before it is positive. A sign-flip test checks this. Second, the change at its common
 strength must lower the error: the confidence interval of the gain must lie above zero.
 """
 
@@ -16,7 +16,7 @@ from litho_models.loop.fits import State, Study
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
-# Limit of p for a grouping. The limit is strict because every candidate is tried with every grouping.
+# Largest accepted p value of a grouping. It is small because every candidate is tried with every grouping.
 EXCHANGED_P = 0.01
 # Seven scans agree by chance with a probability of 1/128, which is too high, so eight scans are needed.
 CONFIRM_P = 0.005
@@ -37,7 +37,7 @@ class Judgement:
     Attributes:
         before_nm2, gain_nm2: mean squared error before the change, and its decrease.
         gains_nm2: (scans,) gain of each scan.
-        p: one-sided p value, by sign flips of the scans' evidence.
+        p: one-sided p value of a sign-flip test on the evidence of the scans.
         low_nm2: lower end of the confidence interval of the gain.
     """
 
@@ -65,13 +65,13 @@ class Judgement:
         """Return why the change is not confirmed; empty if it is confirmed."""
         better, count = self.improved
         if count < FEWEST_SCANS:
-            return f"{count} scans, at least {FEWEST_SCANS} are needed to confirm anything"
+            return f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm anything"
         if self.p > (GROUPED_P if grouped else CONFIRM_P):
-            return f"better in only {better} of {count} held-out scans (p = {self.p:.3f})"
+            return f"only {better} of {count} held-out scans improve (p = {self.p:.3f})"
         if self.low_nm2 <= 0:
-            return "the interval of the held-out gain includes zero"
+            return "the confidence interval of the gain on held-out scans includes zero"
         if not self.matters:
-            return f"gain of {100 * self.gain_nm2 / self.before_nm2:.2f} % is too small to matter"
+            return f"the gain of {100 * self.gain_nm2 / self.before_nm2:.2f} % is too small to matter"
         return ""
 
 
@@ -101,8 +101,8 @@ def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Return whether a rival is worse than the best in nearly every scan, and by at least a quarter of the
-    gain.
+    """Return whether a rival is worse than the best change in nearly every scan, by at least a quarter of
+    the best gain.
     """
     lost = judge(other_nm2, best_nm2, study)
     return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

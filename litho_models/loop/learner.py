@@ -54,12 +54,14 @@ class Rest:
 
     @cached_property
     def ci95_nm2(self) -> tuple[float, float] | None:
-        """Return the interval over scans of the mean gain; None with fewer than six scans."""
+        """Return the confidence interval of the mean gain over scans; None for fewer than six scans."""
         return interval(self.gains_nm2.tolist())
 
     @property
     def most_nm(self) -> float:
-        """Return the root of the interval's upper end: an upper bound on the rms error of the form."""
+        """Return an upper bound on the rms error of the model's form: the root of the upper end of
+        ``ci95_nm2``.
+        """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
@@ -77,7 +79,7 @@ class Learner:
 
     Args:
         study: scans and folds.
-        predictions: (y, x) µm, one per scan; the scan's free gain multiplies it.
+        predictions: (y, x) µm, one per scan; the free gain of a scan multiplies its prediction.
     """
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
@@ -85,8 +87,8 @@ class Learner:
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
-        # Writing order, and difference of the dose from nominal. A dependence on either can be learned only
-        # if it takes at least three values.
+        # These are the writing order and the deviation of the dose from nominal. A dependence on either can
+        # be learned only if the scans have at least three different values of it.
         facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
@@ -128,7 +130,7 @@ class Learner:
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
-        # Height, ∂y and ∂x stand for a gain and a displacement whose strength may depend on position.
+        # Height, ∂y and ∂x represent a gain and a displacement whose strength may depend on position.
         placed = (18, 19, 20)
         columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
         for value in varied:
@@ -152,7 +154,7 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # With a single scan no strength can be cross-validated, so the largest is used.
+        # With a single scan, no strength can be cross-validated, so the strongest regularisation is used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))

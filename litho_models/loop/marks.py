@@ -54,7 +54,9 @@ def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> 
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Find the common step of all heights of a raw scan, up to one offset; return 0 if there is none."""
+    """Return the step of which all heights of a raw scan are multiples, up to one offset; 0 if there is
+    none.
+    """
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
     # Smaller differences come from rounding in single precision.
@@ -71,11 +73,11 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
     if not len(rounded):
-        evidence = "the heights of the raw files share no common step"
+        evidence = "the heights in the raw files are not multiples of a common step"
     else:
         evidence = (
             f"the raw heights of {len(rounded)} of {len(steps_nm)} scans are multiples of "
-            f"{np.median(rounded):.3g} nm, which adds {noise_nm:.2g} nm rms"
+            f"{np.median(rounded):.3g} nm; this rounding adds noise of {noise_nm:.2g} nm rms"
         )
     return ScanFinding.of("quantisation", evidence, seen=noise_nm >= _SMALLEST_RMS_NM)
 
@@ -85,7 +87,10 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
     counts = np.array([_drawn_out(scan, own) for scan, own in zip(scans, residuals, strict=True)])
     along, across = counts.T
     p = one_sided_flip_p((along - across).astype(float))
-    text = f"{along.sum()} outliers elongated along the lines and {across.sum()} across them (p = {p:.4f})"
+    text = (
+        f"{along.sum()} outliers are elongated along the scan lines and {across.sum()} across them "
+        f"(p = {p:.4f})"
+    )
     return ScanFinding.of("scars-and-spikes", text, seen=p <= CONFIRM_P and along.sum() >= 10, p=p)
 
 
@@ -109,10 +114,10 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
 def _short_lines(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
 ) -> ScanFinding:
-    """Test for short lines: in flat places, residuals of pixels on the same scan line must agree more than
-    residuals across scan lines.
+    """Test for short lines: on flat areas, the residuals of nearby pixels must agree more along the scan
+    lines than across them.
 
-    Slopes are left out, because model errors there are not noise.
+    Slopes are excluded, because the residuals there contain errors of the model.
     """
     shared = np.array([_shared_nm2(*one) for one in zip(scans, maps_um, residuals, strict=True)])
     along, across = shared.T
@@ -120,9 +125,9 @@ def _short_lines(
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
     first, last = _LINE_LAGS_UM
     text = (
-        f"flat places {first:g} to {last:g} µm apart share {along.mean():.1f} nm² "
-        f"along the lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
-        f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
+        f"on flat areas, residuals {first:g} to {last:g} µm apart share {along.mean():.1f} nm² of variance "
+        f"along the scan lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness "
+        f"of at least {rms_nm:.1f} nm rms, from the print or from the microscope"
     )
     return ScanFinding.of("line-roughness", text, seen=p <= CONFIRM_P and rms_nm >= _SMALLEST_RMS_NM, p=p)
 
@@ -133,7 +138,7 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
     for line in (scan.line, row_index(flat.shape)):
-        # The mean of every line is subtracted. An error of this mean can only lower the product along lines.
+        # The mean of every line is subtracted. An error in this mean can only lower the product along lines.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )
@@ -148,15 +153,15 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
         )
         return products / max(pairs, 1.0)
 
-    # A scan turned by 90 degrees has its lines along y.
+    # In a scan rotated by 90 degrees, the scan lines run along y.
     turned = axis_along(scan.line) == 0
     return mean_product(turned), mean_product(not turned)
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Report scans that registration straightened; all other steps use the straightened scans."""
+    """Report which scans the registration straightened. All other steps use the straightened scans."""
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
-    text = f"registration straightened {len(found_um)} of {len(scans)} scans"
+    text = f"the registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:
-        text += f", bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
+        text += f", which were bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
     return ScanFinding.of("registration-residual", text, seen=bool(found_um))

@@ -53,7 +53,7 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Fit the measurement, the printer, and the strengths of the measurement again, to the same scans.
+    """Fit the measurement model, then the printer, then the measurement's strengths again, to the same scans.
 
     Args:
         twin: start of the printer's fit; ``scans``: original scans.

@@ -52,8 +52,8 @@ class Added:
     values: Values
 
     def of(self, label: str | None) -> dict[str, float]:
-        """Return the parameters of a group; for a group that was never fitted, return the mean of the fitted
-        ones.
+        """Return the parameters of a group; for a group that was never fitted, return the mean over the
+        fitted groups.
         """
         if label is not None and label in self.values:
             return dict(self.values[label])
@@ -69,7 +69,7 @@ class Twin:
         base: the model of the printer; its parameters are refitted if they are few.
         numbers: fitted parameters of the base.
         effects: the effects by name, in the order in which they were added.
-        frames: frame with which an effect turns, where it differs from the catalogue; see ``EffectChain``.
+        frames: frame with which an effect rotates, if this is not the default; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -97,8 +97,8 @@ class Twin:
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """Return the fitted parameters of the effects, which follow those of the base in ``vector`` in this
-        order.
+        """Return the fitted parameters of the effects, in the order in which they follow the parameters of
+        the base in ``vector``.
         """
         return [
             Slot(name, key, label)
@@ -195,8 +195,8 @@ class Twin:
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
-        """Return the chain of effects for one scan, or with mean strengths; ``extra`` is a further effect to
-        try.
+        """Return the chain of effects for one scan or, without a scan, with mean strengths; ``extra`` is a
+        further effect to try.
         """
         labels = {} if scan is None else self.labels(scan)
         key = tuple(labels.values())
@@ -227,7 +227,7 @@ class Twin:
         return chain.after_base(known[key], scan.context, known, key)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Return the steps (p,) of difference quotients, which go upwards except at an upper limit."""
+        """Return the steps (p,) of difference quotients; a step is negative only near an upper limit."""
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
         effects = np.where(self.vector[self.own :] + size <= upper, size, -size)
@@ -266,13 +266,13 @@ class Twin:
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
-        """Return the amplitudes of an effect that lie, in some group, on a limit of their range other than
-        the null.
+        """Return the amplitudes of an effect that reach a limit of their range, other than the null, in some
+        group.
         """
         return self._at_limits(name, lambda one, at: one.kind == "amplitude" and at != one.null)
 
     def outgrows(self, name: str) -> list[str]:
-        """Return the fitted lengths of an effect, such as ranges and depths, that lie on a limit."""
+        """Return the fitted lengths of an effect, such as ranges and depths, that reach a limit."""
         return self._at_limits(name, lambda one, at: one.kind == "shape" and one.is_length)
 
     def _at_limits(self, name: str, counts: Callable[[Parameter, float], bool]) -> list[str]:

@@ -20,7 +20,8 @@ def parse_planted(text: str) -> tuple[Effect, float]:
     """Parse ``NAME=AMOUNT`` into an effect and an amount, in the unit of the effect's first amplitude.
 
     Raises:
-        InputError: the text has another form, the effect is unknown or per-scan, or the amount not a number.
+        InputError: the text is not NAME=AMOUNT, the effect is unknown or per-scan, or the amount is not a
+            number.
     """
     name, separator, number = text.partition("=")
     effect = get_effect(name.strip())

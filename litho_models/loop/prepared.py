@@ -17,7 +17,7 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# Fits and screening use one quadrant, with a margin, of scans of this size or larger.
+# If a scan has at least this size, fits and screening use only one of its quadrants, with a margin.
 LARGE_PX = 400
 
 
@@ -83,7 +83,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, placed in the writing order of the scans to which a model was fitted."""
+    """Prepare further scans, and interpolate their positions in the writing order of the fitted scans."""
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
     def placed(scan: PreparedScan) -> PreparedScan:
@@ -119,8 +119,8 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
-    """Give large scans a window; successive scans use different quadrants, so that together they cover the
-    whole field.
+    """Give large scans a window. Successive scans use different quadrants, which together cover the whole
+    field.
     """
     shape, pitch = scan.stored.shape, scan.stored.pitch_um
     if min(shape) < LARGE_PX:

@@ -38,12 +38,12 @@ class ErrorRow(Record):
 
     Attributes:
         model: the base, the base with causes, or ``all``, the corrected model.
-        measurement: what was added to the print: nothing, the smooth background of the training scans (the
-            published protocol), or the whole measurement model.
+        measurement: what was added to the predicted print: nothing, the smooth background of the training
+            scans (the published protocol), or the whole measurement model.
         policy: the ``k`` terms fitted to each scan, on pixels that are not scored.
-        held_out: folds of scans, or whole prints; nested if all choices were made without them.
-        printer_numbers: fitted parameters of the model; ``measurement_numbers``: fitted parameters of the
-            measurement, the largest number in any fold.
+        held_out: folds of scans, or whole prints; nested if all choices were also made without them.
+        printer_numbers: number of fitted parameters of the model; ``measurement_numbers``: number of fitted
+            parameters of the measurement model, the largest of all folds.
         edge_by_scan_nm: mean distance of the edges, for films.
     """
 
@@ -72,14 +72,14 @@ class ErrorRow(Record):
 
     @property
     def is_headline(self) -> bool:
-        """Return whether this row is the quoted one: k = 1 (films: 0), shared measurement, folds of scans."""
+        """Return whether this is the headline error: k = 1 (films: 0), shared measurement, folds of scans."""
         usual = usual_policy(bool(self.edge_by_scan_nm))
         return (self.policy, self.measurement, self.held_out) == (usual, "shared", "scans")
 
 
 class Strength(Record):
-    """A fitted parameter for one label, with its interval over prints, or over scans if no prints are
-    known.
+    """A fitted parameter for one label, with its confidence interval over prints, or over scans if no prints
+    are known.
     """
 
     label: str
@@ -95,12 +95,12 @@ class FoundEffect(Record):
         by: the grouping in which its strength differs; ``all`` for one strength.
         strengths: fitted values of each parameter.
         gain_nm2: decrease of the squared error of held-out scans when the effect is added to everything else
-            in the model. The error is that of the fitted pixels, after seven terms and an affine shift of
-            each scan are removed.
+            in the model. The error is that of the fitted pixels, after seven terms and an affine
+            registration error of each scan are removed.
         left_out_nm: increase of the mean absolute error if the effect is left out (k = 1).
         family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping, by
             permuted labels.
-        reshaped_share: further gain that variants of its change have, as a share of its own gain.
+        reshaped_share: gain that variants of its change would add, as a share of its own gain.
         survives_on: other bases with which the search also found the effect.
     """
 
@@ -136,7 +136,7 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """A term or mark that differs from scan to scan; it enters no model.
+    """A term or mark that differs from scan to scan and is not part of any model.
 
     Attributes:
         seen: whether it was found; ``evidence``: a sentence; ``p``: p value of its test.
@@ -165,8 +165,8 @@ class ScanFinding(Record):
 class Planted(Record):
     """An effect planted in copies of the scans, and what the loop found in these copies.
 
-    ``rms_nm`` is the rms of the change it makes, without the scans' free terms. ``named`` is the reported set
-    of effects that contains it, or empty. ``found`` is the fitted amount.
+    ``rms_nm`` is the rms of the change that it makes, without the scans' free terms. ``named`` is the
+    reported set of effects that contains it; it is empty if there is none. ``found`` is the fitted amount.
     """
 
     name: str
@@ -262,7 +262,7 @@ class CloseLoop(Result):
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """Return one row of the errors, by default for the usual terms; None if it was not measured."""
+        """Return one row of the errors, by default for the usual terms; None if it was not computed."""
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)

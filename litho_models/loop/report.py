@@ -40,15 +40,15 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
             *("name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm"),
             *("family_p", "confusable_with"),
         )
-        page.table(result.effects, "What was added.", "effects.csv", columns=columns)
+        page.table(result.effects, "Effects added to the model.", "effects.csv", columns=columns)
         page.table(
             [row for one in result.effects for row in _strength_rows(one)],
-            "Strengths with 95 % intervals, from the scatter over prints (or scans).",
+            "Fitted strengths with 95 % confidence intervals, from the scatter over prints (or scans).",
             "strengths.csv",
             digits=3,
         )
     if result.decisions:
-        page.heading("What new prints decide")
+        page.heading("What the new prints decide")
         page.points([said("decision", one) for one in result.decisions])
     page.heading("Where the residual lies")
     _residuals(page, maps)
@@ -64,12 +64,12 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         "Each row names its model, measurement model and scan terms. All rows are computed in the same way.",
         "errors.csv",
     )
-    page.heading("Errors that scans share apart from their prints", folded=True)
+    page.heading("Measurement errors that scans share", folded=True)
     page.paragraph(said("measurement", result.measurement))
-    page.heading("What single scans add", folded=True)
+    page.heading("Terms that differ from scan to scan", folded=True)
     page.table(
         [one.model_dump() | {"spread": said("spread", one)} for one in result.single_scans],
-        "Terms that differ from scan to scan; no model contains them. Spread: standard deviation over scans.",
+        "These terms are part of no model. Spread: standard deviation over scans.",
         "single_scans.csv",
     )
     if result.planted:
@@ -77,10 +77,11 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.table(result.planted, "Whether the loop names each planted effect.", "planted.csv", digits=3)
     if result.confounded:
         page.paragraph(
-            f"Only known in combination: {'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
+            "These scans cannot determine separately: "
+            f"{'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
         )
     page.heading("Every other candidate", folded=True)
-    page.table(result.candidates, "Why it was not added.", "candidates.csv")
+    page.table(result.candidates, "Why each candidate was not added.", "candidates.csv")
     return page.write(folder)
 
 
@@ -98,7 +99,7 @@ def _residuals(page: Page, maps: Maps) -> None:
         errors = " → ".join(f"{np.nanmean(np.abs(own)):.1f}" for own in pair)
         shown = [coloured_png(thumbnail(own), "RdBu_r", -limit_nm, limit_nm) for own in pair]
         rows.append((f"{name}: {errors} nm", shown))
-    page.gallery(titles, rows, "Measured minus expected, and the mean absolute error of each map.")
+    page.gallery(titles, rows, "Measured minus expected height, with the mean absolute error of each map.")
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:

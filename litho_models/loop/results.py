@@ -1,4 +1,4 @@
-"""Make the record of a loop: errors, strengths with intervals, and why effects were rejected."""
+"""Make the record of a loop: errors, strengths with confidence intervals, and why effects were rejected."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
-    # A cause that another base does not need may only correct this base.
+    # If another base does not need a cause, this cause may only correct an error of the chosen base.
     corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
@@ -144,7 +144,7 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Return the fitted values of an effect, with intervals from the scatter over prints (or scans)."""
+    """Return an effect's fitted values, with confidence intervals from the scatter over prints (or scans)."""
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
@@ -161,8 +161,8 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """Name the independent unit of each scan for intervals: its print, or the scan itself if there are too
-    few prints.
+    """Return the independent unit of each scan for confidence intervals: its print, or the scan itself if
+    there are too few prints.
     """
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
@@ -230,18 +230,18 @@ def _refused(
     if name in untestable:
         return "not-testable", untestable[name]
     if name in sets:
-        return "confusable", f"cannot be told from {sets[name]}, which was added"
+        return "confusable", f"cannot be distinguished from {sets[name]}, which was added"
     if any(one.name == name for one in named.failed):
         return "resembles", refused
     if last is None:
-        return "not-testable", "not screened"
+        return "not-testable", "it was not screened"
     if count < FEWEST_SCANS:
-        return "too-few-scans", f"{count} scans to choose and confirm on, at least {FEWEST_SCANS} needed"
+        return "too-few-scans", f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm it"
     if last.beside_base < SMALLEST_RETAINED:
-        return "not-testable", "on these layouts it cannot be told from per-scan terms"
+        return "not-testable", "on these layouts it cannot be distinguished from per-scan terms"
     if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-        return "absorbed", "changed parameters of the base have the same effect"
+        return "absorbed", "a change of the base's parameters has the same effect"
     if not last.allowed and named.first[name].family_p <= FAMILY_P:
-        return "contradicted", "its best strength has the wrong sign"
-    gained = f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
+        return "contradicted", "its best-fitting strength has the wrong sign"
+    gained = f"it removes only {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
     return "below-noise", refused or gained

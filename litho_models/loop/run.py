@@ -63,7 +63,7 @@ def close_loop(
             models compete.
         base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds; each scan is predicted by fits without its fold.
-        nested: also repeat all choices without each fold, or each print, and judge them on the part left out.
+        nested: also repeat all choices without each fold, or each print, and judge them on what was left out.
         inject: effects as ``NAME=AMOUNT``, each planted in copies of the scans to see whether it is found.
         open_lock_box: also score the locked scans.
         steps: optimiser steps of a network, by default those of its recipe. A network is trained once per
@@ -76,7 +76,7 @@ def close_loop(
 
     Raises:
         InputError: there is no store, the base is unknown, too few scans are usable, or ``nested`` is set
-            with a base that is not fitted here.
+            with a base that the loop does not refit.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
@@ -97,7 +97,7 @@ def close_loop(
         bases = bases_for(base, study, steps=steps, cache=kept, fields=base_settings)
         if nested and not all(map(is_refitted, bases.values())):
             raise InputError(
-                f"--nested with {base}", got="a model that is not fitted here", wanted="a small model's name"
+                f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
             )
         closed = close(study, bases)
         own = {closed.base_name: bases[closed.base_name]}
@@ -155,7 +155,7 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
     locked = [scan for scan in usable if scan.id in store.locked_ids]
     development = [scan for scan in usable if scan.id not in store.locked_ids]
     if len(development) < 2:
-        got = f"{len(development)} usable and not locked"
+        got = f"{len(development)} that can be used and are not locked"
         raise InputError("scans to close the loop on", got=got, wanted="at least 2")
     return development, locked, [f"{one}: fewer than 1024 measured pixels" for one in dropped]
 
@@ -163,7 +163,7 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Repeat all choices without each fold, or print, and judge them on the part left out.
+    """Repeat all choices without each fold, or print, and judge them on this fold or print.
 
     Also count how often each effect was chosen.
     """
@@ -177,8 +177,8 @@ def _nested(
     often = Counter[str]()
 
     def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
-        for number, out in enumerate(progress(parts, "choosing anew"), 1):
-            study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
+        for number, out in enumerate(progress(parts, "repeating all choices"), 1):
+            study.report(f"repeating all choices without {', '.join(out)} ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)
             yield HeldOut(closed), [scan for scan in scans if scan.id in out]

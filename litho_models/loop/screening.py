@@ -22,7 +22,7 @@ from litho_models.loop.trials import Secants, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
-# Smallest share of a direction's information that the projections must leave for a valid test.
+# A test is valid only if the projections leave at least this share of a direction's information.
 SMALLEST_RETAINED = 1e-5
 # A candidate is fitted if its predicted gain reaches this share of the smallest useful gain. Derivatives
 # predict the gain of a fit only to within a factor of three.
@@ -41,8 +41,9 @@ class Screened:
         allowed: whether the strengths have a physical sign.
         retained: share of the information that remains after scan terms and the model's own parameters are
             projected out; ``beside_base``: the share after only the scan terms are projected out.
-        family_p: share of sign flips of the scans in which any candidate gains at least as much; ``group_p``:
-            share of permutations of the scans in which a grouping does, if a grouping was tested.
+        family_p: share of sign flips of the scans in which any candidate gains at least as much.
+        group_p: if a grouping was tested, share of permutations of the scans in which any grouping gains at
+            least as much.
     """
 
     trial: Trial
@@ -131,7 +132,7 @@ class Screening:
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """Return the significant candidates, each with its best grouping, largest gain first."""
+        """Return the significant candidates, each with its best grouping, in order of decreasing gain."""
         standing = []
         for own in self.candidates.values():
             grouped = self._grouped(own)
@@ -163,7 +164,7 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _change(self, one: Screened) -> np.ndarray:
-        """Return the factors (scans, columns) of the columns that add up to the change of a candidate."""
+        """Return the factors (scans, columns) with which the columns add up to the change of a candidate."""
         found = np.zeros(self.freed.shape[:2])
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
@@ -213,7 +214,7 @@ class Screening:
     def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
         """Return the share of permutations of the scans after which any grouping gains as much as this one.
 
-        Permutations that leave every group with the same scans are not counted.
+        Permutations that reproduce the tested grouping are not counted.
         """
         groupings = {name: np.array(own) for name, own in self.study.groups.items() if name != ALL}
         rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[by])

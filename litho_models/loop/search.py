@@ -1,9 +1,9 @@
-"""Search for causes: add effects while they reduce the error on held-out scans, and test each again at the
-end.
+"""Search for causes: add effects while they reduce the error on held-out scans, and test every added effect
+again at the end.
 
-All candidates are screened at once, with common strengths and strengths by group. The most promising ones are
-fitted in full before one is chosen, because a derivative at zero strength only estimates the gain of a large
-effect.
+All candidates are screened at once, with common strengths and with strengths by group. The most promising
+candidates are fitted in full before one is chosen, because a derivative at zero strength gives only a rough
+estimate of the gain of a large effect.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Cause:
         judgement: judgement of its gain on held-out scans, in addition to the rest of the model.
         family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping.
         values: starting values of its parameters by label, for the fit of a table.
-        reshaped_share: further gain that variants of its change have, as a share of its own gain.
+        reshaped_share: gain that variants of its change would add, as a share of its own gain.
         reason: why its name was refused; empty if it was not.
         corrects: whether it was refused because it may only correct another formula.
     """
@@ -142,8 +142,8 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
             found.state = fitted[one.name]
             found.refused.pop(one.name, None)
             _regroup(found, one.name)
-            gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
-            study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
+            gained = f"{judgement.gain_nm2:.0f} of {judgement.before_nm2:.0f} nm² on held-out scans"
+            study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: it removes {gained}")
             return True
     return False
 
@@ -185,7 +185,7 @@ def _regroup(found: Found, name: str) -> None:
             starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
     state = fit_state(twin.without(name).with_effect(name, by, starts), study, from_here=True)
     if judge_states(found.state, state).p <= GROUPED_P:
-        study.report(f"{name} differs by {by}")
+        study.report(f"the strength of {name} differs by {by}")
         found.causes[at_cause] = replace(cause, by=by, group_p=p)
         found.state = state
 
@@ -201,8 +201,8 @@ def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) 
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """Return the effects that look the same in these scans, judged by their fits if available, otherwise by
-    screening.
+    """Return the effects that look the same in these scans. They are compared by their fits if these are
+    available, otherwise by screening.
     """
     own = fitted[one.name]
     by_fit = [
@@ -262,7 +262,7 @@ def _test_again(found: Found) -> None:
     """Judge each cause in addition to all others, and remove it if it is not confirmed."""
     study = found.state.study
     for cause in list(found.causes):
-        study.report(f"testing again: {cause.name}")
+        study.report(f"testing {cause.name} again")
         without = found.state.without(cause.name)
         judgement = judge_states(without, found.state)
         at = found.causes.index(cause)
@@ -270,7 +270,7 @@ def _test_again(found: Found) -> None:
             found.causes[at] = replace(cause, judgement=judgement)
         else:
             found.causes.pop(at)
-            found.refused[cause.name] = "not needed once the others were added"
+            found.refused[cause.name] = "not needed after the other effects were added"
             found.state = without
 
 

@@ -78,8 +78,8 @@ class SingleScans:
         terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
         rmse_nm = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
-            f"RMSE on pixels not fitted {rmse_nm[0]:.2f} -> {rmse_nm[1]:.2f} nm with {terms[1]:.0f} "
-            f"instead of {terms[0]:.0f} terms per scan"
+            f"with {terms[1]:.0f} instead of {terms[0]:.0f} terms per scan, the RMSE on pixels outside the "
+            f"fit goes from {rmse_nm[0]:.2f} to {rmse_nm[1]:.2f} nm"
         )
         return ScanFinding.of(
             name,
@@ -112,9 +112,9 @@ class SingleScans:
         """Test line offsets along the rows of the scan and of the layout.
 
         The two are compared with each other, and with offsets along columns, which serve as a control. Scans
-        are slightly rotated relative to their layouts. Lines that follow the layout's rows come from the
-        printer, and lines that follow the scan's rows come from the microscope. Without rotation they cannot
-        be told apart.
+        are slightly rotated relative to their layouts. Offsets that follow the layout's rows come from the
+        printer, and offsets that follow the scan's rows come from the microscope. Without a rotation, the two
+        cannot be distinguished.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
@@ -134,16 +134,16 @@ class SingleScans:
             excess = (
                 ""
                 if excess_p <= CONFIRM_P
-                else f"row terms gain no more than column terms (p = {excess_p:.3f})"
+                else f"offsets of rows gain no more than offsets of columns (p = {excess_p:.3f})"
             )
             follows = ""
             if beaten:
-                follows = f"the lines follow {_frame(other)} more closely: {other}"
+                follows = f"the offsets follow {_frame(other)} more closely, which indicates {other}"
             elif at and not better:
-                follows = f"cannot be told from {other}: no scan is turned enough against its layout"
+                follows = f"cannot be distinguished from {other}: no scan is rotated enough on its layout"
             reasons = [*filter(None, (judged[name].reason(), excess, follows))]
             deviation = np.sqrt(np.maximum(gains, 0).mean()) / NM_PER_UM
-            taken = f"{gains.mean():.1f} nm² along {_frame(name)}, {columns.mean():.1f} along columns"
+            taken = f"{gains.mean():.1f} nm² along {_frame(name)} and {columns.mean():.1f} nm² along columns"
             found.append(
                 ScanFinding.of(
                     name,
@@ -188,8 +188,8 @@ class SingleScans:
         if found is None or found.p > 1e-3:
             return ""
         return (
-            f"; they repeat every {found.period_um:.3g} µm, with {100 * found.share:.0f} % of the squared "
-            f"line means (p = {found.p:.1g})"
+            f"; the line means repeat every {found.period_um:.3g} µm, and this period explains "
+            f"{100 * found.share:.0f} % of their squares (p = {found.p:.1g})"
         )
 
     @cached_property
@@ -202,7 +202,7 @@ class SingleScans:
 
 
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
-    """Judge a per-scan term by the agreement of the two halves of each scan.
+    """Judge a per-scan term by whether the two halves of each scan agree.
 
     The gain is not a suitable test, because a scan whose term is near zero gains nothing.
     """

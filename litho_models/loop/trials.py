@@ -43,10 +43,10 @@ class Trial:
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
-        """Return whether every amplitude lies on the allowed side of its null, up to noise.
+        """Return whether every amplitude, at multiples (…, sets), lies on the allowed side of its null.
 
-        Values that are small relative to the largest amplitude of any group count as noise; multiples (…,
-        sets).
+        Wrong signs of amplitudes that are small relative to the largest amplitude of any group count as noise
+        and are ignored.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -84,8 +84,8 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
     Columns are numbered from ``first``.
 
-    The same amplitudes at the same shape may be tried at two sizes, because the change by a large effect may
-    not be a multiple of the change by a small one.
+    The same amplitudes at the same shape may be tried at two sizes, because a large effect may not simply
+    make a multiple of the change that a small one makes.
     """
     found: list[Trial] = []
     for effect in effects:

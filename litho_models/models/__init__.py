@@ -1,4 +1,4 @@
-"""All models, by name."""
+"""List, register and build models by name."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -39,10 +39,10 @@ MODELS: dict[str, type[Simulator]] = {
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
     """Register a model, so that every function and command of this process knows its name.
 
-    Call it in a plug-in to register the model in every process of a command.
+    Call this function in a plug-in to register the model in every process of a command.
 
     Raises:
-        InputError: a model without a name, or with a name that is taken.
+        InputError: a model without a name, or with a name that is already taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
@@ -68,7 +68,7 @@ def require_models(names: Sequence[str]) -> None:
         InputError: no name, a repeated name, or an unknown name.
     """
     if isinstance(names, str):
-        raise InputError("models", got=repr(names), wanted="a list of names", hint=f"such as [{names!r}]")
+        raise InputError("models", got=repr(names), wanted="a list of names", hint=f"use [{names!r}]")
     for name in names:
         model_class(name)
     if not names or len(set(names)) < len(names):
@@ -86,7 +86,7 @@ def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) 
     """
     usual = model_class(name).Config.model_fields["fixed"].default
     for one in free:
-        require_known(f"fixed number of {name}", one, usual)
+        require_known(f"fixed parameter of {name}", one, usual)
     return [*dict.fromkeys(one for one in (*usual, *fix) if one not in free)]
 
 
@@ -107,5 +107,5 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
     numbers = {key: key for key, _ in model.named_parameters()}
     numbers |= {key: own.name for key, own in model.ranges.items()}
     for fixed in model.config.fixed:
-        require_known(f"number of {name} to fix", fixed, [*numbers.values()])
+        require_known(f"parameter of {name} to fix", fixed, [*numbers.values()])
     return model

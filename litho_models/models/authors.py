@@ -1,4 +1,4 @@
-"""Load the weights of the paper's authors into our models of variant ``authors``, by translating the names.
+"""Load the weights of the paper's authors into our models of variant ``authors``, by translating their names.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -27,19 +27,19 @@ _PHYSICS = {
 
 
 def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
-    """Return our PBL, Physics or FNO of variant ``authors`` with the weights of the authors' class of the
-    same kind.
+    """Return our PBL, Physics or FNO of variant ``authors`` with the weights of the authors' corresponding
+    class.
 
     Args:
-        weights: their ``state_dict``, from name to array or tensor; complex numbers as such, or as pairs of
-            reals along the last axis.
+        weights: their ``state_dict``, a mapping from name to array or tensor. Complex numbers may also be
+            given as pairs of real numbers along the last axis.
         fields: config fields of the model (geometry).
 
     Raises:
         InputError: weights of an unknown class, or weights that are missing, unknown or of another shape.
     """
     if not isinstance(weights, Mapping):
-        hint = "torch.load reads their file"
+        hint = "read the authors' file with torch.load"
         raise InputError("weights", got=type(weights).__name__, wanted="a state_dict", hint=hint)
     own = {name: _as_real(value) for name, value in weights.items()}
     model: Simulator
@@ -78,7 +78,7 @@ def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Ten
     if "raw_alpha" in state:
         alpha = float(state["raw_alpha"])
         if not alpha > 0:
-            raise InputError("alpha of the authors' physics", got=alpha, wanted="above 0")
+            raise InputError("alpha of the authors' physics", got=alpha, wanted="a number above 0")
         # Their parameter is the steepness itself; ours is the raw number of a range.
         state["raw_alpha"] = steepness.raw(alpha)
     return state

@@ -1,4 +1,4 @@
-"""Baselines that every model must beat, from the layout itself to linear features in closed form."""
+"""Baselines that every model must beat, from the layout itself to linear models fitted in closed form."""
 
 import torch
 from pydantic import Field
@@ -52,7 +52,9 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), with T linear between free heights: one per level, or 33 at evenly spaced inputs."""
+    """H = T(G_σ * M), where T is linear between fitted heights at evenly spaced inputs: one for each level,
+    at most 33.
+    """
 
     name = "blur-table"
     Config = BlurTableConfig
@@ -70,7 +72,7 @@ class BlurTable(Simulator):
 
     @property
     def sigma_um(self) -> Tensor:
-        """Return the blur, between 0 and ``sigma_max_um``."""
+        """Return the standard deviation of the blur, between 0 and ``sigma_max_um``."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -89,7 +91,7 @@ class AffineMtfConfig(SimulatorConfig):
 
 
 class AffineMtf(Simulator):
-    """H = offset + Σ_j w_j (G_j * M): the transfer function is Σ_j w_j exp(-2π²σ_j²f²), its gain Σ_j w_j."""
+    """H = offset + Σ_j w_j (G_j * M): the transfer function is Σ_j w_j exp(-2π²σ_j²f²), with gain Σ_j w_j."""
 
     name = "affine-mtf"
     is_linear = True
@@ -118,7 +120,7 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Apply one blur (or a pair along y, along x), without the pixels within ``reach_px`` of the edge."""
+    """Blur a layout by one width (or by a pair, along y and x), and crop ``reach_px`` at each edge."""
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
     rows, columns = (

@@ -1,4 +1,5 @@
-"""Networks on fixed features of a field: of the surroundings of each layout pixel, or of the height along x.
+"""Networks whose inputs are fixed features of a field: the surroundings of a layout pixel, or the height
+along x.
 
 The features have no parameters, so these networks are fitted to single pixels
 (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
@@ -17,8 +18,8 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# Below this change over σ, relative to the highest level (2 nm), the magnitude of a slope is smoothed, so
-# that it has a derivative at 0.
+# The magnitude of a slope is smoothed below this height change over σ, relative to the highest level (2 nm),
+# so that it has a derivative at 0.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
@@ -45,8 +46,8 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 
 class FeatureNetwork(OfField):
-    """A function of the features of each pixel, µm: the sum of a linear part and a network, zero at the
-    start.
+    """A height, µm, computed from the features of each pixel: the sum of a linear part and a network, both
+    zero before training.
     """
 
     # Whether the network may add a constant height.
@@ -103,9 +104,7 @@ class FeatureNetwork(OfField):
 
     @abstractmethod
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the height change over σ (slope) and over σ² (curvature), from a height with a margin of 1
-        px.
-        """
+        """Return the slope times σ and the curvature times σ² of a height with a margin of 1 px."""
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
         """Return the local means of the slope's magnitude and of its square around each pixel."""
@@ -117,8 +116,8 @@ class FeatureNetwork(OfField):
 
 
 class Surroundings(FeatureNetwork):
-    """Features of the layout near a pixel that treat x and y alike: blurs, slopes, displaced copies, mean
-    steepness.
+    """A network on features of the layout near a pixel: blurs, slopes, displaced copies, and mean steepness.
+    The features treat x and y alike.
     """
 
     def features(self, field_um: Tensor) -> list[Tensor]:
@@ -138,7 +137,7 @@ class Surroundings(FeatureNetwork):
         return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the magnitude of the slope."""
+        """Return the magnitude of the slope, and the curvature."""
         up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
@@ -147,8 +146,8 @@ class Surroundings(FeatureNetwork):
 
 
 class ScanAxis(FeatureNetwork):
-    """Features of a printed height along x, the direction of the microscope's lines: slopes, steps, mean
-    steepness.
+    """A network on features of a printed height along x, the direction of the microscope's lines: slopes,
+    steps, and mean steepness.
 
     All features are 0 where the print does not change along x, so the network adds nothing there.
     """
@@ -174,7 +173,7 @@ class ScanAxis(FeatureNetwork):
         return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return slope and curvature along x."""
+        """Return the slope and the curvature along x."""
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2

@@ -14,7 +14,7 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# Below this relative height per µm the magnitude of a slope is smoothed, so that it has a derivative at 0.
+# The magnitude of a slope is smoothed below this relative height per µm, so that it has a derivative at 0.
 _LEAST_SLOPE = 1e-4
 
 
@@ -31,15 +31,15 @@ class FeaturesConfig(SimulatorConfig):
     )
     slope_sigmas_um: tuple[float, ...] = Field((0.15, 0.3, 0.6), min_length=1, description="µm")
     shifts_um: tuple[float, ...] = Field((0.2, 0.5, 1.0), min_length=1, description="displacements, µm")
-    shift_sigma_um: float = Field(0.1, gt=0, description="blur of what is displaced, µm")
+    shift_sigma_um: float = Field(0.1, gt=0, description="blur of the displaced copies, µm")
     streak_sigmas_um: tuple[float, ...] = Field((), description="blurs along one axis only, µm")
-    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs with averaged slopes, µm")
+    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs whose slopes are averaged, µm")
     steep_widths_um: tuple[float, ...] = Field((), description="widths of these averages, µm")
 
 
 class OfField(nn.Module, ABC):
-    """Common methods of models with features: blurs, displacements, their reach, and the scale of a network's
-    inputs.
+    """Common methods of models with features: blurs, displacements, their reach, and the scaling of a
+    network's inputs.
     """
 
     config: Any
@@ -53,7 +53,7 @@ class OfField(nn.Module, ABC):
         """Return the receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """Return the smallest field, whose interior is one pixel."""
+        """Return a field of the smallest size, whose interior is one pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -74,8 +74,8 @@ class OfField(nn.Module, ABC):
         self.register_buffer("scale", torch.ones(count))
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
-        """Set the scale of the inputs from those ``seen`` in each scan (inputs, n): the mean over scans and
-        the spread within them.
+        """Set the centre and scale of the inputs from those ``seen`` in each scan (inputs, n): the mean over
+        scans and the standard deviation within scans.
         """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
@@ -84,13 +84,13 @@ class OfField(nn.Module, ABC):
 
 
 class Features(OfField, Simulator):
-    """H = w · φ(M), all heights relative to the highest level.
+    """H = w · φ(M), with all heights relative to the highest level.
 
     φ contains blurs with their cubes and the products of each pair; slopes along y and x at several blurs,
-    with their sizes, products and second derivatives; copies displaced to one side, and the magnitudes of the
-    height differences to them; blurs along one axis; and the steepness of the surroundings along each axis.
-    The sizes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes differ.
-    ``litho_models.fitting.ridge`` finds the weights in closed form.
+    with their magnitudes, products and second derivatives; copies displaced to one side, and the magnitudes
+    of the height differences to them; blurs along one axis; and the steepness of the surroundings along each
+    axis. The magnitudes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes
+    differ. ``litho_models.fitting.ridge`` finds the weights in closed form.
     """
 
     name = "features"
@@ -125,8 +125,8 @@ class Features(OfField, Simulator):
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Return φ(M) of the interior, (b, 1, y, x) each: blurs, slopes and displaced copies, then their
-        products and 1.
+        """Return the features φ(M) of the interior, (b, 1, y, x) each, in two lists: blurs, slopes and
+        displaced copies; and their products and 1.
         """
         config = self.config
         layout = layout_um / config.full_height_um
@@ -149,8 +149,8 @@ class Features(OfField, Simulator):
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
 
     def _slopes(self, height: Tensor) -> list[Tensor]:
-        """Return height, slopes, their sizes and second derivatives, per µm, from a height with a margin of 1
-        px.
+        """Return the height, its slopes, their magnitudes and the second derivatives, per µm, from a height
+        with a margin of 1 px.
         """
         pitch, inner = self.pitch_um, crop_border(height, 1)
         up, down, left, right = neighbours(height, 1)
@@ -160,8 +160,8 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Return copies displaced to each side, the magnitudes of the height differences to the copies, and
-        those between opposite copies.
+        """Return copies displaced to each side, and the magnitudes of the height differences between the
+        field and each copy and between opposite copies.
         """
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
@@ -197,9 +197,9 @@ class RandomFeaturesConfig(FeaturesConfig):
     streak_sigmas_um: tuple[float, ...] = (0.3, 0.6, 1.2, 2.5, 4.0)
     steep_sigmas_um: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
     steep_widths_um: tuple[float, ...] = (1.0, 2.5)
-    units: int = Field(500, ge=1, description="random features")
-    inputs: int = Field(8, ge=1, description="simple features that each of them sees")
-    seed: int = Field(0, ge=0, description="seed of their draw")
+    units: int = Field(500, ge=1, description="number of random features")
+    inputs: int = Field(8, ge=1, description="number of inputs of each random feature")
+    seed: int = Field(0, ge=0, description="seed of the random features")
 
 
 class RandomFeatures(Features):
@@ -207,7 +207,7 @@ class RandomFeatures(Features):
     fixed.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
-    learn more than products of two features, but still in closed form.
+    learn more than products of two features and is still fitted in closed form.
     """
 
     name = "random-features"
@@ -233,8 +233,8 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the neighbours ``step`` above, below, left and right of all pixels farther than ``step`` from
-    the edge.
+    """Return the neighbours at distance ``step`` above, below, left and right of all pixels that are at least
+    ``step`` from the edge.
     """
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

@@ -31,12 +31,15 @@ class FnoConfig(SimulatorConfig):
     projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
     # The paper uses 1 x 1. Detail finer than the kept modes is then mapped only pixel by pixel.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
-    coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
-    padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
+    coordinates: bool = Field(False, description="y and x, from 0 to 1, as further inputs")
+    padding_fraction: float = Field(
+        0.0, ge=0, le=1, description="zeros at bottom and right, fraction of size"
+    )
     padding_px: int = Field(0, ge=0, le=4096, description="zeros at bottom and right of an image of any size")
     tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
-    overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
-    # The network starts as the layout and learns the difference. The paper's network starts at random.
+    overlap_px: int = Field(32, ge=0, description="overlap of blended tiles, at most half a tile")
+    # Before training, the network returns the layout; it learns the difference. The paper's network starts
+    # with random weights.
     starts_as_layout: bool = True
 
     _PUBLISHED: ClassVar[dict[str, Any]] = {
@@ -54,18 +57,19 @@ class FnoConfig(SimulatorConfig):
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
         if self.local_px % 2 == 0:
-            raise ValueError("local_px has to be odd")
+            raise ValueError("local_px must be odd")
         if self.layers * self.width**2 * self.modes[0] * self.modes[1] > _MOST_MATRIX_ENTRIES:
-            raise ValueError(f"more than {_MOST_MATRIX_ENTRIES:g} entries in layers · width² · modes")
+            raise ValueError(f"layers · width² · modes must be at most {_MOST_MATRIX_ENTRIES:g}")
         return self
 
 
 class Fno(Simulator):
-    """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), no gelu after the last.
+    """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), but without gelu in the last
+    layer.
 
     P lifts each pixel to ``width`` channels, and Q maps them to a height through one hidden layer. With
-    ``starts_as_layout`` this height is added to M and starts at zero. If the config has a tile, ``interior``
-    is the height of one tile, taken as periodic, and the field is blended from tiles.
+    ``starts_as_layout``, this height is added to M and is zero before training. If the config has a tile,
+    ``interior`` is the height of one tile, which is treated as periodic, and the field is blended from tiles.
     """
 
     name = "fno"
@@ -95,7 +99,7 @@ class Fno(Simulator):
         return None if size is None else Tile(size, self.config.overlap_px)
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Return the height of a whole image, of the same size, (batch, 1, y, x) µm."""
+        """Return the height of a whole image, (batch, 1, y, x) µm, with the size of the image."""
         config = self.config
         ny, nx = layout_um.shape[-2:]
         # Heights need full precision at the input and the output, even under autocast. Channels are the last
@@ -132,7 +136,7 @@ class Fno(Simulator):
 
 
 class PeriodicConvolution(nn.Conv2d):
-    """A convolution of a periodic image, (b, y, x, channels) to the same shape."""
+    """A convolution of a periodic image (b, y, x, channels) that keeps its shape."""
 
     def forward(self, features: Tensor) -> Tensor:
         if margin := self.kernel_size[0] // 2:
@@ -154,8 +158,8 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field (b, y, x, channels); an image smaller than the modes uses only the modes that it
-        has.
+        """Convolve a field (b, y, x, channels). A small image, which has fewer frequencies than there are
+        modes, uses only some modes.
 
         Only a few frequencies are kept, so products with their waves are cheaper than fast Fourier
         transforms.

@@ -23,8 +23,8 @@ from litho_data.foundation.kinds import Array
 
 # Radius in units of λ / NA at which a kernel is cut off.
 _REACH = 4.0
-# Number of sample points along each side of a frequency cell, to find the share of the cell that the source
-# fills. The number is odd, so one point is the centre.
+# Number of sample points along each side of a frequency cell, for estimating the share of the cell that the
+# source fills. The number is odd, so one point is at the centre.
 _COUNTED = 9
 
 
@@ -33,9 +33,10 @@ class Optics(NamedTuple):
 
     Attributes:
         wavelength_um, na: wavelength, and numerical aperture on the image side.
-        outer, inner: radii of a round or ring-shaped source, relative to the pupil; 0: a point.
+        outer, inner: radii of a round or ring-shaped source, relative to the pupil; with both 0, the source
+            is a point.
         defocus_um: distance of the resist from the focus.
-        kernels: number of kernels, the strongest first.
+        kernels: number of kernels that are used, the strongest first.
     """
 
     wavelength_um: float
@@ -47,13 +48,13 @@ class Optics(NamedTuple):
 
 
 def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
-    """Return how many pixels a kernel reaches to each side."""
+    """Return the number of pixels that a kernel reaches to each side."""
     return max(1, math.ceil(_REACH * optics.wavelength_um / optics.na / pitch_um))
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     """Return the intensity of the image of a mask (b, 1, y, x), relative to an open mask. A border as wide as
-    the kernels' reach is left out.
+    the kernels' reach is cropped.
     """
     reach = kernel_reach_px(optics, pitch_um)
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
@@ -62,8 +63,8 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
 
 def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
     """Image a mask that is not periodic; return the intensity without the outermost ``reach_px``."""
-    # Fourier transforms spread rounding errors over the field. With double precision the result in tiles
-    # equals that of the whole field.
+    # Fourier transforms spread rounding errors over the field. In double precision, tiles give the same
+    # result as the whole field.
     image = imaged(transmission.double(), spectra.to(transmission.device))
     return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
@@ -72,7 +73,7 @@ def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
     """Return Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the
     kernels.
 
-    The mask is transformed once; the transforms back run in one batch over all kernels.
+    The mask is transformed once; the inverse transforms run in one batch over all kernels.
     """
     amplitudes = torch.fft.ifft2(torch.fft.fft2(transmission) * spectra)
     return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
@@ -110,8 +111,8 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
 
 
 def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
-    """Return the share of each cell (y, x) that the source fills; cells lie around frequencies relative to
-    the pupil.
+    """Return the share of each cell (y, x) that the source fills; each cell is centred on a frequency,
+    relative to the pupil.
     """
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
@@ -123,7 +124,7 @@ def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
 
 
 def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
-    """Return the amplitude that passes the pupil, with the phase of a defocus."""
+    """Return the amplitude that passes through the pupil, with the phase of the defocus."""
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)
     along = np.sqrt(np.where(inside, 1 - squared, 1.0)) - 1
@@ -132,7 +133,7 @@ def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Return the spectra (``spectra_of``) of a lens's kernels, cut to ``size_px``."""
+    """Return the spectra (``spectra_of``) of a lens's kernels, cropped to ``size_px``."""
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
     return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)
 

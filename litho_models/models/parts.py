@@ -1,7 +1,7 @@
-"""The parts of a printer: functions that turn one field into the next, each with parameters and a source.
+"""Define the parts of a printer: functions that turn one field into the next, each with parameters and the
+source of its formula.
 
-Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by the distance that
-it reaches.
+Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by its reach.
 """
 
 import math
@@ -23,13 +23,13 @@ from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
-# If the resist changes by less than this between neighbouring pixels, there is no edge.
+# There is no edge where the resist changes by less than this between neighbouring pixels.
 FLATTEST = 5e-3
 # The upper limit of a length is this multiple of its starting value.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
-# Fitted values are tensors, others are plain numbers.
+# Fitted values are tensors; other values are plain numbers.
 Values = Mapping[str, Any]
 Apply = Callable[[Tensor, Values, float], Tensor]
 
@@ -39,7 +39,7 @@ class Number:
     """One parameter of a part.
 
     Attributes:
-        start: starting value; ``unit``: ``1`` if it has no unit.
+        start: starting value; ``unit``: its unit, ``1`` if it has none.
         lower, upper: its range; by default the upper limit of a length is five times its start.
         fitted: whether a fit changes the parameter.
     """
@@ -61,7 +61,7 @@ class Part:
     """A stage of a printer.
 
     Attributes:
-        numbers: the parameters by name, see ``Number``; ``source``: source of the formula.
+        numbers: the parameters by name (see ``Number``); ``source``: reference for the formula.
         apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
     """
 
@@ -73,7 +73,7 @@ class Part:
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
-    """Return how many pixels a Gaussian spot reaches."""
+    """Return the number of pixels that a Gaussian spot reaches to each side."""
     # Float32 rounds a width, and this rounding must not change the size of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
@@ -81,7 +81,8 @@ def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
 def illuminate(
     pattern: Tensor, spots: Sequence[tuple[Tensor | float, Tensor]], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Expose with a spot of several Gaussians, Σ share · G_sigma; the result is cropped by ``reach_px``.
+    """Expose a pattern with a spot that is a sum of Gaussians, Σ share · G_sigma; the result is cropped by
+    ``reach_px``.
 
     One Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered electrons
     (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third has a width between those two.
@@ -100,7 +101,7 @@ def illuminate(
 
 
 def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
-    """Apply a smoothed threshold of the resist, 0 at 0 and 1 at 1 (Wang et al. 2011,
+    """Apply a smoothed threshold of the resist, which maps 0 to 0 and 1 to 1 (Wang et al. 2011,
     doi:10.1007/s00158-010-0602-y).
     """
     low = torch.tanh(steepness * threshold)
@@ -118,7 +119,7 @@ def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
 
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
-    """Return the share of the depth developed, 1 + γ log₁₀(E / E₀), limited to 0 ... 1 with rounded
+    """Return the developed share of the depth, 1 + γ log₁₀(E / E₀), limited to 0 ... 1 with rounded
     corners.
     """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
@@ -126,8 +127,8 @@ def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tens
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Return the coverage of a film that remains where resist exceeds the threshold; the result is cropped by
-    one pixel.
+    """Return the coverage of a film that remains where the resist exceeds the threshold; the result is
+    cropped by one pixel.
 
     The edge lies where the resist crosses the threshold, moved outward by the bias. A pixel that the edge
     crosses is partly covered. The coverage is a sigmoid, one pixel wide, of the distance (resist - threshold)
@@ -170,7 +171,8 @@ def _shrink(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
 
 
 def kernels_part(name: str, file: str | Path) -> Part:
-    """Make the illumination by the coherent kernels in an NPY file: Σ_k |h_k * M|², 1 for an open mask.
+    """Make a part for illumination by the coherent kernels in an NPY file: Σ_k |h_k * M|², which is 1 for an
+    open mask.
 
     Args:
         name: name of the part.
@@ -186,7 +188,7 @@ def kernels_part(name: str, file: str | Path) -> Part:
         odd = kernels.ndim == 3 and kernels.shape[1] == size_px and size_px % 2
         if not odd or not np.isfinite(kernels).all():
             got = f"{kernels.dtype} {kernels.shape}"
-            raise InputError(f"kernels {file}", got=got, wanted="numbers (k, size, size) of an odd size")
+            raise InputError(f"kernels {file}", got=got, wanted="finite numbers (k, size, size), size odd")
     spectra = lru_cache(maxsize=2)(partial(spectra_of, kernels))
 
     def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
@@ -238,7 +240,7 @@ PARTS = {
             "hill",
             _CONTRAST,
             lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
-            "share that a dose converts, one half at the threshold",
+            "share that a dose converts: one half at the threshold",
         ),
         Part(
             "contrast-curve",
@@ -263,21 +265,21 @@ PARTS = {
             "shrinkage",
             {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
             _shrink,
-            "less height where less is exposed around: arXiv:2309.17343, parameterized physics model",
+            "less height where less is exposed nearby: arXiv:2309.17343, parameterized physics model",
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(
             "etch",
             {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
             lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
-            "a film that stays under the resist, its edge moved by a bias",
+            "a film remains under the resist, with its edge moved by a bias",
             lambda values, pitch: 1,
         ),
         Part(
             "transfer",
             {"selectivity": Number(1.0)},
             lambda resist, values, pitch: values["selectivity"] * resist,
-            "directional etching: a relief in proportion to that of the resist",
+            "directional etching: the relief is proportional to that of the resist",
         ),
     )
 }
@@ -296,10 +298,10 @@ def register_part(part: Part) -> Part:
 
 
 def part_of(name: str) -> Part:
-    """Return the part of that name.
+    """Return the part with this name.
 
     Raises:
-        InputError: there is none.
+        InputError: no part has this name.
     """
     require_known("part of a printer", name, PARTS)
     return PARTS[name]

@@ -42,28 +42,32 @@ class PblConfig(SimulatorConfig):
     )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
-    illumination: str | None = Field(None, description="part of a printer in place of this spot: lens, …")
-    numbers: dict[str, float] = Field({}, description="values in place of the illumination's own")
+    illumination: str | None = Field(
+        None, description="part of a printer that replaces this spot, such as lens"
+    )
+    numbers: dict[str, float] = Field({}, description="values that replace those of the illumination")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
     # The blur starts wider than the reach of the areawise network (0.5 µm), because no other part can learn
-    # at such distances.
+    # influences at such distances.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
-    # The model starts as the optically blurred layout and learns the difference. The paper's networks start
-    # at random.
+    # Before training, the model returns the optically blurred layout; it learns the difference. The paper's
+    # networks start with random weights.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
     kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
     blur_modulus: bool = Field(False, description="absolute value after the diffusion blur")
     edge: Edge = "replicate"
-    knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
+    knots: int = Field(
+        1025, ge=0, le=1_000_000, description="interpolation points of a pointwise network; 0: none"
+    )
 
     # The next three fields are not in the paper.
     transposable: bool = Field(False, description="network on areas (areawise) that treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
-    scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
+    scan_axis: ScanAxisConfig | None = Field(None, description="network for effects along scan lines")
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
         "default": {
@@ -100,37 +104,37 @@ class PblConfig(SimulatorConfig):
 
     @property
     def exposing(self) -> Part:
-        """Return the illumination that replaces the spot."""
+        """Return the illumination: the spot, or the part that replaces it."""
         return part_of(self.illumination or "spot")
 
     @property
     def exposing_values(self) -> dict[str, float]:
-        """Return the part's values by name."""
+        """Return the values of the illumination by name."""
         return {name: self.numbers.get(name, own.start) for name, own in self.exposing.numbers.items()}
 
     @model_validator(mode="after")
     def _can_be_built(self) -> Self:
         if self.edge == "zero" and (self.surroundings or self.scan_axis):
-            raise ValueError("surroundings and scan_axis take edge 'replicate'")
+            raise ValueError("surroundings and scan_axis require edge 'replicate'")
         if self.illumination is not None:
             part = self.exposing
             for name in self.numbers:
-                require_known(f"number of {part.name}", name, part.numbers)
+                require_known(f"parameter of {part.name}", name, part.numbers)
             if self.edge == "zero":
-                raise ValueError("illumination takes edge 'replicate'")
+                raise ValueError("illumination requires edge 'replicate'")
         return self
 
 
 class Pbl(Simulator):
     """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
 
-    With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I), g_shrink = 1 +
-    net, g_mismatch(H) = H + net(H). The last layers of these networks are zero at the start.
+    With ``starts_as_blur``, the three networks learn a difference: g_thresh(I) = I + net(I), g_shrink = 1 +
+    net, g_mismatch(H) = H + net(H). The last layers of these networks are zero before training.
 
     The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
     the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
-    height along x on the measured map. ``scan_axis`` is fitted together with the chain, so that the chain
-    does not learn this influence, and is left out of ``printer()``.
+    height along x on the measured map. It is fitted together with the chain, so that the chain does not learn
+    this influence, and ``printer()`` leaves it out.
     """
 
     name = "pbl"
@@ -161,7 +165,7 @@ class Pbl(Simulator):
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """Return the model without its feature networks, which is the paper's chain alone."""
+        """Return the model without its feature networks: the paper's chain alone."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
@@ -199,7 +203,9 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the chain's height of the interior, and the input fields of each feature network, µm."""
+        """Return the height of the interior after the chain, and the input field of each feature network,
+        µm.
+        """
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
         printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
         around = self.surroundings
@@ -255,8 +261,8 @@ class Pbl(Simulator):
         return height + (product if padding else crop_border(product, self.mismatch.reach_px))
 
     def _shrink_by_table(self, dose: Tensor) -> Tensor:
-        # A blur averages, so the dose stays in the range of its input. The threshold network's range is that
-        # of its knots, whatever the image.
+        # A blur averages, so the dose stays in the range of its input. The range of the threshold network is
+        # that of its values at the knots, whatever the image.
         full = self.config.full_height_um
         knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
         reachable = self.thresh.at_knots(0.0, full).detach()
@@ -272,7 +278,7 @@ class Pbl(Simulator):
 
 
 class AreawiseNet(nn.Module):
-    """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
+    """A stack of 3 x 3 convolutions, 1 -> channels -> 1, with a leaky ReLU after each but the last.
 
     With ``transposable``, each kernel is averaged with its transpose, which treats x and y alike.
     """
@@ -294,8 +300,8 @@ class AreawiseNet(nn.Module):
         return len(self.hidden) + 1
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
-        """Return the interior of (b, 1, y, x) without padding, or the same size with a zero padding of 1 per
-        layer.
+        """Return the height (b, 1, y, x) of the interior, or of the whole field if each layer has a zero
+        padding of 1.
         """
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
@@ -312,6 +318,6 @@ class AreawiseNet(nn.Module):
         return (kernel + kernel.transpose(-1, -2)) / 2 if self.transposable else kernel
 
     def start_at_zero(self) -> None:
-        """Make the network the zero function, but keep its hidden layers random."""
+        """Set the last layer to zero, so that the network returns zero. The hidden layers stay random."""
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(cast(Tensor, self.last.bias))

@@ -34,18 +34,19 @@ class PhysicsConfig(SimulatorConfig):
     spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one per axis")
     sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
-    # The starting values matter: fits that start from a steep threshold in mid-range end at a straight
+    # The starting values matter: fits that start from a steep threshold in mid-range end with a linear
     # projection.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
     alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
     eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
     eta_min: float = Field(0.0, le=0, description="lower bound of the threshold")
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
-    gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
+    gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: fixed at 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
-    # With 1 the equations are in µm, and with None in units of the full height; the paper has no such height.
+    # With 1, the equations are in µm, and with None, in units of the full height. The paper states no such
+    # height.
     reference_height_um: float | None = Field(
-        None, gt=0, description="height that is 1; None: the highest level"
+        None, gt=0, description="height that counts as 1; None: the highest level"
     )
     shrinkage: Shrinkage = "fixed-reference"
     kernel_support: Support = "four-sigma"
@@ -73,11 +74,11 @@ class PhysicsConfig(SimulatorConfig):
 class Physics(Simulator):
     """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
 
-    In ``default`` H₀ is the nominal full height and g a gain; without it a full level would always print H₀ +
-    b. In ``paper`` and ``authors`` H₀ is 1 µm and g is 1. With a threshold below 0, before the first level,
-    the projection is the concave part of the tanh alone. S = κ + (1 - κ) · u, where u is the diffused dose
-    scaled to 0 ... 1: from a fixed range in ``default``, from the range of the image in ``paper``, from its
-    maximum in ``authors``. In ``paper`` and ``authors`` the result therefore depends on the crop.
+    In ``default``, H₀ is the nominal full height and g is a gain, without which a full level would always
+    print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. With a threshold below 0, before the
+    first level, the projection uses only the concave part of the tanh. S = κ + (1 - κ) · u, where u is the
+    diffused dose scaled to 0 ... 1, with a fixed range in ``default``, the range of the image in ``paper``,
+    and its maximum in ``authors``. In ``paper`` and ``authors``, the result therefore depends on the crop.
     """
 
     name = "physics"
@@ -151,11 +152,13 @@ class Physics(Simulator):
         return self._printed(layout_um, self.config.edge)
 
     def _printed(self, layout_um: Tensor, edge: Edge | None) -> Tensor:
-        """Return the height of the field including what lies beyond its edge, or only of its interior."""
+        """Return the height of the whole field, padded by ``edge``, or only of its interior if ``edge`` is
+        None.
+        """
         values = self.values
         optical, diffusion = self._radii_px(values)
-        # Farther outside the field than the radius of the optical blur, the blurred continued layout is
-        # constant.
+        # The layout is continued by its outermost pixels, so its optical blur is constant farther outside
+        # than the radius of the blur.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
@@ -165,8 +168,8 @@ class Physics(Simulator):
         initial = crop_border(initial, margin if edge else diffusion)
         return self._develop(initial, crop_border(dose, margin), values)
 
-    # The methods below take the values as arguments. The values are computed once per pass, because in
-    # forward mode every operation is slow.
+    # The methods below take the values as arguments. The values are computed once per pass, because every
+    # operation is slow in forward-mode differentiation.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())

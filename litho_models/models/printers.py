@@ -18,8 +18,10 @@ class PrinterConfig(SimulatorConfig):
     Each parameter can also be set like a field, for example as ``spot.sigma_um``.
     """
 
-    parts: tuple[str, ...] = Field(("spot", "tanh"), min_length=1, description="names in order of action")
-    numbers: dict[str, float] = Field({}, description="values in place of the part's own")
+    parts: tuple[str, ...] = Field(
+        ("spot", "tanh"), min_length=1, description="names of the parts, in the order in which they act"
+    )
+    numbers: dict[str, float] = Field({}, description="values that replace those of the parts")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
@@ -35,23 +37,23 @@ class PrinterConfig(SimulatorConfig):
     def _can_be_built(self) -> Self:
         known = {name: number for _, name, number in self.all_numbers()}
         if len(set(self.parts)) < len(self.parts):
-            raise ValueError("a part is named twice")
+            raise ValueError("each part may be named only once")
         for name, value in self.numbers.items():
             if name not in known:
-                raise ValueError(f"{name} is not a number of these parts, which are {', '.join(known)}")
+                raise ValueError(f"{name} is not a parameter of these parts; they have {', '.join(known)}")
             upper = known[name].range_at(name, value).upper
             if not known[name].lower <= value <= upper:
-                raise ValueError(f"{name} is {value:g}, not within {known[name].lower:g} to {upper:g}")
+                raise ValueError(f"{name} is {value:g}, but must be {known[name].lower:g} to {upper:g}")
         return self
 
     def all_numbers(self) -> list[tuple[Part, str, Number]]:
-        """Return all parameters of all parts, by name."""
+        """Return all parameters of all parts, each with its part and its name."""
         found = map(part_of, self.parts)
         return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
 
 
 class Printer(Simulator):
-    """A printer that applies its parts in order: H = H₀ · (…part₂(part₁(M / H₀))), see ``parts``."""
+    """A printer that applies its ``parts`` in order: H = H₀ · (…part₂(part₁(M / H₀)))."""
 
     name = "printer"
     Config = PrinterConfig
@@ -115,7 +117,7 @@ class ElectronBeamConfig(PrinterConfig):
 
 
 class ElectronBeam(Printer):
-    """A film written by electrons, with backscattering, and etched."""
+    """An electron-beam writer, with backscattering, for films that are etched."""
 
     name = "e-beam"
     Config = ElectronBeamConfig
@@ -127,7 +129,7 @@ class ProjectionConfig(PrinterConfig):
 
 
 class Projection(Printer):
-    """A film exposed through a projection lens with a partially coherent source, and etched."""
+    """A projection lens with a partially coherent source, for films that are etched."""
 
     name = "projection"
     Config = ProjectionConfig
@@ -139,7 +141,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A relief of many levels, written by a laser in a resist with a contrast curve."""
+    """A laser writer for multi-level reliefs in a resist with a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -151,7 +153,7 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A relief of many levels, exposed by micromirrors in a resist in which the dose diffuses."""
+    """A micromirror printer for multi-level reliefs in a resist in which the dose diffuses."""
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig

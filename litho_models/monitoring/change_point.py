@@ -1,13 +1,14 @@
-"""Test whether the mean of a figure has changed since the reference, at a stated rate of false alarms.
+"""Test whether the mean of a monitored quantity has changed since the reference, at a stated rate of false
+alarms.
 
-Each new print is tried as the first after a step that lasts to the last print. Student's t with pooled spread
-compares the figures before the step, including the reference, with those after it. The t distribution holds
-for any number of reference prints, with unknown mean and spread. The test is the likelihood ratio for a step
-in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of
-false alarms is divided among the comparisons, so it holds for the whole set, whatever the correlation between
-comparisons (Bonferroni). A step should be noticed within ``SOON`` prints, so comparisons with at least that
-many prints after the step get most of the rate. With three new prints the rule is nearly the t test of their
-mean, which is the best possible test if the spread is unknown.
+Each new print is tried as the first print after a step that lasts until the last print. Student's t with
+pooled spread compares the values before the step, including the reference, with those after it. The t
+distribution holds for any number of reference prints, with unknown mean and spread. The test is the
+likelihood ratio for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
+Technology 35, 355). The rate of false alarms is divided among the comparisons, so it holds for the whole set,
+whatever the correlation between comparisons (Bonferroni). A step should be noticed within ``SOON`` prints, so
+comparisons with at least that many prints after the step get most of the rate. With three new prints, the
+rule is nearly the t test of their mean, which is the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -28,10 +29,10 @@ _LARGEST = 1e4
 
 
 class Series(NamedTuple):
-    """One figure per print in printing order, and its variance up to a common factor.
+    """One value per print in printing order, and its variance up to a common factor.
 
     Attributes:
-        reference: (..., n); ``new``: (..., m).
+        reference: values of the reference prints, (..., n); ``new``: values of the new prints, (..., m).
         reference_variance: (n,); ``new_variance``: (m,).
     """
 
@@ -46,7 +47,7 @@ class Step(NamedTuple):
 
     Attributes:
         since: number of the first changed new print, from 0.
-        size: new mean minus old mean; ``ci95``: interval of this difference.
+        size: new mean minus old mean; ``ci95``: confidence interval of this difference.
     """
 
     since: int
@@ -70,7 +71,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
     freedom.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
-    # A value within the data is subtracted first, because sums of squares of large figures would lose digits.
+    # A value within the data is subtracted first, because sums of squares of large values would lose digits.
     centre = np.mean(series.reference, axis=-1, keepdims=True)
     values = np.concatenate([series.reference - centre, series.new - centre], axis=-1)
     n, m = series.reference.shape[-1], series.new.shape[-1]
@@ -86,7 +87,7 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """Find the most significant step, and an upper bound of its p value.
+    """Find the most significant step, and an upper bound on its p value.
 
     Args:
         series: values of shape (n,) and (m,), n at least 2, m at least 1.
@@ -103,12 +104,12 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
     """Return the probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if
     there are fewer.
 
-    The result is a lower bound. It comes from the noncentral t of a single comparison, the one that starts
-    with the rise.
+    The result is a lower bound. It is computed from the noncentral t distribution of a single comparison, the
+    one in which the step starts with the rise.
 
     Args:
-        step: in units of the (unknown) spread of a figure whose variance here is 1.
-        reference_variance: (n,); ``new_variance``: (m,), of Gaussian figures.
+        step: the rise, in units of the (unknown) spread of a print whose variance here is 1.
+        reference_variance: (n,); ``new_variance``: (m,), of Gaussian values.
         rate: chance of a false alarm in the whole set.
     """
     limit, freedom, error = _comparison(reference_variance, new_variance, rate)
@@ -116,8 +117,8 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
-    """Return the step that is noticed with probability ``power``; infinite beyond ten thousand standard
-    errors.
+    """Return the step that is noticed with probability ``power``; infinite if it exceeds ten thousand
+    standard errors.
     """
     error = _comparison(reference_variance, new_variance, rate)[2]
 

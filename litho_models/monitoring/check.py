@@ -30,20 +30,22 @@ def check(
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
-        store: dataset store of the new prints; locked scans of the model's own prints are left out.
+        store: dataset store of the new prints; locked scans are left out if the model was made from these
+            prints.
         out: result folder.
         reference: store of unchanged prints; by default the prints in the model's card.
         new: names of the prints of ``store`` that are new; the other prints are then the reference.
-        false_alarms: chance that an unchanged data set raises an alarm in any figure.
-        tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
+        false_alarms: chance that prints of an unchanged printer raise an alarm in any monitored quantity.
+        tolerance: largest relative drift of a monitored quantity (0.05 is 5 %); three times its spread by
+            default.
 
     Raises:
         InputError: a model or store that cannot be read or does not fit, or too few prints.
     """
     if not 0 < false_alarms < 0.5:
-        raise InputError("rate of false alarms", got=false_alarms, wanted="between 0 and 0.5")
+        raise InputError("rate of false alarms", got=false_alarms, wanted="a number between 0 and 0.5")
     if tolerance is not None and not 0 < tolerance < 1:
-        raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
+        raise InputError("tolerance", got=tolerance, wanted="a number between 0 and 1, such as 0.05 for 5 %")
     dataset = open_store(store)
     frozen = load_frozen(model)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}

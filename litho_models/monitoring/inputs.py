@@ -1,4 +1,4 @@
-"""Collect the scans to check, and the reference from a store, other prints or a card."""
+"""Collect the scans to check and the reference scans, which come from a store, other prints or a card."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +21,8 @@ _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
-    """Figures of reference and new scans, excluded scans, and a description of the reference.
+    """The monitored values of reference and new scans, the excluded scans, and a description of the
+    reference.
 
     ``between`` says whether the new prints were made between reference prints.
     """
@@ -36,7 +37,7 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Compute the figures of the new prints and of the reference, keeping only scans of one dose.
+    """Compute the monitored values of the new prints and of the reference, keeping only scans of one dose.
 
     Raises:
         InputError: no reference or more than one, unknown prints, stores of another geometry, stores with
@@ -78,11 +79,13 @@ def _require_prints(names: Sequence[str], rows: Sequence[ScanFigures], dataset: 
 
 
 def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
-    """Return the figures of the prints from which the model was made, unless they are in the store."""
-    hint = "--reference STORE takes the prints of a store, --new PRINT the other prints of this one"
+    """Return the monitored values of the prints from which the model was made, unless they are in the
+    store.
+    """
+    hint = "use --reference STORE, or --new PRINT to compare it with the other prints of this store"
     if not frozen.card["baseline"]:
         raise InputError(
-            f"card of {frozen.name}", got="no figures of prints", wanted="a reference", hint=hint
+            f"card of {frozen.name}", got="no values of reference prints", wanted="a reference", hint=hint
         )
     if made_of_these_prints(frozen, dataset):
         raise InputError(
@@ -98,7 +101,9 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
 
 
 def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[ScanFigures]:
-    """Compute the figures of the scans of a store; locked scans of the model's own prints are left out."""
+    """Compute the monitored values of the scans of a store. Locked scans are left out if the model was made
+    from these prints.
+    """
     seen, locked = trained_ids(frozen, store), set()
     if made_of_these_prints(frozen, store):
         locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
@@ -130,9 +135,9 @@ def _check_apart(dataset: Store, other: Store) -> None:
     if dataset.sha256 == other.sha256 or files & known:
         raise InputError(
             "reference",
-            got=f"scans of {dataset.path} in {other.path} too",
-            wanted="prints that are not checked",
-            hint="--new PRINT checks some prints of a store against its others",
+            got=f"{other.path}, which shares scans with {dataset.path}",
+            wanted="a store without the checked scans",
+            hint="use --new PRINT to compare some prints of a store with its other prints",
         )
 
 
@@ -142,12 +147,12 @@ def _check_reference(rows: Sequence[ScanFigures], frozen: FrozenSimulator) -> No
         raise InputError(
             "prints in the reference",
             got=prints,
-            wanted=f"{FEWEST_REFERENCE_PRINTS} at least, to show how much unchanged prints differ",
+            wanted=f"at least {FEWEST_REFERENCE_PRINTS}, to show how much unchanged prints differ",
         )
     gain = float(np.median([row.gain for row in rows]))
     if not _OWN_GAIN[0] < gain < _OWN_GAIN[1] or min(row.gain for row in rows) <= 0:
         raise InputError(
-            f"reference prints against model {frozen.name}",
+            f"heights of the reference prints, compared with model {frozen.name}",
             got=f"{gain:.2f} times the predicted heights",
             wanted=f"{_OWN_GAIN[0]:g} to {_OWN_GAIN[1]:g}",
             hint="the model describes another printer, or scans and layouts do not belong together",

@@ -1,4 +1,4 @@
-"""Judge each figure of the scans; this module needs neither files nor models."""
+"""Judge each monitored quantity of the scans. This module needs neither files nor models."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,12 +24,12 @@ from litho_models.scoring.printer_state import ScanFigures
 
 
 class Trend(NamedTuple):
-    """A straight line through the figures of prints.
+    """A straight line through the values of prints.
 
     Attributes:
-        per_print: change from print to print, with its 95 % interval.
+        per_print: change from print to print; ``ci95``: its 95 % confidence interval.
         p: two-sided p value of the slope.
-        prints_left: number of further prints for which the 95 % bound of the drift stays within the
+        prints_left: number of further prints for which the 95 % bound on the drift stays within the
             tolerance.
     """
 
@@ -43,11 +43,13 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     """Fit the trend over all prints, and estimate the number of prints until it reaches the tolerance.
 
     The drift is the change since the middle of the reference, when the model was made: the trend times the
-    number of prints since then. The 95 % bound of the drift follows from the end of the trend's interval with
-    the faster change. The forecast assumes a steady drift. Steps are detected by the alarm.
+    number of prints since then. The 95 % bound on the drift follows from the end of the trend's confidence
+    interval at which the change is faster. The forecast assumes a steady drift. Steps are detected by the
+    alarm.
 
     Args:
-        values: one value per print in printing order, (n,), at least three; ``variance``: relative, (n,).
+        values: one value per print in printing order, (n,), at least three; ``variance``: their relative
+            variances, (n,).
         reference: bool (n,), True for prints of the reference.
         tolerance: largest drift, in the unit of ``values``.
     """
@@ -78,12 +80,12 @@ def judge(
     figures: Sequence[Figure] = FIGURES,
     between: bool = False,
 ) -> list[FigureCheck]:
-    """Compare every figure of the new prints with the reference.
+    """Compare every monitored quantity of the new prints with the reference.
 
     Args:
         reference, new: scans of the prints, in any order; there must be at least three reference prints.
-        rate: chance of a false alarm in an unchanged set, divided among the figures by their weights.
-        tolerance: largest drift that is allowed, relative; three times the spread by default.
+        rate: chance of a false alarm if nothing has changed, divided among the quantities by their weights.
+        tolerance: largest allowed relative drift; three times the spread by default.
         between: whether new prints were made between reference prints. If so, the trend follows the common
             printing order; otherwise all new prints come after the reference.
     """
@@ -94,7 +96,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """Return each figure's share of the rate of false alarms."""
+    """Return each quantity's share of the rate of false alarms."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

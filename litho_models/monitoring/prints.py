@@ -1,4 +1,6 @@
-"""The record ``check.json`` and its figures: one value per print, and the spread of these values."""
+"""Define the record ``check.json`` and the monitored quantities, each with one value per print and the spread
+of these values.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -15,10 +17,10 @@ _LEAST_GAIN = 0.01
 
 
 class Figure(NamedTuple):
-    """A figure that is monitored.
+    """A monitored quantity.
 
-    ``of`` is the logarithm of the figure for one scan, so that differences are relative: a step of 0.03 is 3
-    %. ``weight`` is the figure's part of the rate of false alarms.
+    ``of`` returns the logarithm of the quantity for one scan, so that differences are relative: a step of
+    0.03 is 3 %. ``weight`` is the quantity's share of the rate of false alarms.
     """
 
     name: str
@@ -51,8 +53,8 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """One value per print in printing order: the mean over the print's scans, whose number is in ``counts``;
-    (n,) each.
+    """The names, values and numbers of scans of prints in printing order, (n,) each. A value is the mean over
+    the scans of a print.
     """
 
     names: list[str]
@@ -64,8 +66,9 @@ class Spread(NamedTuple):
     """The variation of unchanged prints.
 
     Attributes:
-        mean: mean over the prints; ``sd``: standard deviation between prints, with its 95 % interval.
-        between, within: variance of prints, and of scans within a print; ``within`` is None where no print
+        mean: mean over the prints; ``sd``: standard deviation between prints; ``sd_ci95``: its 95 %
+            confidence interval.
+        between, within: variance between prints, and between scans of a print; ``within`` is None if no print
             has two scans.
     """
 
@@ -77,7 +80,7 @@ class Spread(NamedTuple):
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
         """Return the variance of each print's value, which depends on its number of scans, relative to the
-        variance of a usual print; (n,).
+        variance of a typical print; (n,).
         """
         if self.within is None:
             return np.ones(len(counts))
@@ -100,8 +103,8 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 
 
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
-    """Compute mean and spread over at least two prints, with variance components by one-way analysis of
-    variance.
+    """Compute the mean and spread over at least two prints, with variance components from a one-way analysis
+    of variance.
 
     The mean of one scan varies more than the mean of four. Prints with several scans show how much of the
     variation comes from the scans. A negative variance between prints counts as 0.
@@ -130,10 +133,10 @@ class CheckedModel(Record):
 
 
 class Alarm(Record):
-    """A step in the mean of a figure, relative; ``since`` is the first changed print.
+    """A relative step in the mean of a monitored quantity; ``since`` is the first changed print.
 
-    ``step`` is the mean from ``since`` on minus the mean before. Its interval does not account for the choice
-    of ``since``.
+    ``step`` is the mean from ``since`` on minus the mean before. Its confidence interval does not account for
+    the choice of ``since``.
     """
 
     since: str
@@ -142,15 +145,15 @@ class Alarm(Record):
 
 
 class FigureCheck(Record):
-    """One figure of the new prints compared with the reference. All values except ``mean`` are relative: 0.01
-    is 1 %.
+    """One monitored quantity of the new prints, compared with the reference. All values except ``mean`` are
+    relative: 0.01 is 1 %.
 
-    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound of the p value of a
-    change. An alarm is raised if ``p`` is at most ``alarm_at``, the figure's share of the rate.
+    ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound on the p value of a
+    change. An alarm is raised if ``p`` is at most ``alarm_at``, the quantity's share of the rate.
     ``noticeable_step`` is the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
-    cases; a fall by r/(1 + r) is noticed equally often. ``noticeable_step`` is None beyond a factor of e.
-    ``trend`` is the change per print over all prints. ``measure_again_in`` is the number of prints until the
-    95 % bound of the drift reaches ``tolerance``.
+    cases; a fall by r/(1 + r) is noticed equally often. ``noticeable_step`` is None if the rise exceeds a
+    factor of e. ``trend`` is the change per print over all prints. ``measure_again_in`` is the number of
+    prints until the 95 % bound on the drift reaches ``tolerance``.
     """
 
     name: str

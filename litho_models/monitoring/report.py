@@ -1,4 +1,6 @@
-"""Write ``report.html`` of a check: the verdict, a control chart for each figure, and a table of scans."""
+"""Write ``report.html`` of a check: the verdict, a control chart for each monitored quantity, and a table of
+scans.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ _COLUMNS = (
 
 
 def write_check_report(result: Check, out: str | Path) -> Path:
-    """Render the result into ``out``; return the page."""
+    """Write the report of a check into ``out``; return its path."""
     page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
     page.verdict(result.verdict[0])
     for one in result.figures:
@@ -32,8 +34,9 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.heading("In numbers", folded=True)
     page.table(
         result.figures,
-        "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed at any print; "
-        f"alarm if at most “alarm at”, the figure's share of {result.false_alarm_rate:g}.",
+        "All values except the mean are relative: 0.01 is 1 %. p is the chance that unchanged prints look as "
+        "changed as these at any print. An alarm is raised if p is at most “alarm at”, this quantity's share "
+        f"of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
         columns=_COLUMNS,
@@ -43,13 +46,13 @@ def write_check_report(result: Check, out: str | Path) -> Path:
         for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
         for row in rows
     ]
-    page.table(scans, f"Every scan; reference: {result.reference}.", "scans.csv", digits=4)
+    page.table(scans, f"All scans. The reference is {result.reference}.", "scans.csv", digits=4)
     return page.write(out)
 
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
-    """Draw the figure of every print relative to the reference: large dots for prints, small dots for scans,
-    the spread of the reference, and steps.
+    """Draw one monitored quantity of all prints, relative to the reference: large dots for prints, small dots
+    for scans, bands for the spread of the reference and for a step.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -77,7 +80,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
     axes.axvline(one.reference_prints - 0.5, color=LIGHT["ink"], lw=0.8, ls=":")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="print, in printing order", ylabel="against the reference, %")
+    axes.set(xlabel="print, in printing order", ylabel="difference from the reference, %")
     axes.set_title(watched.words, fontsize=10)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, ncols=2)
@@ -85,13 +88,13 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
 
 
 def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
-    """Convert the logarithm of a figure to its difference from the reference mean, %."""
+    """Convert the logarithm of a quantity to its difference from the reference mean, %."""
     return 100 * np.expm1(np.asarray(value) - np.log(one.mean))
 
 
 def _chart_text(one: FigureCheck) -> str:
     unit = " nm" if one.name == "error" else ""
     return (
-        f"Large dots are prints, small ones their scans. 0 is the mean of {one.reference_prints} reference "
-        f"prints, {one.mean:.4g}{unit}; dashed: the tolerance, {100 * one.tolerance:.1f} %."
+        f"Large dots are prints; small dots are their scans. 0 is the mean of {one.reference_prints} "
+        f"reference prints, {one.mean:.4g}{unit}. Dashed lines: tolerance, {100 * one.tolerance:.1f} %."
     )

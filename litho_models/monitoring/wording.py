@@ -11,7 +11,7 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# A layout that is this much flatter, higher or steeper than every reference layout is of another kind.
+# A layout that is flatter, higher or steeper than every reference layout by this factor is of another kind.
 _OTHER_KIND = 1.1
 # Largest amount, in units of the spread, by which a fit may understate its error without raising the rate of
 # false alarms.
@@ -46,10 +46,10 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Return whether the reference's errors are too small to be compared with errors on unseen prints.
+    """Return whether the errors of the reference are too small to be compared with errors on unseen prints.
 
-    On the scans that were fitted, the error is too small by the ratio of parameters to independent pixels.
-    Pixels within one correlation length of the residual count as one.
+    On scans used in the fit, the error is too small by the ratio of parameters to independent pixels. Pixels
+    within one correlation length of the residual count as one.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))

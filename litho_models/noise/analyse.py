@@ -33,13 +33,13 @@ def analyse_noise(
     """Analyse the noise of a store; write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. Scans of use substrate, flat or steps, and doses, are used if the store has
-            them.
+        store: dataset store. Scans whose use is substrate, flat or steps, and scans that state a dose, are
+            analysed if the store has them.
         out: result folder.
-        residuals: folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
+        residuals: result folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
             ``zoo:NAME``). The analysis then contains σ(x) and its calibration, and the budget if the
             residuals are out of fold.
-        model: which model of the benchmark; its best one by default.
+        model: name of a model in the benchmark; by default the best one.
         seed: seed that decides which pixels are drawn.
 
     Raises:
@@ -63,7 +63,7 @@ def analyse_noise(
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
-            f"{scan_id}: lock box" + ", in the dose matrix only" * (scan_id in in_matrix)
+            f"{scan_id}: lock box" + ", used only in the dose matrix" * (scan_id in in_matrix)
             for scan_id in locked
         ]
         repeats = repeated_prints(scans)
@@ -110,7 +110,7 @@ def analyse_noise_of_files(
         level_height_um: nominal step of the staircase.
 
     Raises:
-        InputError: a file that cannot be read, or without a known pitch.
+        InputError: a file that cannot be read, or whose pitch is not known.
     """
     with growing_folder(out, NoiseAnalysis.FILE_NAME):
         references = []
@@ -126,7 +126,7 @@ def analyse_noise_of_files(
             references=found,
             dose=None,
             spread=None,
-            notes=["Single scans as read, levelled by an offset or a second-degree polynomial, as stated."],
+            notes=["Scans are used as read; an offset or a second-degree polynomial is removed, as stated."],
         )
         write_noise_report(result, references, out)
         result.write(out)

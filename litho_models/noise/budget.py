@@ -25,8 +25,8 @@ _FEWEST_PIXELS = 1000
 class FlatLevel(Record):
     """The residual of pixels of one level where the layout is flat: rms and mean absolute value, nm.
 
-    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the interval of σ over
-    prints.
+    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the confidence interval of σ
+    over prints.
     """
 
     level: int
@@ -41,7 +41,8 @@ class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 
     ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
-    ``flat_texture`` is the texture of the same pixels after policy ``full``, so it contains line offsets.
+    ``flat_texture`` is the texture of the same pixels after the terms of policy ``full`` are removed, so it
+    contains line offsets.
     """
 
     model: str
@@ -52,7 +53,7 @@ class NoiseBudget(Record, extra="ignore"):
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Make both estimates from the residuals of one model on held-out scans."""
+    """Compute both estimates from the residuals of one model on held-out scans."""
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
@@ -72,7 +73,7 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 
 def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
-    """Yield the flat pixels of each level that has enough of them."""
+    """Yield the residual in the flat pixels of each level that has enough of them."""
     pool = Pool(scans, [np.isfinite(own) for own in flat_um])
     level, residual = pool.of([scan.mask_level for scan in scans]), NM_PER_UM * pool.of(flat_um)
     for value in np.unique(level).tolist():

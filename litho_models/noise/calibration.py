@@ -40,11 +40,12 @@ _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
-# Older results contain further figures: those of ensembles, and stated bounds for whole scans.
+# Older results contain further values: those of ensembles, and stated bounds for whole scans.
 class ScanCalibration(Record, extra="ignore"):
-    """One scan: likelihood and CRPS (lower is better), coverage at the stated levels, rms of r/σ.
+    """The calibration on one scan: negative log-likelihood and CRPS (lower is better), the coverage at the
+    stated levels, and the rms of r/σ.
 
-    ``ence`` and ``ause`` are shares, where 0 is best (see ``spread_scores``).
+    ``ence`` and ``ause`` are fractions, where 0 is best (see ``spread_scores``).
     """
 
     scan: str
@@ -61,8 +62,8 @@ class Calibration(Record, extra="ignore"):
 
     Args:
         name: whether the spread is constant or depends on covariates.
-        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are the coverages that a calibrated
-            spread has.
+        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are the coverages of a calibrated
+            spread.
         pit: histogram of the stated probability below r/s, in 20 bins that sum to one; flat if the shape is
             right.
     """
@@ -82,8 +83,8 @@ class Calibration(Record, extra="ignore"):
 class SigmaBin(Record, extra="ignore"):
     """The measured and predicted spread, and its coverage, for pixels within one range of one covariate.
 
-    The record contains the coverage at 68 and 95 % with 95 % intervals over prints, and ENCE and AUSE within
-    the group.
+    The record contains the coverage of the 68 and 95 % intervals with 95 % confidence intervals over prints,
+    and ENCE and AUSE within the bin.
     """
 
     covariate: str
@@ -101,11 +102,11 @@ class SigmaBin(Record, extra="ignore"):
 
 
 class SpreadAnalysis(Record, extra="ignore"):
-    """The σ(x) of one model's residuals and its calibration. ``bins`` are out of fold, while the recorded
-    variance model is fitted to all scans.
+    """The spread σ(x) of one model's residuals, and its calibration. ``bins`` are out of fold, while the
+    recorded variance model is fitted to all scans.
 
     ``nuisance`` names the terms that were removed from the residuals. ``left_out`` states whether each fit
-    leaves out prints or scans, on which it is then judged.
+    leaves out prints or scans; the fit is then judged on those left out.
     """
 
     model: str
@@ -217,7 +218,9 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Yield bins: all pixels, each level, and ranges of equal pixel counts of every other covariate."""
+    """Yield the bins: all pixels, each level, and, for every other covariate, ranges with equal numbers of
+    pixels.
+    """
     pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
     residual = pool.of(residuals_nm)
     sigma = pool.of([own.tails.sd * own.scale_nm for own in stated])

@@ -1,4 +1,4 @@
-"""Evaluate the dose matrix: height, roughness and lost steps against dose, and the recommended dose.
+"""Evaluate the dose matrix: height, roughness and lost steps as functions of dose, and the recommended dose.
 
 This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
 that state a dose. They show step ladders, or any layout with areas of one level that are wider than the
@@ -22,7 +22,7 @@ _GUARD_UM = 1.0
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Surroundings still matter beyond this distance, because diffusion reaches up to 2.5 µm.
+# Surroundings matter even beyond the guard distance, because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
@@ -40,15 +40,15 @@ class DoseRow(Record, extra="ignore"):
 
     Args:
         dose: dose relative to the nominal dose.
-        height_gain: printed over nominal height, slope of a straight line through the levels.
+        height_gain: printed over nominal height, from the slope of a straight line through the levels.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation within areas of one level.
         lost_low, lost_high: number of steps at the low and the high end that are, per level, less than half
             the median step of this dose. Low steps are lost to under-exposure (nothing remains), high steps
             to over-exposure (nothing more reacts). Steps are compared with others of the same dose, so that
             shrinkage does not count as a wrong exposure.
-        worst_readability: smallest ratio of a step to the σ of its two levels; from 3.92 on, single pixels
-            can be told apart.
+        worst_readability: smallest ratio of a step to the σ of its two levels; if it is at least 3.92, single
+            pixels of the two levels can be told apart.
     """
 
     dose: float
@@ -93,7 +93,7 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
         notes.append(
             f"{'Left out of the' if len(rows) > 1 else 'No'} dose matrix: prints at dose "
             f"{', '.join(f'{dose:g}' for dose in narrow)} have fewer than {_FEWEST_LEVELS} levels with areas "
-            f"farther than {_GUARD_UM:g} µm from every edge; step ladders have them (litho-data masks "
+            f"farther than {_GUARD_UM:g} µm from every edge; step ladders have such areas (litho-data masks "
             "--pattern dose-matrix)."
         )
     if len(rows) < 2:
@@ -103,8 +103,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     best = min(sound, key=lambda row: abs(row.height_gain - 1))
     told_apart = "can" if best.worst_readability >= READABLE_AT else "cannot all"
     reason = (
-        f"of the {len(sound)} doses that lose the fewest steps ({fewest}), its height comes nearest to the "
-        f"nominal one (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
+        f"of the {len(sound)} doses that lose the fewest steps ({fewest}), this one prints nearest to the "
+        f"nominal height (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
         f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
     )
     return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=_GUARD_UM), notes
@@ -174,7 +174,7 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def _plateaus(scan: PrintedScan) -> Array:
-    """Return the measured pixels (ny, nx) away from all changes of level."""
+    """Return a mask (ny, nx) of the measured pixels that are not near any change of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * round(_GUARD_UM / scan.pitch_um) + 1
@@ -188,6 +188,6 @@ def _run_length(flags: Array) -> int:
 
 
 def _pooled_sd(parts: Sequence[Array]) -> float:
-    """Return the standard deviation within parts, each about its own mean; 0 if no part has two values."""
+    """Return the standard deviation within parts, each relative to its mean; 0 if no part has two values."""
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

@@ -70,7 +70,7 @@ def dose(found: DoseMatrix) -> Figure:
 
 
 def spread(found: SpreadAnalysis) -> Figure:
-    """Draw observed (points) and predicted (line) rms of the residual in ranges of each covariate."""
+    """Draw the observed (points) and the predicted (line) rms of the residual in ranges of each covariate."""
     names = list(dict.fromkeys(row.covariate for row in found.bins if row.covariate != "all"))
     figure = new_figure(2.8 * len(names), 2.9)
     grid = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
@@ -103,5 +103,5 @@ def calibration(found: SpreadAnalysis) -> Figure:
     left.set_ylabel("pixels inside the 90 % interval, %")
     left.legend(fontsize=8)
     right.axhline(1, color="#9aa7b5", lw=1)
-    right.set(xlabel="Φ(residual / σ)", ylabel="density (flat where σ is right)")
+    right.set(xlabel="Φ(residual / σ)", ylabel="density (flat if σ is right)")
     return figure

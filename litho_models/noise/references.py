@@ -1,4 +1,4 @@
-"""Read scans for measuring the noise (bare substrate, flat print, steps), and compute their results."""
+"""Read scans for measuring the noise (bare substrate, flat print, steps), and compute the noise from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +39,8 @@ class Reference:
 
 
 class ReferencePrints(Record):
-    """Results of the reference scans: roughness of each surface, of the print alone, and the steps.
+    """Results of the reference scans: the roughness of each surface, the roughness of the print alone, and
+    the steps.
 
     ``textures`` are those of substrates and flat prints with square pixels, without a quadratic
     background.
@@ -53,7 +54,7 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """Return the substrate, flat and step scans of a store, levelled, each in the frame of the scan."""
+    """Return the levelled substrate, flat and step scans of a store, each on the grid of the scan."""
     pitches = store.recorded_pitches_um()
     return [
         Reference(
@@ -102,16 +103,16 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
 
 def _has_texture(one: Reference) -> bool:
-    """Return whether a scan has enough lines, on square pixels."""
+    """Return whether a scan has enough lines and square pixels."""
     pitch_y_um, pitch_x_um = one.pitch_um
     return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
 
 
 class RepeatedPrints(Record):
-    """The noise of one print, nm, that comes from print, microscope and, at edges, registration.
+    """The noise of one print, nm. It comes from the print, the microscope and, at edges, the registration.
 
     A polynomial of second degree is removed from each pair, so datum, tilt and bow are not included. Errors
-    that repeat from print to print are not included either. ``ci95_nm`` resamples pairs.
+    that repeat from print to print are not included either. ``ci95_nm`` comes from resampling pairs.
     """
 
     sigma_nm: float
@@ -121,7 +122,8 @@ class RepeatedPrints(Record):
 
 
 def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
-    """Return half the variance between prints of one layout at one dose; None without repeated prints.
+    """Estimate the noise variance as half the variance of the difference between prints of one layout at one
+    dose. Return None without repeated prints.
 
     The mean absolute error is the mean absolute difference divided by √2. This is exact for Gaussian noise,
     and within a few percent for other noise (``estimated_floor``).

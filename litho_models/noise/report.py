@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
-# The terms that each policy fits to a scan before the noise is measured, in words.
+# A description of the terms that each policy fits to a scan before the noise is measured.
 _FREE = {
     "none": "nothing fitted",
-    "offset": "the zero of each scan free",
-    "offset-gain": "zero and gain of each scan free",
-    "full": "zero, gain, tilt and bow of each scan free",
-    "full+rows": "zero, gain, tilt, bow and line offsets of each scan free",
+    "offset": "the zero height of each scan fitted",
+    "offset-gain": "the zero height and gain of each scan fitted",
+    "full": "the zero height, gain, tilt and bow of each scan fitted",
+    "full+rows": "the zero height, gain, tilt, bow and line offsets of each scan fitted",
 }
 
 
 def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], out: str | Path) -> Path:
-    """Render the result into ``out``; return the page."""
+    """Write the report of a noise analysis into ``out``; return its path."""
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
@@ -44,8 +44,8 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
         _dose(page, result.dose)
     if result.repeats is not None:
         page.paragraph(
-            f"Repeated prints ({result.repeats.scans}): σ {result.repeats.sigma_nm:.2f} nm "
-            f"({interval_text(result.repeats.ci95_nm)}), half the variance of a pair's difference."
+            f"Noise from {result.repeats.scans} repeated prints: σ = {result.repeats.sigma_nm:.2f} nm (95 %: "
+            f"{interval_text(result.repeats.ci95_nm)}). σ² is half the variance of a pair's difference."
         )
     if result.spread is not None:
         _spread(page, result.spread)
@@ -63,7 +63,8 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     found = result.references
     page.heading("Reference prints")
     page.figure(
-        plots.surfaces(references), "Heights relative to their mean; substrate and flat have the same scale."
+        plots.surfaces(references),
+        "Heights relative to their mean. Substrate and flat print share one scale.",
     )
     page.heading("Reference prints in numbers", folded=True)
     rows = [
@@ -93,10 +94,11 @@ def _texture(page: Page, found: Texture) -> None:
     page.paragraph(f"Texture of {found.id}: {found.verdict}.")
     page.table(
         found.lines,
-        f"Strength of the direction {found.strength:.2f}: 0 where all directions are alike (chance of as "
-        f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: part of the variance that is "
-        "in the means of the lines along each axis; part of their squares in the strongest period. p: "
-        "chance of such a peak in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
+        f"The directional strength is {found.strength:.2f}: 0 if all directions are alike, 1 if all lines "
+        "have one direction. An isotropic surface is at least as directional with probability "
+        f"{found.isotropic_p:.1g}. Share: fraction of the variance in the means of the lines along each "
+        "axis; fraction of the squares of these means in the strongest period. p: probability of such a "
+        "peak in a smooth spectrum. Coherence: 1 if all surfaces have the same phase.",
         f"texture_{found.id.replace(' ', '_')}.csv",
         digits=3,
     )
@@ -107,8 +109,8 @@ def _steps(page: Page, found: StepPrint) -> None:
     page.table(
         [{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)],
         f"Steps along {found.axis}; tread σ {found.tread_sigma_nm:.2f} nm. Readability is height over σ; "
-        "misread pixels are nearer to the other tread. Single pixels tell steps of "
-        f"{found.resolvable_step_nm:.1f} nm apart.",
+        "misread pixels are nearer to the other tread. Single pixels resolve steps of at least "
+        f"{found.resolvable_step_nm:.1f} nm.",
         f"steps_{found.id}.csv",
         digits=3,
     )
@@ -119,13 +121,13 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
         plots.dose(found),
-        "Green: recommended. Shaded: steps are lost. Above the dashed line, single pixels tell levels apart.",
+        "Green: recommended. Shaded: steps are lost. Above the dashed line, single pixels resolve levels.",
     )
     page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
     page.table(
         rows,
-        f"Measured farther than {found.guard_um:g} µm from every edge. Gain is printed over nominal height.",
+        f"Values farther than {found.guard_um:g} µm from every edge. Gain is printed over nominal height.",
         "doses.csv",
         digits=3,
     )
@@ -135,25 +137,25 @@ def _dose(page: Page, found: DoseMatrix) -> None:
 
 def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.heading(f"Uncertainty of {found.model}")
-    origin = "no fit has seen" if found.held_out else "the model was trained on, so they are too small"
+    origin = "that no fit has used" if found.held_out else "used in training (so they are too small)"
     shared = "without" if found.nuisance.background == "none" else "with"
-    background = f"{shared} the background that the training scans share"
+    background = f"{shared} the background shared by the training scans"
     page.paragraph(
-        f"Errors on scans that {origin}, with {_FREE[found.nuisance.policy]}, {background}: RMS "
-        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They are the noise and what "
-        f"the model lacks. σ(x), the uncertainty at a pixel, is fitted on other {found.left_out} than it is "
-        f"judged on; its shape is {_shape(found.variance.freedom)}."
+        f"Errors on scans {origin}, with {_FREE[found.nuisance.policy]}, {background}: RMS "
+        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They consist of noise and of "
+        f"effects that the model lacks. σ(x), the uncertainty at a pixel, is judged on {found.left_out} "
+        f"left out of its fit; the distribution is {_shape(found.variance.freedom)}."
     )
     page.figure(
         plots.calibration(found),
-        "Scans left out. First: how many pixels lie inside the 90 % interval that was predicted for them. "
-        "Second: where among the predicted heights the measured ones fall; flat if σ is right.",
+        "Scans left out of the fit. First: percentage of pixels inside their predicted 90 % intervals. "
+        "Second: predicted probability of a lower height than the measured one; flat if σ is right.",
     )
     page.heading(f"Dependence of the uncertainty of {found.model} on its covariates", folded=True)
-    page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
+    page.figure(plots.spread(found), "Spread by level, slope, distance to the nearest edge, and radius.")
     page.table(
         [row for one in found.calibrations for row in _covered(one, [one], {"levels", "pit", "scans"})],
-        "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
+        "Means over scans. NLL is in nats for heights in nm; ENCE and AUSE are fractions (0 is best).",
         "calibration.csv",
         digits=3,
     )
@@ -161,13 +163,13 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.table(scans, "By scan.", "calibration_scans.csv", digits=3)
     page.table(
         {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients},
-        "The scale fitted on all scans.",
+        "The coefficients of ln s², fitted to all scans.",
         "variance.csv",
         digits=4,
     )
     page.table(
         found.bins,
-        "By level, and by ranges of equal pixel count of the other covariates; intervals over prints.",
+        "By level, and by ranges of the other covariates with equal pixel counts; intervals over prints.",
         "spread.csv",
         digits=3,
     )
@@ -176,21 +178,21 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
 def _budget(page: Page, found: NoiseBudget) -> None:
     page.heading("Noise budget", folded=True)
     page.paragraph(
-        f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
-        "the model lacks counts as noise unless like surroundings share it. What levelling removed from the "
-        "scans is missing, a few percent of the variance."
+        f"These estimates come from residuals of {found.model} on scans that it had not seen. Both are upper "
+        "limits: effects that the model lacks count as noise unless similar surroundings share them. The "
+        "part that levelling removed from the scans, a few percent of the variance, is not included."
     )
     if found.floor.by_policy:
         page.table(
             found.floor.by_policy,
-            "Noise by the scan terms that are set free (k per scan), from like layout surroundings in "
-            "different scans; 95 % intervals over prints.",
+            "Noise for each set of fitted scan terms (k per scan), from similar layout surroundings in "
+            "different scans, with 95 % confidence intervals over prints.",
             "budget.csv",
         )
     page.table(
         found.flat_levels,
-        f"Where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels); tilt, "
-        "bow, gain and line offsets of each scan are free.",
+        f"Noise where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels). "
+        "Tilt, bow, gain and line offsets are fitted to each scan.",
         "flat_levels.csv",
     )
     if found.flat_texture is not None:

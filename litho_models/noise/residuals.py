@@ -30,7 +30,7 @@ class Residuals(NamedTuple):
     Attributes:
         maps_um: the map that the model expects for each scan, (ny, nx).
         residuals_nm: residuals without the terms of ``protocol``.
-        held_out: whether the model had not seen any of the scans.
+        held_out: whether none of the scans was used to train the model.
     """
 
     model: str
@@ -52,27 +52,29 @@ class Pool(NamedTuple):
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
-        """Return the interval, over prints, of the mean of ``values`` (n,) at the chosen pixels."""
+        """Return the confidence interval, over prints, of the mean of ``values`` (n,) at the chosen
+        pixels.
+        """
         owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
         return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Return the residuals of each scan, measured minus predicted, without the scan's terms, which are fitted
+    """Return the residuals of each scan (measured minus predicted) without the scan's terms, which are fitted
     on other pixels.
 
     The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
     shared background. The mean absolute value of these residuals is therefore the error stated there.
 
     Args:
-        store: the store that the source was made from.
+        store: the store from which the source was made.
         source: frozen model (a folder, ``zoo:NAME``), or result folder of ``litho-models benchmark``, whose
             cache holds predictions of scans that the fit has not seen. Locked scans are left out.
-        model: which model of a benchmark; by default the best one.
+        model: name of a model in the benchmark; by default the best one.
 
     Raises:
-        InputError: a folder that holds neither, a benchmark of another dataset or without its cache, a
-            ``model`` given together with a frozen model, or no predicted scan.
+        InputError: a folder that is neither, a benchmark of another dataset or without its cache, a ``model``
+            given together with a frozen model, or no predicted scan.
     """
     folder = zoo.model_folder(source, other=["the result of a benchmark"])
     if not (folder / CARD_FILE).exists():
@@ -88,7 +90,7 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
         )
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id in maps]
     if not scans:
-        raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
+        raise InputError("residuals", got="none for scans of the store", wanted="predictions of its scans")
     found = [maps[scan.id] for scan in scans]
     residuals = [NM_PER_UM * residual_um(scan, own, protocol) for scan, own in zip(scans, found, strict=True)]
     return Residuals(name, scans, found, residuals, held_out, protocol)

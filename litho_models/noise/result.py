@@ -16,7 +16,7 @@ from litho_models.scoring.statistics import rms
 
 
 class NoiseAnalysis(Result, extra="ignore"):
-    """``noise.json``."""
+    """The content of ``noise.json``."""
 
     SCHEMA = "litho-models/noise/1"
     FILE_NAME = "noise.json"
@@ -35,7 +35,7 @@ class NoiseAnalysis(Result, extra="ignore"):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """Choose the source of the noise floor: repeated prints; without these a flat print; without both, the
+    """Choose the source of the noise floor: repeated prints; without these, a flat print; without either, the
     residuals of a model.
     """
     if repeats is not None:
@@ -43,8 +43,8 @@ def floor_of(
             mae_nm=repeats.mae_nm,
             rmse_nm=repeats.sigma_nm,
             kind="measured",
-            source=f"half the variance between {repeats.scans} repeated prints, offset and bow of a pair "
-            "removed",
+            source=f"half the variance between {repeats.scans} repeated prints, without offset and bow of "
+            "a pair",
         )
     flats = [flat for flat in found.flats if flat.background == "offset"]
     if flats:
@@ -52,7 +52,7 @@ def floor_of(
             mae_nm=float(np.mean([one.mae_nm for one in flats])),
             rmse_nm=rms([one.sigma_nm for one in flats]),
             kind="measured",
-            source=f"flat print ({', '.join(one.id for one in flats)}), offset removed, MAE as measured; one "
-            "level only: edges and other levels may be rougher",
+            source=f"flat print ({', '.join(one.id for one in flats)}), without its offset; it has only one "
+            "level, and edges and other levels may be rougher",
         )
     return budget.floor if budget is not None else UNKNOWN_FLOOR

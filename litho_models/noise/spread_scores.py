@@ -1,5 +1,5 @@
-"""Score a stated spread by closed-form scores for a Gaussian or Student's t, and by two scores that assume no
-distribution.
+"""Score a stated spread with closed-form scores for a Gaussian or Student's t, and with two scores that
+assume no distribution.
 
 The CRPS of a Gaussian follows Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with the
 opposite sign.
@@ -44,8 +44,8 @@ class Tails:
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Return the probability below z (PIT). For residuals divided by their scale it is uniformly
-        distributed if scale and shape are right.
+        """Return the probability below z (PIT). For residuals divided by their scale, this probability is
+        uniformly distributed if scale and shape are right.
         """
         return student.cdf(z, self.freedom)
 
@@ -64,8 +64,8 @@ class Tails:
     def crps(self, residual: Array, scale: Array | float) -> Array:
         """Return the continuous ranked probability score in the unit of the residual.
 
-        The score is the mean absolute error of a prediction that states its own spread; for scale → 0 it is
-        |r|. For Student's t it follows Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        The score generalises the absolute error to a prediction with a stated spread; for scale → 0, it is
+        |r|. For Student's t, it follows Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom
         density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
@@ -81,9 +81,9 @@ GAUSSIAN = Tails()
 def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     """Return ENCE, the mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
-    Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels of one σ
-    stay in one bin, so that a constant σ has one bin. Even for a perfect σ the result is about ``1/√(π n)``
-    by chance, with n independent pixels per bin.
+    Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels with the
+    same σ are in the same bin, so a constant σ has only one bin. Even for a perfect σ, the result is about
+    ``1/√(π n)`` by chance, with n independent pixels per bin.
 
     Args:
         residual, sigma: (pixels,), both in the same unit.
@@ -105,9 +105,10 @@ def sparsification_error(residual: Array, sigma: Array) -> float:
     """Return AUSE, which states how well σ ranks the pixels by error; 0 is perfect.
 
     Pixels are removed in two orders, largest σ first and largest ``|r|`` first. For each order, the mean
-    ``|r|`` of the remaining pixels is a curve over the removed share, 0 to 1. AUSE is the area between the
-    two curves, in units of the mean ``|r|`` of all pixels. Ilg et al. 2018, arXiv:1802.07095. Among pixels
-    with the same σ, each counts with the group's mean, so that their order does not matter.
+    ``|r|`` of the remaining pixels is a function of the removed share, 0 to 1. AUSE is the area between the
+    graphs of the two functions, in units of the mean ``|r|`` of all pixels. Ilg et al. 2018,
+    arXiv:1802.07095. Each pixel in a group with the same σ counts with the mean of the group, so that the
+    order within the group does not matter.
 
     Args:
         residual, sigma: (pixels,), both in the same unit; not all residuals may be zero.

@@ -14,11 +14,11 @@ from litho_models.noise.spread_scores import GAUSSIAN
 from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
-# Two heights can be told apart if at most 2.5 % of each lie beyond the middle between them.
+# Two heights can be told apart if at most 2.5 % of the pixels of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Distance kept from each edge: at least three σ of the printer's blur.
 _GUARD_UM = 0.75
-# Width of the narrowest tread, as a share of the field.
+# Width of the narrowest tread, as a fraction of the field.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
@@ -28,7 +28,7 @@ class Step(Record, extra="ignore"):
 
     Args:
         readability: height divided by the σ of single pixels on its two treads.
-        misread: share of the pixels of both treads that are nearer to the height of the other tread.
+        misread: share of pixels, over both treads, that are nearer to the height of the other tread.
     """
 
     height_nm: float
@@ -111,9 +111,9 @@ def step_print(
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
     """Find the axis of a staircase and the pixels at which a new tread starts, ascending.
 
-    Constant pieces are fitted to the profile of medians with the least squared error plus a price per edge.
-    The price equals the error that an edge saves between two treads of the narrowest width that differ by
-    half a level.
+    A piecewise-constant function is fitted to the profile of medians, minimising the squared error plus a
+    price per edge. The price is the squared error that one edge saves between two treads of the narrowest
+    width whose heights differ by half a level.
 
     Raises:
         InputError: no edge along either axis.

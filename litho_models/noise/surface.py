@@ -25,8 +25,8 @@ class SurfaceNoise(Record, extra="ignore"):
 
     Args:
         background: the removed background: the mean (``offset``) or a polynomial of second degree.
-        sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm`` its standard uncertainty from the
-            number of independent heights in the field.
+        sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm``: its standard uncertainty, from the number
+            of independent heights in the field.
         mae_nm: mean absolute deviation from the median, computed from the pixels without assuming a
             distribution.
         independent_heights: number of pixels divided by the sum of the squared autocorrelation.
@@ -53,7 +53,7 @@ class PrintNoise(Record, extra="ignore"):
 
 
 def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -> SurfaceNoise:
-    """Measure the roughness of one surface about its background.
+    """Measure the roughness of one surface relative to its background.
 
     Args:
         scan_id: name in the result.

@@ -20,10 +20,10 @@ class Period(Record, extra="ignore"):
 
     Args:
         period_um: distance at which lines repeat.
-        share: part of the sum of squares of the lines' means that has this period.
+        share: fraction of the sum of squares of the lines' means that has this period.
         p: chance of a peak this high anywhere in a smooth spectrum.
         amplitude_nm: root mean square of the amplitude over the surfaces.
-        coherence: 1 if the lines have the same phase in all surfaces, in the frame in which these are given.
+        coherence: 1 if the lines have the same phase in all surfaces, in the coordinates of the given arrays.
     """
 
     period_um: float
@@ -38,8 +38,8 @@ class Lines(Record):
 
     Args:
         along: ``x`` (rows) or ``y`` (columns).
-        share: part of the surface's variance that is in the means of the lines. It is not zero for a surface
-            without lines either, so compare the two axes.
+        share: fraction of the surface's variance that is in the means of the lines. It is above zero even for
+            a surface without lines, so compare the two axes.
         period: the strongest period of these means; None with fewer than 64 lines.
     """
 
@@ -53,8 +53,8 @@ class Texture(Record):
 
     Args:
         angle_deg: direction of the lines, 0 along x, positive from x to y.
-        strength: 0 if all directions are alike, 1 for lines of one direction; ``isotropic_p``: the chance of
-            such a strength in an isotropic surface.
+        strength: 0 if all directions are alike, 1 if all lines have one direction; ``isotropic_p``: the
+            chance of such a strength on an isotropic surface.
         lines: along x and along y.
     """
 
@@ -67,7 +67,7 @@ class Texture(Record):
 
     @property
     def verdict(self) -> str:
-        """State whether the texture is directed and periodic, at a significance level of 1 in 1,000."""
+        """State whether the texture is directional and periodic, at a significance level of 1 in 1,000."""
         directed = (
             f"line-shaped, along {self.angle_deg:.0f}° from x" if self.isotropic_p < RARE else "no direction"
         )

@@ -15,7 +15,7 @@ from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Maps on which σ may depend; the slope is also taken squared, and the radius also to the fourth power.
+# Maps on which σ may depend; the square of the slope and the fourth power of the radius are used too.
 PLACES = ("level", "slope", "edge distance", "radius²")
 # The dependence on the level is linear between these knots. Rare levels at both ends are twice as rough as
 # those in the middle.
@@ -28,13 +28,13 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# The shapes that are tried, from tails much heavier than those of prints to a Gaussian.
+# The shapes that are tried, from much heavier tails than those of prints to a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
 # Standard deviation of the optical spot, which blurs edges of the layout.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
-# Limit of a step, which keeps exp() finite during the fit: twice the largest effect seen for noise of 1 to
-# 100 nm.
+# Limit on a step, which keeps exp() finite during the fit. It is twice the largest effect seen for noise of 1
+# to 100 nm.
 _LARGEST_STEP = 2.0
 _STEPS = 60
 
@@ -54,7 +54,7 @@ class VarianceModel(Record):
 
 
 def place_maps(scan: PrintedScan) -> dict[str, Array]:
-    """Return the maps ``PLACES`` for each pixel of a scan, (ny, nx) each."""
+    """Return the values of ``PLACES`` at each pixel of a scan, (ny, nx) each."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
@@ -79,12 +79,12 @@ def covariates_of(places: dict[str, Array]) -> Array:
 
 
 def layout_slope(scan: PrintedScan) -> Array:
-    """Return the slope of the layout behind the optical spot, height over length, (ny, nx)."""
+    """Return the slope (height over length) of the layout blurred by the optical spot, (ny, nx)."""
     return np.hypot(*np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM), scan.pitch_um))
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
-    """Find the scale and the tails that make the residuals most likely: β in ln s² = X β, and the shape."""
+    """Fit the scale (β in ln s² = X β) and the tails of the residuals by maximum likelihood."""
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
         beta = fit_log_scale(covariates, residual, tails)
@@ -100,7 +100,7 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
     The information I of a pixel about ln s² does not depend on s, so one matrix serves all steps.
 
     Args:
-        covariates: X, (pixels, k), with a sum of columns that is constant.
+        covariates: X, (pixels, k); some of its columns must add up to a constant.
         residual: r, (pixels,).
         tails: shape of r/s, which sets the weights w.
 
@@ -112,7 +112,7 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
         raise InputError(
             "residuals for a variance",
             got=f"{square.size} pixels, {np.count_nonzero(square)} not zero",
-            wanted="more pixels than covariates, and some that are not zero",
+            wanted="more pixels than covariates, and some nonzero residuals",
         )
     normal = covariates.T @ covariates
     level = np.full(square.size, np.log(square.mean()))

@@ -17,9 +17,9 @@ from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Questi
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
 
-# Threshold that corresponds to the largest allowed probability of a wrong name.
+# Threshold, in standard deviations, for the largest allowed probability of naming a wrong cause.
 Z_DECIDED = float(norm.isf(CONFIRM_P))
-# If the printer is the cause, this share of a per-scan term's variance differs between prints.
+# If the printer is the cause, this share of a per-scan term's variance is variance between prints.
 PRINT_SHARE = 0.9
 ENOUGH = 0.95
 # Below this power, the rivals count as not separated by any allowed experiment.
@@ -42,12 +42,12 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
 
 
 def of_repeats(prints: int, scans: int) -> float:
-    """Return the power of remounted and rescanned prints to attribute a per-scan term to printer or
-    microscope.
+    """Return the power of an experiment with remounted and rescanned prints, which attributes a per-scan term
+    to the printer or to the microscope.
 
     The test is the F test of an analysis of variance. The printer is the cause if scans of one print agree
-    more than chance allows (p <= 0.005). The microscope is the cause if they agree less than a printer's
-    effect allows (p <= 0.005). The smaller of the two powers is returned.
+    more than chance allows (p <= 0.005). The microscope is the cause if they agree less than an effect of the
+    printer allows (p <= 0.005). The smaller of the two powers is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -61,7 +61,7 @@ def of_repeats(prints: int, scans: int) -> float:
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
     """Return the power to distinguish lines made by the printer from lines made by the microscope.
 
-    The scan is turned, so the two kinds of lines run along different axes.
+    The scan is rotated, so the two kinds of lines run along different axes.
     """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
@@ -119,8 +119,8 @@ def of_rivals(
     random: Sequence[PlannedPrint],
     prints: int,
 ) -> PlannedQuestion:
-    """Plan a question whose rivals are models, with the planned prints and with equally many random
-    layouts.
+    """Plan a question whose rivals are models; compute its power for the planned prints and, as a control,
+    for equally many random layouts.
     """
     question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
@@ -131,23 +131,23 @@ def of_rivals(
         f"difference between the two most similar rivals on one random print, in standard deviations: {ways}"
     ]
     if question.spread:
-        why.append(f"the evidence of a print varies by {100 * question.spread:.0f} %, beyond noise")
+        why.append(f"beyond noise, the evidence varies by {100 * question.spread:.0f} % between prints")
     if question.form_nm is not None:
         why.append(
-            f"the model's own error is {question.form_nm:.1f} nm at most, the two differ by "
+            f"the model's own error is at most {question.form_nm:.1f} nm, and the two rivals differ by "
             f"{hardest.difference_nm:.1f} nm"
         )
     if _status(hardest.power, prints) == _HOPELESS:
-        why.append(f"no experiment of this plan separates them; one outside it might: {question.experiment}")
+        why.append(f"no experiment of this plan separates them, but this one might: {question.experiment}")
     return _planned(
         question,
         hardest.power,
         prints,
         "; ".join(why),
         [
-            *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
-            "two fit equally well: these two stay a set, the others are excluded",
-            "the residuals of all exceed the noise: none of them is the cause",
+            *(f"if {name} fits the scans better than every other rival, it is the cause" for name in names),
+            "if two rivals fit equally well, both remain possible, and the others are excluded",
+            "if the residuals of all rivals exceed the noise, none of them is the cause",
         ],
         rivals=names,
         pairs=pairs,
@@ -159,7 +159,7 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Return the pairs of rivals, each in the direction with less power, averaged over the draws."""
+    """Return the pairs of rivals, each in the direction with the smaller power, averaged over the draws."""
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
     for _ in range(DRAWS):
@@ -192,10 +192,10 @@ def of_others(
             question,
             [of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS],
             prints,
-            "in a turned scan, scan lines and written lines run along different axes of the layout",
+            "in a rotated scan, scan lines and written lines run along different axes of the layout",
             [
-                "offsets follow the layout's rows in turned scans, too: written",
-                "they follow the scan lines: scanned",
+                "if the offsets follow the layout's rows in rotated scans, too, they come from the printer",
+                "if they follow the scan lines, they come from the microscope",
             ],
         )
     if question.kind == "per-scan":
@@ -203,13 +203,13 @@ def of_others(
             question,
             [of_repeats(n, scans) for n in _COUNTS],
             prints,
-            "every print is taken out and scanned again, so the printer's part of the term repeats",
+            "every print is remounted and scanned again, so the printer's part of the term repeats",
             [
-                "scans of one print agree: the printer's, different in every print",
-                "they agree no better than scans of different prints: the microscope's",
+                "if scans of one print agree, the term comes from the printer, and differs between prints",
+                "if they agree no better than scans of different prints, it comes from the microscope",
             ],
         )
-    told = [f"once the fact is in the card, {question.name} is tested"]
+    told = [f"when the card states the missing fact, the loop can test {question.name}"]
     return _planned(question, [0.0 for _ in _COUNTS], prints, question.experiment, told)
 
 

@@ -4,8 +4,8 @@ Every rival is fitted to all prints, old and new, and judged only on the new pri
 squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
 standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
 one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
-better, with p <= 0.005 and by at least 1 % of the squared error of the better one. The answer is given if
-only one rival remains.
+better, with p <= 0.005 and by at least 1 % of the squared error of the better one. If only one rival remains,
+it is the answer.
 """
 
 from __future__ import annotations
@@ -104,15 +104,15 @@ class Judge:
         ratio = float(np.median(f_oneway(*repeated).statistic))
         law = f_distribution(count - 1, total - count)
         expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
-        told = f"F({count - 1}, {total - count}) = {ratio:.2f} of prints against repeats"
+        told = f"between prints, relative to repeats: F({count - 1}, {total - count}) = {ratio:.2f}"
         left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
-        """Compare line offsets of turned scans along the layout's rows and along the scan lines."""
+        """Compare the offsets along the layout's rows with those along the scan lines, in rotated scans."""
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
-            return _decision(question, self.new, BOTH, "no scan is turned", UNSEEN)
+            return _decision(question, self.new, BOTH, "no scan is rotated", UNSEEN)
         rows, lines = [], 0
         for scan in turned:
             used, index = scan.usable, row_index(scan.usable.shape)
@@ -123,14 +123,14 @@ class Judge:
         written, scanned, own = 1e6 * np.mean(rows, axis=0)
         z = (written - scanned) / ((written + scanned + own) * np.sqrt(2 / lines))
         told = (
-            f"offsets vary by {written:.1f} nm² along the layout's rows and by {scanned:.1f} nm² along the "
-            f"lines of the turned scans (z = {z:.1f})"
+            f"in the rotated scans, the variance of line offsets is {written:.1f} nm² along the layout's "
+            f"rows and {scanned:.1f} nm² along the scan lines (z = {z:.1f})"
         )
         return _decision(question, turned, _left(z >= Z_DECIDED, z <= -Z_DECIDED), told)
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """Enter the decisions into the result. An effect that remains alone is explained, with its owner."""
+    """Enter the decisions into the result. An effect that alone remains is explained, and gets its owner."""
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
         rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
@@ -160,15 +160,15 @@ def compared(
     excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
     left = [name for name in left_nm if name not in {*excluded, NONE}]
     told = [
-        f"{one.better} better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})"
+        f"{one.better} fits better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})"
         for one in comparisons
         if one.better in left and one.worse != NONE
-    ] or ["no rival is better than another"]
+    ] or ["no rival fits better than another"]
     if len(left) > 1 and question.form_nm is not None:
         nearest_nm = min(one.difference_nm for one in comparisons if {one.better, one.worse} <= {*left})
         told.append(
-            f"the model's own error is {question.form_nm:.1f} nm at most, the nearest two that are left "
-            f"differ by {nearest_nm:.1f} nm"
+            f"the model's own error is at most {question.form_nm:.1f} nm, and the two most similar "
+            f"remaining rivals differ by {nearest_nm:.1f} nm"
         )
     nothing = not left or (NONE not in excluded and len(left) == 1)
     decision = _decision(question, new, left, "; ".join(told), NONE if nothing else None)
@@ -224,7 +224,7 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """Return the decision on a question. By default, the question is decided if one answer remains."""
+    """Return the decision on a question. By default, the question is decided if only one answer remains."""
     return Decision(
         question=question.name,
         kind=question.kind,

@@ -17,29 +17,29 @@ from litho_models.planning.rivalry import Place, Rivalry, Way
 
 TURNED = Way(turned_deg=90)
 WORDS = {
-    TURNED: "turned by 90°",
+    TURNED: "rotated by 90°",
     Way(direction=-1): "in the other direction",
     Way(tip=2): "with a new, sharp tip",
     Way(pixel_size=0.5): "with half the pixel size and the same time per pixel",
 }
 _MOST_EXTRAS = 2
-# A further scan is planned if it increases the separation of the rivals at least by this factor.
+# A further scan is planned if it increases the separation of the rivals by at least this factor.
 _WORTH = 1.3
 # A lower dose keeps every exposure in the range that the models know, unlike a higher dose.
 SECOND_DOSE = 0.8
 # Below this separation, in standard deviations, a layout does not show the difference.
 _NOTHING = 0.3
-# Registration refuses layouts whose repeats exceed 0.9; the limit here is lower because prints are less
-# clear.
+# Registration refuses layouts whose self-similarity exceeds 0.9. The limit here is lower, because prints are
+# less clear than layouts.
 _MOST_REPEATING = 0.7
 
 
 class Chosen(NamedTuple):
     """How prints are made and scanned for one question or for all questions.
 
-    ``ways`` are the scans of each print. Successive prints take the ``places`` (in the write field) and
-    ``doses`` in turn. ``tried`` is the separation, in standard deviations, with one plain scan and with each
-    other way added.
+    ``ways`` are the scans of each print. Successive prints use the ``places`` (in the write field) and
+    ``doses`` in turn. ``tried`` is the separation, in standard deviations, with one plain scan, and with each
+    other way in addition.
     """
 
     ways: tuple[Way, ...]
@@ -60,7 +60,7 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
-        # The report gets the separation with only one plain scan and this way, so earlier values are kept.
+        # The report shows the separation with one plain scan and this way only, so earlier values are kept.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
@@ -71,7 +71,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
         tried["at the edge of the write field"] = at_edge = score(rivalry, level, ways, "edge")
         places = ("edge", "centre") if _worth(at_edge, reached) else places
     one, two = (score(rivalry, level, ways, places[0], (1.0, dose)) for dose in (1.0, SECOND_DOSE))
-    tried |= {"two prints so scanned": one, f"the second of them at {SECOND_DOSE:g} of the dose": two}
+    both = "two prints with these scans"
+    tried |= {both: one, f"{both}, the second at {SECOND_DOSE:g} of the dose": two}
     return Chosen(ways, places, (1.0, SECOND_DOSE) if _worth(two, one) else (1.0,), tried)
 
 
@@ -114,7 +115,8 @@ def climbed(
         file = kept / f"{number}.npy"
         if not file.is_file():
             rivalry = rivalries[which]
-            report(f"tile {number + 1} of {count}: from {name}, for {rivalry.question.name}")
+            asked = rivalry.question.name
+            report(f"optimising tile {number + 1} of {count} for {asked}, starting from {name}")
             tile = climb(rivalry, start, chosen.ways, limits, place=chosen.places[0], steps=steps)
             with atomic_file(file) as temporary:
                 np.save(temporary, tile)
@@ -126,7 +128,7 @@ def climbed(
 def _repeats(level: np.ndarray) -> float:
     """Return how closely a layout repeats itself, as registration measures it.
 
-    At 1, the layout fits equally well at another shift.
+    At a value of 1, the layout fits equally well at another shift.
     """
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

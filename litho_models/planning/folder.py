@@ -48,7 +48,7 @@ _USES = {
     "flat": "one level everywhere: the noise floor",
     "steps": "a stair: height against level",
 }
-# Periods of commercial gratings, µm, and the smallest number of periods in a field that shows the period.
+# Periods of commercial gratings, µm, and the smallest number of periods that a field must contain.
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 
 
@@ -79,7 +79,7 @@ def schedule(
         level = one.level.numpy().astype(np.min_scalar_type(limits.highest))
         weaker = f"; the print has {one.dose:g} of the dose" if one.dose != 1 else ""
         for at, way in enumerate(one.ways, start=1):
-            why = WORDS.get(way, "as the prints so far") + weaker
+            why = WORDS.get(way, "like the earlier prints") + weaker
             rows.append(("dataset", number, at, level, one, way, why))
     scans = [
         PlannedScan(

@@ -24,9 +24,9 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# The models do not know levels that are rarer than this share in earlier prints.
+# Levels that cover less than this share of earlier prints are unknown to the models.
 _RARE = 1e-3
-# Summed distance of the mean and the spread of the levels from those of earlier prints that costs nothing.
+# The levels' mean and spread may differ from those of earlier prints by this sum without a penalty.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 
@@ -148,7 +148,7 @@ def climb(
         # The separation is exact only if the rivals have been refitted to this layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
-        # This is a soft minimum over pairs; with a hard minimum the ascent would alternate between two pairs.
+        # This is a soft minimum over pairs. With a hard minimum, the ascent would alternate between pairs.
         climber.zero_grad()
         (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()

@@ -2,7 +2,7 @@
 
 Effects that look the same become rivals: each of them in turn is added to the corrected model, which is
 refitted to all scans. If it is unknown whether printer or microscope causes an effect, the effect becomes two
-rivals: one turns with the print, the other with the scan.
+rivals: one rotates with the print, the other with the scan.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """Return the question of which effect of a set, or which owner, is right; None if nothing is open."""
+        """Return the question which effect of a set, or which owner, is right; None if nothing is open."""
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
@@ -107,7 +107,7 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Return the question of which significant but unconfirmed effect, if any, explains the residual."""
+        """Return the question which significant but unconfirmed effect explains the residual, if any does."""
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
@@ -121,8 +121,8 @@ class _Asking:
             return None
         twins = [_with(self.twin, one) for one in standing]
         rivals = self._rivals(names, twins)
-        # The loop estimated the error of the model's form without these effects. The estimate also applies
-        # with them.
+        # The loop estimated the error of the model's form without these effects. Here it is estimated with
+        # each of them.
         learner = Learner(self.study, self.maps)
         fitted = [rival.twin(self.twin.alone()) for rival in rivals]
         rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
@@ -180,7 +180,7 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible owners of an effect: the owner in the catalogue, or printer and microscope.
+    """Return the possible owners of an effect: printer and microscope, or None for that of the catalogue.
 
     Both are possible if scans of one orientation cannot distinguish them.
 
@@ -207,13 +207,13 @@ def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) ->
     """Return a question about effects, with its text."""
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":
-        text = "offsets of lines: written or scanned"
+        text = "whether line offsets come from the printer or the microscope"
     elif kind == "fact":
         text = f"{first}: {text}"
     elif others:
-        text = f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
+        text = f"which effect is present: {', '.join([first, *others[:-1]])} or {others[-1]}"
     else:
-        text = f"{first}: the printer's or the microscope's"
+        text = f"{first}: caused by the printer or by the microscope"
     name = " or ".join(names) if kind == "suspects" else names[0]
     return Question(name=name, kind=kind, text=text, experiment=separating(names), **known)
 

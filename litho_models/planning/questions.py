@@ -112,7 +112,7 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """Return the model of this answer; its effect turns with the print or with the scan.
+        """Return the model of this answer; its effect rotates with the print or with the scan.
 
         ``bare`` is the base without effects.
         """
@@ -128,8 +128,8 @@ class Question(Record):
 
     Attributes:
         spread: how much the evidence for the effect varies between prints beyond noise, relative to its mean.
-        form_nm: upper bound of the rms error of the model's form, from what could still be learned beside the
-            best answer; None if unknown.
+        form_nm: upper bound on the rms error of the model's form, from what could still be learned in
+            addition to the best answer; None if unknown.
         sizes: sizes of per-scan terms, by name and unit.
     """
 
@@ -146,8 +146,8 @@ class Question(Record):
 class OpenQuestions(Result):
     """``open_questions.json``: the open questions, and the noise against which they are decided.
 
-    ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` their finest
-    structure, cycles/µm.
+    ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` is the frequency of
+    their finest structure, cycles/µm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
@@ -162,7 +162,7 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each twin from its current values and from the base values of the best twin."""
+    """Fit each twin from its own values and from the base values of the best twin; keep the better fit."""
 
     def fitted(twin: Twin) -> LeastSquaresFit:
         return fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)

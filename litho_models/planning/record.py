@@ -15,8 +15,8 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One planned scan; ``field_x_um`` and ``field_y_um`` are its position in the write field, ``dose`` is
-    the dose of its print.
+    """One planned scan. ``field_x_um`` and ``field_y_um`` are its position in the write field, and ``dose``
+    is the dose of its print.
     """
 
     id: str
@@ -50,7 +50,7 @@ class PlannedQuestion(Record):
     ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is this
     probability for random layouts with the same scans, and ``random_difference_nm`` is the smallest
     difference of any pair on them. ``prints_needed`` is the number of prints for a power of 0.95.
-    ``form_nm`` is an upper bound of the error of the model's form, or None if unknown.
+    ``form_nm`` is an upper bound on the error of the model's form, or None if unknown.
     """
 
     name: str

@@ -49,7 +49,7 @@ def write_report(
     first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
         layouts_figure(first, plan.levels),
-        "Levels of the first prints; each has the same tiles in a different order.",
+        "Levels of the first prints. Every print has the same tiles in a different order.",
     )
     rows = [
         {
@@ -72,7 +72,7 @@ def write_report(
                 "first rival, nm.",
             )
     page.heading("Scans", folded=True)
-    page.table(plan.scans, "In the order of scanning.", "order.csv")
+    page.table(plan.scans, "All scans, in the order in which to make them.", "order.csv")
     return page.write(folder)
 
 
@@ -82,7 +82,7 @@ def _verdict(plan: NextPrint) -> str:
     decided = "; ".join(q.text for q in asked if q.status == "decides")
     if not asked:
         return f"No print is needed: add the missing fact to the card to settle {facts}."
-    wanting = f" To settle {facts}, add the missing fact to the card; no print can." if facts else ""
+    wanting = f" No print settles {facts}: add the missing fact to the card." if facts else ""
     return (
         f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
         f"Questions asked: {len(asked)}.{wanting}"

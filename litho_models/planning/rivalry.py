@@ -39,9 +39,9 @@ _SMALLEST = 1e-12
 class Way:
     """How one scan is made; the fields are columns of the plan's table.
 
-    ``turned_deg`` is the angle of the print under the microscope, ``direction`` -1 for the retrace, ``tip`` 2
-    for a second, sharp tip, and ``pixel_size`` the size of a pixel relative to earlier scans, with the
-    same time per pixel.
+    ``turned_deg`` is the angle of the print under the microscope. ``direction`` is -1 for the retrace, and
+    ``tip`` is 2 for a second, sharp tip. ``pixel_size`` is the size of a pixel relative to earlier scans,
+    with the same time per pixel.
     """
 
     turned_deg: int = 0
@@ -54,7 +54,7 @@ class Way:
 class PlannedPrint:
     """One printed field and its scans.
 
-    ``level`` has shape (y, x), whole or soft levels; ``place`` is the position in the write field, ``order``
+    ``level`` contains whole or soft levels (y, x). ``place`` is the position in the write field, ``order``
     runs from -0.5 (first) to 0.5 (last), and ``dose`` is relative to earlier prints.
     """
 
@@ -110,9 +110,9 @@ class Printing:
 class Contrast:
     """A directed pair of rivals on some prints; each quantity has shape (prints,).
 
-    ``squares_um2`` is the squared distance over all pixels and scans, ``sd_um2`` the standard deviation
-    that noise causes in the difference of the two squared errors, and ``pixels`` the number of pixels of all
-    scans.
+    ``squares_um2`` is the squared distance, summed over all pixels and scans. ``sd_um2`` is the standard
+    deviation that noise causes in the difference of the two squared errors. ``pixels`` is the number of
+    pixels of all scans.
     """
 
     squares_um2: Tensor
@@ -227,7 +227,7 @@ class Rivalry:
             for _ in printed.ways:
                 right, refitted = next(scans)
                 # The scan terms are those of the refitted model. With the gain term of the true model, the
-                # refit could shrink to zero.
+                # refitted prediction could shrink to zero.
                 basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
                 inner = _inner(right - refitted)
                 flat = inner.reshape(-1)

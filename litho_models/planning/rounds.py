@@ -33,7 +33,7 @@ def close_loop(
 
     Raises:
         InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
-            is turned but its card does not say so.
+            is rotated but its card does not say so.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
@@ -59,25 +59,25 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             raise InputError(
                 f"{name} of {store.path}",
                 got=getattr(store, name),
-                wanted=f"{getattr(first, name)}, as before",
+                wanted=f"{getattr(first, name)}, as in {first.path}",
             )
     planned = store.manifest.get("card", {}).get("plan", {}).get("dataset_sha256")
     if planned is not None and planned != first.sha256:
         raise InputError(
-            f"prints of {store.path}",
-            got=f"a plan for dataset {planned[:12]}…",
-            wanted=f"a plan for {first.path}, {first.sha256[:12]}…",
-            hint="these prints were planned for the questions on another printer",
+            f"store {store.path}",
+            got=f"prints planned for dataset {planned[:12]}…",
+            wanted=f"prints planned for {first.path}, {first.sha256[:12]}…",
+            hint="as the first store, give the one for which these prints were planned",
         )
     scans = store.scans()
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
-        # The sign of a turn is a convention, but registration shows whether a print was turned.
+        # The sign of a rotation is a convention, but registration shows whether a print was rotated.
         if (stated - scan.quarter_turns) % 2:
             raise InputError(
                 f"scan {scan.id} of {store.path}",
-                got=f"turned by {90 * scan.quarter_turns}° on its layout, {90 * stated}° in its card",
-                wanted="the turn that the scan shows",
-                hint="add the column turned_deg to the table of the card, and build again",
+                got=f"rotated by {90 * scan.quarter_turns}° on its layout, but {90 * stated}° in its card",
+                wanted="the rotation of the scan in the card",
+                hint="enter it in the column turned_deg of the card's table, and build the store again",
             )
     return scans

@@ -63,7 +63,7 @@ def next_print(
         raise InputError(
             f"no {OpenQuestions.FILE_NAME} in {loop}",
             wanted="the folder of a closed loop",
-            hint="litho-models close-loop writes it",
+            hint="litho-models close-loop writes this file",
         )
     open_ = OpenQuestions.read(folder)
     if not open_.questions:
@@ -74,9 +74,9 @@ def next_print(
     size_px = round(field_um / card.pitch_um)
     if size_px < _SMALLEST_PX or prints < 1:
         raise InputError(
-            "size of the prints",
+            "planned prints",
             got=f"{prints} of {field_um:g} µm",
-            wanted=f"at least one of {_SMALLEST_PX * card.pitch_um:g} µm",
+            wanted=f"at least one, of at least {_SMALLEST_PX * card.pitch_um:g} µm",
         )
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
         base = load_simulator(folder / MODEL_FOLDER, card)
@@ -86,7 +86,7 @@ def next_print(
         tile_px = min(TILE_PX, size_px)
         can_move = open_.write_field_um is not None and open_.write_field_um > field_um
         choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
-        # A scan turned by 90 degrees is also a repeat, because the print was remounted.
+        # A scan rotated by 90 degrees is also a repeat, because the print was remounted.
         turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
         chosen = together(choices, turned)
         count = _TILES if size_px > tile_px else prints

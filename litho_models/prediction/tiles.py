@@ -1,5 +1,5 @@
-"""Predict whole fields of any size in tiles. For models with a receptive radius the result is exact; for
-others it is blended from overlapping tiles.
+"""Predict whole fields of any size in tiles. For models with a receptive radius, the result is exact; for
+others, it is blended from overlapping tiles.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,8 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
     """Predict the height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
 
     A field larger than ``tile_px`` is computed in tiles, each with a margin of the receptive radius. The
-    heights equal those of the whole field computed at once. A model without a receptive radius predicts the
-    field by its own ``forward``.
+    heights equal those of the whole field computed at once. For a model without a receptive radius, the field
+    is predicted by its ``forward``.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -35,7 +35,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
     """Predict the height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x -
     2r), µm.
 
-    Gradients flow to the layout. Tiles of at most ``tile_px`` do not change the result.
+    Gradients flow to the layout. The field is computed in tiles of at most ``tile_px``, which does not change
+    the result.
 
     Raises:
         InputError: a model without a receptive radius, or a layout that has no interior.
@@ -63,8 +64,8 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     """Predict the height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the
     layout.
 
-    The border must be less than half the layout. The result equals that of ``predict_field`` without its
-    border. If the model allows it, only the pixels that the result needs are computed: see
+    The border must be less than half the layout. The result is that of ``predict_field`` with the border
+    cropped. If the model allows it, only the pixels that the result needs are computed: see
     ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
@@ -87,8 +88,8 @@ def blend_tiles(
         function: maps tiles (b, 1, T, T) to their heights.
         layout_um: (b, 1, y, x), any size, µm.
         tile: side T and overlap.
-        border_px: outermost pixels that are left out of the result, less than half the field; tiles that
-            lie wholly in them are not computed.
+        border_px: width of the border that is cropped from the result, less than half the field; tiles that
+            lie wholly in the border are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.

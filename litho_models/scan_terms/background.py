@@ -63,8 +63,8 @@ def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
     """Learn the smooth background that scans share in addition to a model's predicted heights.
 
-    All terms of policy ``full``, with offset and gain, are fitted to the valid pixels of each scan. The
-    background is the mean over scans of the five smooth terms.
+    All terms of policy ``full``, including offset and gain, are fitted to the valid pixels of each scan. The
+    background is the mean of the five smooth terms over the scans.
 
     Args:
         scans: training scans of one size; ``predictions_um``: the model's heights (ny, nx).

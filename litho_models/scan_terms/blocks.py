@@ -2,8 +2,8 @@
 
 Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
 to one half of a checkerboard and subtracted from the other half. The offset of a line is estimated from few
-pixels, whose roughness correlates with that of their neighbours (still by 0.2 at 32 px along x). Line offsets
-are therefore fitted on the other side of the scan, beyond a gap.
+pixels, and their roughness correlates with that of their neighbours (along x, the correlation is still 0.2 at
+32 px). Line offsets are therefore fitted on the other side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Blocks(NamedTuple):
 
     Attributes:
         block_px: side of a block of the checkerboard.
-        buffer_px: fitted pixels are farther than this from every scored pixel; about one correlation length
-            of the measured prints' residuals (0.5 at 5 px).
-        line_gap_px: distance of fitted from scored pixels along the line, for line offsets.
+        buffer_px: fitted pixels are farther than this from every scored pixel. It is about one correlation
+            length of the measured prints' residuals, whose correlation at 5 px is 0.5.
+        line_gap_px: for line offsets, distance between fitted and scored pixels along the line.
         seed: moves the origin of the checkerboard.
     """
 
@@ -79,7 +79,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
     Args:
         shape: (ny, nx).
         axes: axes along which lines run; 1: along x.
-        gap_px: least distance along a line from a scored pixel to the pixels that give its offset.
+        gap_px: smallest distance along a line from a scored pixel to the pixels that determine its offset.
     """
     axes, cells = sorted(set(axes)), []
     for sides in product((False, True), repeat=len(axes)):

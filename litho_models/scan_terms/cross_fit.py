@@ -1,7 +1,7 @@
-"""Remove a scan's terms, which are fitted to pixels that are not scored.
+"""Remove the terms of a scan, after fitting them to pixels that are not scored.
 
 The datum or bow of a microscope contains no information about the printer, so errors may be stated without
-these terms. In this project ``cross_fit`` computes every error without such terms.
+these terms. In this project, ``cross_fit`` computes all errors that are stated in this way.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Return the residual of one scan without its terms, which are fitted to pixels that are not scored.
+    """Return the residual of a scan without its terms, which are fitted to pixels that are not scored.
 
     Args:
         height_um: measured height (ny, nx), µm; NaN allowed where not valid.
@@ -74,7 +74,7 @@ def cross_fit(
     usable = np.asarray(valid, bool) & np.isfinite(height)
     bad = int(np.sum(~np.isfinite(prediction[usable])))
     if bad:
-        raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="none")
+        raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="finite heights")
     difference = np.where(usable, height - prediction, 0.0)
     residual = np.full(height.shape, np.nan)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)

@@ -34,7 +34,7 @@ def label_of(scan: PrintedScan, by: str) -> str:
     if by in _STATED:
         stated = getattr(scan, by)
         return "" if stated is None else f"{stated:g}"
-    # Names of groups in the card contain no blanks.
+    # Names of groups in the card contain no spaces.
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
         last, first = map(int, value.split("-"))
@@ -48,10 +48,10 @@ def label_of(scan: PrintedScan, by: str) -> str:
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
     """Return the label of each scan in every grouping, with ``all`` first.
 
-    Groups come from the card (print, field, tip, direction and turn of a scan) and from each varying
-    character of the ids. With ``by_order`` they also come from the order: before and after every possible
-    time of a change. A grouping needs at least two labels, and at least half of the labels must have two or
-    more scans. If two groupings are identical, only the first is used.
+    Groups come from the card (print, field, tip, direction and rotation of a scan) and from each varying
+    character of the ids. With ``by_order``, they also come from the order: the scans before and after each
+    position at which something may have changed. A grouping needs at least two labels, and at least half of
+    the labels must have two or more scans. If two groupings are identical, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -173,7 +173,7 @@ class Products:
         """Project these blocks, fitted to all scans, out of the residual and the other columns.
 
         The columns of the blocks become zero. A later fit of common strengths then gives the same result as a
-        joint fit. For strengths by group this holds only if the projected part is the same in all groups.
+        joint fit. For strengths by group, this holds only if the projected part is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)

@@ -38,7 +38,7 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """Return the axis of the lines: 1 for lines along x, 0 for a scan turned by 90 degrees."""
+    """Return the axis of the lines: 1 for lines along x, 0 for a scan rotated by 90 degrees."""
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
 

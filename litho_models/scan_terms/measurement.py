@@ -1,6 +1,6 @@
 """The measurement model: changes by microscope, registration and levelling that scans share.
 
-A scan shows the print after levelling: displaced by an uneven scanner, multiplied by a gain, and added to a
+In a scan, the print is displaced by an uneven scanner, multiplied by a gain, levelled, and added to a
 background. The parts that all scans, or all scans of a group, share are learned from training scans and
 applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model is not part
 of the printer and is not used in a design.
@@ -28,8 +28,8 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that may have been fitted to whole files and subtracted, as the numbers of their terms among x, y,
-# x², xy, y², counted from 1.
+# Surfaces that may have been fitted to whole files and subtracted. Each is given by the positions of its
+# terms in the list x, y, x², xy, y², counted from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -44,8 +44,8 @@ class SharedPart(Record):
     Attributes:
         what: ``background`` and displacements are sums of Legendre polynomials of x and y, -1 to 1 over the
             field, up to the total ``degree``; the gain is one relative number.
-        by: grouping; ``coefficients``: by label, in µm, or relative for the gain. A part without coefficients
-            adds nothing.
+        by: grouping; ``coefficients``: by label, in µm; those of the gain are relative. A part without
+            coefficients adds nothing.
         shrinking: weight, in scans, of the prior for zero in the fit.
     """
 
@@ -57,7 +57,7 @@ class SharedPart(Record):
 
     @property
     def numbers(self) -> int:
-        """Return the fitted numbers."""
+        """Return the number of fitted coefficients."""
         return sum(len(own) for own in self.coefficients.values())
 
     def of(self, scan: PrintedScan) -> list[float]:
@@ -71,7 +71,7 @@ class SharedPart(Record):
 
 
 class MeasurementModel(Record):
-    """The changes that scans share, beyond their prints.
+    """The changes by the measurement that scans share.
 
     Attributes:
         levelling: surface that was fitted to whole files and subtracted; predictions are treated in the same
@@ -89,7 +89,7 @@ class MeasurementModel(Record):
 
     @property
     def numbers(self) -> int:
-        """Return the fitted numbers."""
+        """Return the number of fitted coefficients."""
         return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
@@ -99,7 +99,7 @@ class MeasurementModel(Record):
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
         """Return the map (ny, nx), µm, that the scan is expected to show for a predicted print (ny, nx), µm.
 
-        For a field of another size only the levelling is applied.
+        For a field of another size, only the levelling is applied.
         """
         parts = self._parts(scan)
         seen = displaced(scan, prediction_um, parts)

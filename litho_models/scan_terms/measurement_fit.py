@@ -54,7 +54,7 @@ _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# A part to try, with its degree and grouping. A scan with its predicted print (ny, nx), µm.
+# An offer is a part to try, with its degree and grouping. A pair is a scan with its predicted print (ny, nx).
 _Offer = tuple[Shared, int, Block]
 _Pair = tuple[PrintedScan, np.ndarray]
 
@@ -66,10 +66,10 @@ def learn_measurement(
     seed: int = 0,
     like: MeasurementModel | None = None,
 ) -> MeasurementModel:
-    """Choose and fit the parts that these scans share, beyond the predicted prints (ny, nx), µm.
+    """Choose and fit the parts that these scans share, in addition to the predicted prints (ny, nx), µm.
 
     Parts are added one at a time while they significantly lower the cross-validated error. If fields differ
-    in size, only those of the most frequent size are used. For micrographs of films the model stays empty.
+    in size, only those of the most frequent size are used. For micrographs of films, the model is empty.
 
     Args:
         like: a model whose levelling and parts are reused, with newly fitted strengths.
@@ -189,7 +189,7 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
-    """Choose the levelling that brings predictions closest to the scans, after a shared bow and tilt are
+    """Choose the levelling with which the predictions fit the scans best, after a shared bow and tilt are
     removed.
     """
     rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}

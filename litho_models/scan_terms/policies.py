@@ -40,7 +40,7 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """Return the default policy, which for films has no free zero height."""
+    """Return the default policy. For films, no zero height is fitted."""
     return "none" if film else "offset"
 
 
@@ -55,8 +55,8 @@ class NuisanceProtocol(Record):
     ``k`` is the number of smooth terms per scan. ``k`` excludes the effective number of line offsets of
     ``full+rows``, which depends on the prediction (``PolicyError.k``). ``background`` is ``training`` if
     predictions include the smooth background of the training scans, and ``shared`` if they include the whole
-    measurement model. No part of it is fitted to the scored scan. ``border_px``, the number of pixels left
-    out at the edge of a scan, is zero.
+    measurement model. No part of the background is fitted to the scored scan. ``border_px``, the number of
+    pixels left out at the edge of a scan, is zero.
     """
 
     policy: Policy = "offset"
@@ -82,7 +82,7 @@ class NuisanceProtocol(Record):
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# The mean of these terms over the scans is part of the process and not of single scans.
+# The mean of these terms over the scans belongs to the process, not to single scans.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 

@@ -106,7 +106,7 @@ def parameter_names(terms: Iterable[str]) -> list[str]:
 
 
 def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """Return the terms of these names, in the order of the catalogue.
+    """Return the terms with these names, in the order of the catalogue.
 
     Raises:
         InputError: a name that is not in the catalogue.
@@ -136,7 +136,8 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
     if term.name in SCAN_TERMS:
         raise InputError("scan term", got=f"{term.name}, which exists", wanted="a new name")
     if (term.maps is None) == (term.lines is None):
-        raise InputError(f"scan term {term.name}", got="both maps and lines", wanted="either maps or lines")
+        got, wanted = "both or neither of maps and lines", "exactly one of the two"
+        raise InputError(f"scan term {term.name}", got=got, wanted=wanted)
     SCAN_TERMS[term.name] = term
     return term
 
@@ -170,8 +171,8 @@ def _warp(pixels: TermPixels) -> FloatMap:
 
 
 def _distortion(pixels: TermPixels) -> FloatMap:
-    """Return the changes that a quadratic error of the registration causes, centred so that a common
-    distortion causes no shift.
+    """Return the changes that a quadratic error of the registration causes. They are centred, so that a
+    common distortion causes no shift.
     """
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])

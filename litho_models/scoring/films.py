@@ -13,15 +13,15 @@ from litho_data.store import PrintedScan
 
 _LEAST_PX = 4
 FILMS_TEXT = (
-    "The area error is the difference of the predicted and the measured area of the film, without sign. "
-    "Features are connected parts of film or ground of at least four pixels. Measured features without any "
-    "pixel in the prediction are missing; predicted features without any pixel in the measurement are extra. "
-    "Merged counts films that only the prediction or only the measurement joins."
+    "The area error is the absolute difference between the predicted and the measured area of the film. "
+    "Features are connected parts of film or ground of at least four pixels. Measured features that share no "
+    "pixel with the prediction are missing; predicted features that share none with the measurement are "
+    "extra. Merged counts films that are joined only in the prediction or only in the measurement."
 )
 
 
 class FilmErrors(NamedTuple):
-    """``area_error_percent`` is relative to the measured area, or None without any; the other fields are
+    """``area_error_percent`` is relative to the measured area, or None if that is zero; the other fields are
     counts of features.
     """
 
@@ -62,7 +62,9 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """For each large enough part of either film, count the parts of the other film that it touches."""
+    """For each part of either film that is large enough, count the parts of the other film that it
+    touches.
+    """
     from scipy.ndimage import label
 
     labels = [label(one)[0] for one in (first, second)]

@@ -1,4 +1,4 @@
-"""The gamma test: compare residuals at pixels with similar surroundings.
+"""Apply the gamma test: compare residuals at pixels with similar surroundings.
 
 Residuals that are the same in similar surroundings can still be learned by a model of the layout; differences
 between such residuals are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
@@ -59,8 +59,8 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
     Only prints of one dose are compared, because the dose changes the height even for equal layouts.
 
     Args:
-        scans: at least three of one dose, with layouts that vary; otherwise the result is None.
-        scored: bool (ny, nx), which pixels count.
+        scans: scans with layouts that vary, at least three of them of one dose; otherwise the result is None.
+        scored: for each scan, bool (ny, nx), True for pixels that count.
         seed: decides which pixels are drawn.
     """
     from scipy.spatial import cKDTree
@@ -105,7 +105,7 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
-    """Blur the layout of a scan by a Gaussian, (ny, nx) float64; its outermost pixels are continued."""
+    """Blur the layout of a scan by a Gaussian, (ny, nx) float64; its outermost pixels are repeated."""
     from scipy.ndimage import gaussian_filter
 
     return gaussian_filter(scan.layout_um.astype(np.float64), sigma_um / scan.pitch_um, mode="nearest")

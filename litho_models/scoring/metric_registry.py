@@ -1,4 +1,4 @@
-"""Further metrics of a scan, each with a name, a unit and a meaning; every report shows them.
+"""Define further metrics of a scan, each with a name, a unit and an explanation. Every report shows them.
 
 A metric function receives one scan, the model's prediction, and the residual without the per-scan terms.
 Built-in metrics are fields of the results; registered ones are listed under ``metrics``.
@@ -95,8 +95,8 @@ def register_metric(
             sum.
 
     Raises:
-        InputError: a name or unit that is no identifier, a name that is taken, or an unknown value of
-            ``over_scans``.
+        InputError: a name or unit that is not an identifier, a name that is already taken, or an unknown
+            value of ``over_scans``.
     """
     metric = Metric(name, unit, over_scans)
     if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):
@@ -115,7 +115,7 @@ def registered_metrics() -> list[Metric]:
 
 
 def metrics_text(keys: Collection[str]) -> str:
-    """Explain the metrics of these keys in sentences."""
+    """Return sentences that explain the metrics with these keys."""
     return " ".join(
         one.explanation for one in _MEASUREMENTS if any(metric.key in keys for metric in one.metrics)
     )
@@ -125,7 +125,7 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
     """Compute all metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
 
     Raises:
-        InputError: a metric that returns no number.
+        InputError: a metric that returns neither a number nor None.
     """
     values: dict[str, float | None] = {}
     for measurement in _MEASUREMENTS:

@@ -61,7 +61,7 @@ def print_gain(
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
     """Score one prediction against one scan, (ny, nx) µm each, on the pixels that ``cross_fit`` scores.
 
-    Slope and intercept, the gain and offset of the print, are those of ``print_gain``.
+    ``print_gain`` computes slope and intercept, the gain and offset of the print.
 
     Raises:
         InputError: no valid pixel.
@@ -93,14 +93,16 @@ def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtoco
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the mean over scans of the datum-free error of a model's heights (ny, nx), policy ``offset``."""
+    """Return the mean over scans of the datum-free error of a model's heights (ny, nx), under policy
+    ``offset``.
+    """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))
     return NM_PER_UM * float(np.mean([np.nanmean(np.abs(residual)) for residual in residuals]))
 
 
 def phase_waves(height_error_um: float) -> float:
-    """Return the phase error, in waves, of light that passes an element whose height is wrong by
+    """Return the phase error, in waves, of light that passes through an element whose height is wrong by
     ``height_error_um``.
     """
     return height_error_um * INDEX_STEP / WAVELENGTH_UM

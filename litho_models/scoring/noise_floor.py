@@ -1,4 +1,4 @@
-"""The noise floor of a dataset: the smallest possible error of any model, for each set of terms.
+"""Estimate the noise floor of a dataset: the smallest possible error of any model, for each set of terms.
 
 The floor is measured on flat or repeated prints if there are any. Otherwise it is estimated from the
 out-of-fold residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
@@ -24,7 +24,7 @@ NOISE_FILE = "noise.json"
 
 
 class PolicyFloor(Record):
-    """The floor of the errors under one nuisance policy, nm, with 95 % intervals over prints.
+    """The floor of the errors under one nuisance policy, nm, with 95 % confidence intervals over prints.
 
     ``k`` is the number of terms per scan, or the effective number if lines have offsets. There is no interval
     with fewer than six prints.
@@ -42,8 +42,8 @@ class NoiseFloor(Record):
     """The error that noise alone causes; ``kind`` states how it was estimated.
 
     ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``. ``by_policy`` has a floor for each policy; it
-    is empty in older result files, and if only the floor of ``offset`` is known. The kinds ``lower-bound``
-    and ``literature`` occur in older files, and the first also in loops on fewer than three scans.
+    is empty in older result files, or if only the floor of ``offset`` is known. The kinds ``lower-bound`` and
+    ``literature`` occur in older files, and the first also in loops on fewer than three scans.
     """
 
     mae_nm: float | None
@@ -81,14 +81,14 @@ class _StatedFloor(Result, extra="ignore"):
 
 
 def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
-    """Read the floor from a noise analysis; without an analysis the floor is unknown.
+    """Read the floor from a noise analysis; without an analysis, the floor is unknown.
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
-        analysis: ``noise.json``, or its folder, of this dataset or of scans without one.
+        analysis: ``noise.json`` of this dataset or of scans without a dataset, or the folder of this file.
 
     Raises:
-        InputError: no noise analysis there, or one of another dataset.
+        InputError: no noise analysis there, or an analysis of another dataset.
     """
     if analysis is None:
         return UNKNOWN_FLOOR
@@ -105,12 +105,13 @@ def estimated_floor(
     blocks: Blocks | None = None,
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit of the floor under every policy, from predictions of held-out scans.
+    """Estimate an upper limit on the floor under every policy, from predictions of held-out scans.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans; ``maps_um``: the map that the model expects for each, (ny, nx) µm.
-        blocks: which pixels fit terms and which are scored, as for the errors compared with the floor.
+        blocks: choice of the pixels that fit terms and of those that are scored, as for the errors that are
+            compared with the floor.
         seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
@@ -140,14 +141,14 @@ def floor_of_residuals(
     freed: Mapping[Policy, Sequence[CrossFit]],
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit of the floor from the residuals of held-out scans.
+    """Estimate an upper limit on the floor from the residuals of held-out scans.
 
-    On drawn pixels ``LikePixels`` finds the part of the squared error that pixels with similar surroundings
-    do not share. The floor is the error over all scored pixels times the square root of this part. For the
-    mean absolute error this assumes that noise and residual have the same shape, that is, the same E|n|/σ.
-    The noise need not be Gaussian, because it makes up nearly all of the residual. If a misfit of another
-    shape made up half of the squared error (Laplace in Gaussian noise or the reverse), the floor would be
-    wrong by up to 6 %.
+    On a random sample of pixels, ``LikePixels`` finds the part of the squared error that pixels with similar
+    surroundings do not share. The floor is the error over all scored pixels times the square root of this
+    part. For the mean absolute error, this assumes that noise and residual have distributions of the same
+    shape, that is, the same E|n|/σ. The noise need not be Gaussian, because it makes up nearly all of the
+    residual. If a misfit of another shape made up half of the squared error (Laplace in Gaussian noise or the
+    reverse), the floor would be wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.
@@ -172,8 +173,8 @@ def floor_of_residuals(
         rmse_nm=offset.rmse_nm,
         kind="upper-estimate",
         source=f"residuals of {model} on scans that it had not seen, {len(drawn.owner):,} pixels compared "
-        "with those of like layout surroundings in other scans; what a layout does from farther away or in "
-        "finer detail than is compared still counts as noise",
+        "with those of similar layout surroundings in other scans; effects of the layout from farther away "
+        "or in finer detail than is compared still count as noise",
         by_policy=rows,
     )
 

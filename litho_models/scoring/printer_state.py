@@ -1,4 +1,4 @@
-"""Describe the state of the printer by figures of one scan: gain, error, and the kind of layout."""
+"""Describe the state of the printer by values from one scan: gain, error, and the kind of layout."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,13 +17,13 @@ _SURFACE = frozenset({"offset", "bow"})
 
 
 class ScanFigures(Record):
-    """Figures of one scan against a model, without the scan's offset, tilt and bow.
+    """Values that compare one scan with a model, without the scan's offset, tilt and bow.
 
     ``gain`` is measured over predicted height, with its standard error, which is computed over blocks (see
-    ``print_gain``; None for a single block). ``error_nm`` is the mean absolute error with a free gain too
-    (policy ``full``, k = 7) and with terms fitted on other pixels. ``order`` is the position in printing.
-    ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height, which
-    characterise the layout. ``held_out`` says that the model was not trained on the scan.
+    ``print_gain``; None for a single block). ``error_nm`` is the mean absolute error with the gain fitted too
+    (policy ``full``, k = 7), and with terms fitted on other pixels. ``order`` is the position in printing
+    order. ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height,
+    which characterise the layout. ``held_out`` says that the model was not trained on the scan.
     """
 
     scan: str
@@ -42,17 +42,17 @@ class ScanFigures(Record):
 def scan_figures(
     scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
 ) -> ScanFigures | None:
-    """Return the figures of a scan; None for a flat layout, which has no gain.
+    """Return the values that compare a scan with a model; None for a flat layout, which has no gain.
 
     Offset, tilt and bow are removed from both height and prediction, which gives the same gain as a joint fit
     of all terms (Frisch and Waugh 1933).
 
     Args:
         scan: the scan; ``prediction_um``: expected map (ny, nx), µm.
-        held_out: whether the model had not seen it.
+        held_out: whether the model was not trained on the scan.
 
     Raises:
-        InputError: what ``cross_fit`` refuses.
+        InputError: input that ``cross_fit`` refuses.
     """
     blocks = Blocks()
     residual = cross_fit(scan.height_um, prediction_um, scan.valid, POLICIES["full"], blocks).residual_um
@@ -83,7 +83,9 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Return the figures of a model's training scans for its card; an empty list if fields are too small."""
+    """Return the values of a model's training scans for its card; an empty list if the scans are too
+    small.
+    """
     pairs = zip(scans, predictions_um, strict=True)
     try:
         rows = [scan_figures(scan, expected, held_out=held_out) for scan, expected in pairs]

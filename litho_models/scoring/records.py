@@ -27,8 +27,8 @@ LEADING["sem"] = "edge_mean_nm"
 
 
 class Prediction(NamedTuple):
-    """The maps that a model expects for a scan, (ny, nx) µm: the print, and the part that scans share, if
-    known.
+    """The maps that a model predicts for a scan, (ny, nx) µm: the print and, if known, the part that scans
+    share.
     """
 
     height_um: Array
@@ -52,7 +52,7 @@ class Prediction(NamedTuple):
 
 
 class PolicyError(Record):
-    """Mean absolute error under one nuisance policy, nm, with its interval over scans."""
+    """Mean absolute error under one nuisance policy, nm, with its confidence interval over scans."""
 
     policy: Policy
     k: float
@@ -76,7 +76,7 @@ class MetricValues(Record):
     metrics: dict[str, float | None] = Field(default_factory=dict)
 
     def metric(self, key: str) -> float | None:
-        """Return the metric of that name in results; None if it was not measured."""
+        """Return the metric with this name in results; None if it was not measured."""
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
@@ -85,8 +85,8 @@ class ScanErrors(Record, extra="ignore"):
     """The error of one model on one scan over the scored pixels.
 
     ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free``, terms
-    fitted on other pixels are removed. Slope and intercept are gain and offset of the measured against the
-    predicted height (``print_gain``).
+    fitted on other pixels are removed. Slope and intercept are the gain and offset of the measured relative
+    to the predicted height (``print_gain``).
     """
 
     pixels: int
@@ -110,11 +110,12 @@ class ScanRow(MetricValues, ScanErrors):
 
 # Older results also contain the spread of line offsets.
 class ModelScores(MetricValues, extra="ignore"):
-    """All scores of one model: means over scans, sums of counts, and intervals from resampled scans.
+    """All scores of one model: means over scans, sums of counts, and confidence intervals from resampled
+    scans.
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
     have no smooth terms themselves. It is empty if the protocol has no background. ``phase_rms_waves`` is the
-    RMS phase error of light that passes the print.
+    RMS phase error of light that passes through the print.
     """
 
     model: str
@@ -146,7 +147,7 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_ci95_nm(self) -> Interval:
-        """Return the interval of the leading error."""
+        """Return the confidence interval of the leading error."""
         return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
 
     @property
@@ -160,8 +161,8 @@ class Paired(Record):
     """The mean over scans of the first model's leading error minus the second's; a negative mean favours the
     first model.
 
-    ``over_prints`` is the same with whole prints resampled; None for a single print, or in older result
-    files.
+    ``over_prints`` is the same comparison with whole prints resampled; None for a single print, or in older
+    result files.
     """
 
     first: str

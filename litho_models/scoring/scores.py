@@ -25,7 +25,7 @@ def score_model(
     predictions: Sequence[Prediction],
     protocol: NuisanceProtocol,
 ) -> ModelScores:
-    """Score the predictions of one model on whole scans, under one protocol and also under all policies.
+    """Score the predictions of one model on whole scans, under one protocol and under all policies.
 
     Args:
         name: name of the model.

@@ -19,17 +19,17 @@ SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
 _CANDIDATES, _MOST_HEIGHTS = 8, 24
-# Half the length of the longest piece of a contour, which is the diagonal of a pixel.
+# Half the length of the longest possible piece of a contour, the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
-    f"SSIM has a Gaussian window of {SSIM_SIGMA_PX:g} px, {SSIM_WINDOW_PX} px wide, and a data range of "
-    f"{SSIM_RANGE_UM:g} µm."
+    f"SSIM is computed with a Gaussian window (σ {SSIM_SIGMA_PX:g} px, width {SSIM_WINDOW_PX} px) and a data "
+    f"range of {SSIM_RANGE_UM:g} µm."
 )
 EDGES_TEXT = (
-    "Edge shifts are distances of the measured contours from the predicted ones at the heights "
-    f"half way between nominal levels, over the pieces whose partner lies within {SEARCH_UM:g} µm (of a "
-    f"film: at half its height, within {FILM_SEARCH_PX:g} px); the counts are pieces of the "
-    "measured contours with and without a partner, and of the predicted contours without one."
+    "Edge shifts are distances from measured to predicted contours at the heights half way between nominal "
+    f"levels, for pieces of contour that have a partner within {SEARCH_UM:g} µm (for films: at half their "
+    f"height, within {FILM_SEARCH_PX:g} px). The counts are the pieces of measured contours with and without "
+    "a partner, and the pieces of predicted contours without one."
 )
 
 
@@ -38,8 +38,8 @@ class EdgePlacement(NamedTuple):
     contour.
 
     A piece has a partner if the expected contour of the same height passes within the search distance and
-    rises to the same side. ``mean_nm`` and ``p95_nm`` cover pieces with a partner; they are None if there are
-    none.
+    rises to the same side. ``mean_nm`` and ``p95_nm`` cover the pieces with a partner and are None if no
+    piece has one.
     """
 
     mean_nm: float | None
@@ -55,7 +55,7 @@ class _Contour(NamedTuple):
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
-    """Return the SSIM of the prediction and of the scan without its per-scan terms (prediction plus
+    """Return the SSIM between the prediction and the scan without its per-scan terms (prediction plus
     residual).
     """
     return structural_similarity(prediction_um + residual_um, prediction_um)
@@ -113,7 +113,8 @@ def edge_placement(
     Args:
         measured_um: (ny, nx) µm, NaN where not scored; contours end there in both maps.
         expected_um: (ny, nx) µm.
-        heights_um: heights of the contours, µm, see ``mid_step_heights_um``; ``pitch_um``: of the maps, µm.
+        heights_um: heights of the contours, µm (see ``mid_step_heights_um``); ``pitch_um``: sampling of the
+            maps, µm.
         search_um: largest distance of a partner.
     """
     expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
@@ -136,7 +137,7 @@ def edge_placement(
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
     """Return the heights half way between neighbouring nominal levels, µm; if there are many levels, only 24
-    evenly spaced ones.
+    evenly spaced heights.
     """
     steps = min(levels - 1, _MOST_HEIGHTS)
     return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)

@@ -1,6 +1,6 @@
 """Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are
-resampled, and whole scans change sign. If the scans of a print share its day and batch, whole prints are used
-instead.
+resampled, and sign-flip tests flip whole scans. If the scans of a print share its day and batch, whole prints
+are used instead.
 """
 
 from collections.abc import Hashable, Sequence
@@ -12,7 +12,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
-# None with fewer than ``FEWEST_FOR_INTERVAL`` units.
+# An interval is None if there are fewer than ``FEWEST_FOR_INTERVAL`` units.
 Interval = tuple[float, float] | None
 # Smallest number of units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
@@ -21,8 +21,8 @@ SIGN_FLIP_DRAWS = 9999
 PERMUTATIONS = 1999
 # The ends of a 95 % interval are written in this way because 0.025 differs in its last bits.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
-# Up to this many scans every combination of signs is used. Screening tests all directions at once, so its
-# limit is one scan lower than in a comparison of two models, which halves its table.
+# For up to this many scans, every combination of signs is used. Screening tests all directions at once, so
+# its limit is one scan lower than in a comparison of two models, which halves its table.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
 # The flips include the observed signs. Rounding must not place their sum below the observed sum.
 _ROUNDING = 1 - 1e-12
@@ -40,7 +40,7 @@ def bootstrap_interval(
     draws: int = BOOTSTRAP_DRAWS,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Return the percentile interval of the mean over scans, by resampling whole scans, or whole groups of
+    """Return the percentile interval of the mean over scans, from resampling whole scans or whole groups of
     scans.
 
     A single scan or group cannot be resampled, so both ends are NaN.
@@ -55,8 +55,8 @@ def bootstrap_interval(
 
 
 def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
-    """Return the interval of a mean over pixels, by resampling prints; each print is weighted by its number
-    of pixels.
+    """Return the confidence interval of a mean over pixels, from resampling prints; each print is weighted by
+    its number of pixels.
 
     Return None if the pixels come from fewer than ``FEWEST_FOR_INTERVAL`` prints.
 
@@ -80,7 +80,7 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
 
 
 def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
-    """Return sum and count of the values of each group; without groups, each value by itself."""
+    """Return the sum and count of the values of each group; without groups, each value is a group."""
     sample = np.asarray(values, np.float64)
     if groups is None:
         return sample, np.ones(sample.size)
@@ -112,18 +112,19 @@ def smallest_flip_p(count: int) -> float:
     """Return the smallest two-sided sign-flip p that this many scans or prints allow: 2 divided by the number
     of combinations of signs.
 
-    With six prints p is at least 2 / 2^6 = 0.031, however large the difference.
+    With six prints, p is at least 2 / 2^6 = 0.031, however large the difference.
     """
     return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
 
 
 class OverUnits(Record):
-    """The mean of a difference over scans, with interval and p by resampling whole scans or prints.
+    """The confidence interval and p value of a mean difference over scans, from resampling whole scans or
+    prints.
 
     ``count`` is the number of units, and ``positive`` the number of units with a positive difference.
-    ``ci95_nm`` is a bootstrap interval, None with fewer than ``FEWEST_FOR_INTERVAL`` units. ``p`` is from
-    two-sided sign flips: all combinations up to 14 units, and 9,999 random ones beyond, counting the observed
-    one. It is never below ``smallest_p``.
+    ``ci95_nm`` is a bootstrap interval, None with fewer than ``FEWEST_FOR_INTERVAL`` units. ``p`` comes from
+    two-sided sign flips: all combinations for up to 14 units, and for more units the observed signs and 9,999
+    random combinations. It is never below ``smallest_p``.
     """
 
     count: int
@@ -136,7 +137,8 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Resample a difference per scan over scans, or over ``groups`` (the print of each scan).
+    """Test a difference that is given for each scan, by resampling scans, or ``groups`` (the print of each
+    scan).
 
     Raises:
         InputError: no difference.
@@ -156,7 +158,7 @@ def over_units(
 
 
 def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
-    """Resample a difference per scan over ``prints``; None for a single print."""
+    """Test a difference that is given for each scan, by resampling ``prints``; None for a single print."""
     return over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
 
 
@@ -185,7 +187,7 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
         prints: print of each scan.
 
     Returns:
-        None for a single print, if no print has two scans, or for constant estimates.
+        None if there is only one print, if no print has two scans, or if the estimates are constant.
     """
     names, members = np.unique(np.asarray(prints, str), return_inverse=True)
     columns = np.reshape(values, (len(members), -1)).astype(np.float64)

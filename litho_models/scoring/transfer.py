@@ -16,7 +16,9 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """The error at the pixels printed with one level, nm. A scan is counted if the level occurs in it."""
+    """The error at the pixels printed with one level, nm. ``scans`` counts the scans in which the level
+    occurs.
+    """
 
     level: int
     pixels: int
@@ -26,7 +28,8 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """Prediction compared with measurement at each frequency: |H·Z*| / |Z|² and coherence γ², along x and y.
+    """The prediction H compared with the measurement Z at each frequency: |H·Z*| / |Z|² and coherence γ²,
+    along x and y.
 
     ``error_psd`` is the one-sided power density of the error along lines, nm² per cycle/µm, with line means
     removed.
@@ -42,7 +45,8 @@ class TransferCurves(Record, extra="ignore"):
 
 
 def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
-    """Return bias (measured minus predicted) and standard deviation per layout level, over scored pixels.
+    """Return the bias (measured minus predicted) and standard deviation for each layout level, over scored
+    pixels.
 
     Args:
         scans: the scans; ``residuals_um``: measured minus predicted (ny, nx), NaN where not scored.
@@ -61,8 +65,7 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
-    """Compute transfer, coherence and error from line spectra (Hann window, line mean removed), over all
-    lines.
+    """Compute transfer, coherence and error from the spectra of all lines (Hann window, line mean removed).
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
@@ -86,8 +89,8 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Return sums over lines and the frequencies of each band, (5, bands): cross, measured, predicted, error,
-    count.
+    """Return sums over all lines and over the frequencies of each band, (5, bands): cross, measured,
+    predicted, error, count.
 
     The error is a one-sided density (µm² per cycle/µm), and the count is the number of its terms.
     """

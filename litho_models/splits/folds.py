@@ -31,7 +31,7 @@ class Split(Record):
 class ScoredSplit(Split):
     """The scored scans; ``lock_box_opened`` says whether any locked scan was scored.
 
-    ``first_folds`` is the number of folds that were made; None stands for all.
+    ``first_folds`` is the number of folds that were fitted and scored; None stands for all.
     """
 
     seed: int = 0
@@ -96,7 +96,7 @@ def plan_folds(
             "lock box to open",
             got=f"none: {len(scans)} scans are too few for one",
             wanted="at least 3 scans",
-            hint="leave out --open-lock-box",
+            hint="run without --open-lock-box",
         )
     development = [scan for scan in scans if scan.id not in locked]
     ids = [scan.id for scan in development]
@@ -127,7 +127,9 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
     """
     require_unique(ids)
     if len(ids) < 2:
-        raise InputError("scans to deal into folds", got=len(ids), wanted="at least 2, one of them held out")
+        raise InputError(
+            "scans to divide into folds", got=len(ids), wanted="at least 2, one of them held out"
+        )
     if not 2 <= k <= len(ids):
         raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
@@ -153,8 +155,8 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
     """Return the crops held out in one random draw over quadrants, as in the paper (24 of 96).
 
-    Quadrants of one scan fall on both sides, so this split leaks; use it only for comparison with the
-    paper.
+    Quadrants of one scan are in both the training and the held-out set, so this split leaks. Use it only for
+    comparison with the paper.
     """
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
@@ -164,8 +166,8 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose training scans that are set aside to select the checkpoint: ``count``, but at most a quarter of
-    all.
+    """Choose the training scans that are set aside to select the checkpoint: ``count`` scans, but at most a
+    quarter of all.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))

@@ -1,8 +1,8 @@
-"""Check in all rooms, on the grids of ``tests/grids.py``, that exchanged axes give exchanged results.
+"""Check, on the grids of ``tests/grids.py``, that swapping the axes of the input swaps those of the result.
 
-A function that treats both axes alike gives for a transposed field the transposed result. If it uses a pitch,
-a size or a position of the wrong axis, this fails on grids without square fields or pixels. Positions are
-checked by each room's own tests, and here for functions that resample.
+A function that treats both axes alike returns the transposed result for a transposed field. A function that
+uses a pitch, a size or a position of the wrong axis does not, because the fields and pixels are not square.
+Positions are checked by each room's own tests; here they are checked only for functions that resample.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ WAVELENGTH_UM = 0.5
 
 
 def exchanged(grid: PixelGrid) -> PixelGrid:
-    """Return the grid with y and x exchanged."""
+    """Return the grid with y and x swapped."""
     (ny, nx), (py, px), (y, x) = grid.shape, grid.pitch_um, grid.origin_um
     return PixelGrid((nx, ny), (px, py), (x, y))
 
 
 def relief(grid: PixelGrid) -> Array:
-    """Return heights (ny, nx), µm, that differ between the axes, with a steep part outside the middle."""
+    """Return heights (ny, nx) in µm that differ between the axes and have a steep part off the centre."""
     y, x = (grid.y_um - grid.y_um.mean())[:, None], (grid.x_um - grid.x_um.mean())[None, :]
     wave = 0.3 + 0.1 * np.sin(2.1 * y + 0.4) * np.cos(1.3 * x - 0.2) + 0.03 * y - 0.05 * x
-    # The flank is smooth on all grids, as half a wave to a pixel has no defined sign along an axis.
+    # The flank is smooth on all grids, because a wave of two pixels has no defined sign along an axis.
     return np.asarray(wave + 0.12 * np.tanh((0.7 - np.hypot(y - 0.6, 1.5 * (x + 0.4))) / 0.25))
 
 
@@ -62,7 +62,7 @@ def by_torch(run: Callable[[torch.Tensor], torch.Tensor]) -> Made:
 
 
 def light(propagator: Any, distance_um: float) -> Made:
-    """Return a function that propagates light of a relief to a finer, displaced grid and back."""
+    """Return a function that propagates light from a relief to another, displaced grid and back."""
 
     def made(height: Array, grid: PixelGrid) -> Array:
         (ny, nx), (py, px), (y, x) = grid.shape, grid.pitch_um, grid.origin_um
@@ -76,7 +76,7 @@ def light(propagator: Any, distance_um: float) -> Made:
 
 
 def printed(height: Array, grid: PixelGrid) -> Array:
-    """Predict a print in tiles, of which the last ones are narrower."""
+    """Predict a print in tiles. The last tiles are narrower than the others."""
     facts = {"pitch_um": 0.1, "level_height_um": 0.1, "levels": 13}
     model = build_model("affine-mtf", sigmas_um=(0.25,), **facts)
     layout = torch.from_numpy(height).float()[None, None]
@@ -84,7 +84,7 @@ def printed(height: Array, grid: PixelGrid) -> Array:
 
 
 def imaged(height: Array, grid: PixelGrid) -> Array:
-    """Blur with a spot whose samples have the pitch of each axis."""
+    """Blur heights with a spot that is sampled at the pitch of each axis."""
     rows, columns = (np.arange(-k, k + 1) * pitch for k, pitch in zip((4, 4), grid.pitch_um, strict=True))
     spot = np.exp(-(rows[:, None] ** 2 + columns[None, :] ** 2) / 0.1)
     blur = Blur(torch.from_numpy(spot), grid.shape)
@@ -118,12 +118,12 @@ def with_steps(height: Array) -> Array:
 
 @pytest.mark.parametrize("name", UNEQUAL)
 @pytest.mark.parametrize("made", MAPS)
-def test_a_map_of_the_exchanged_field_is_the_exchanged_map(made: str, name: str) -> None:
+def test_swapping_the_axes_of_a_field_swaps_those_of_the_map(made: str, name: str) -> None:
     grid = UNEQUAL[name]
     height = relief(grid)
     here = MAPS[made](height, grid)
     there = MAPS[made](np.ascontiguousarray(height.T), exchanged(grid))
-    # The sums have another order, at worst in float32.
+    # The terms of sums are added in a different order, at worst in float32.
     np.testing.assert_allclose(there, here.T, rtol=1e-4, atol=1e-5 * np.nanmax(np.abs(here)))
 
 
@@ -158,7 +158,7 @@ ALONG: dict[str, Along] = {
 
 @pytest.mark.parametrize("name", UNEQUAL)
 @pytest.mark.parametrize("figure", ALONG)
-def test_a_figure_along_y_is_that_along_x_of_the_exchanged_field(figure: str, name: str) -> None:
+def test_a_result_along_y_equals_that_along_x_of_the_transposed_field(figure: str, name: str) -> None:
     grid, height = UNEQUAL[name], relief(UNEQUAL[name])
     along_y = ALONG[figure](height, grid, 0)
     along_x = ALONG[figure](np.ascontiguousarray(height.T), exchanged(grid), 1)
@@ -166,7 +166,7 @@ def test_a_figure_along_y_is_that_along_x_of_the_exchanged_field(figure: str, na
 
 
 @pytest.mark.parametrize("name", UNEQUAL)
-def test_edges_of_exchanged_prints_are_as_far_apart(name: str) -> None:
+def test_swapping_the_axes_of_prints_keeps_the_distances_of_edges(name: str) -> None:
     height = relief(UNEQUAL[name])
     moved = np.roll(height, 1, axis=0)
     one, other = (
@@ -176,7 +176,7 @@ def test_edges_of_exchanged_prints_are_as_far_apart(name: str) -> None:
     assert (other.mean_nm, other.p95_nm) == (pytest.approx(one.mean_nm), pytest.approx(one.p95_nm))
 
 
-# Effects of the microscope, whose lines lie along x for any direction of the printer.
+# Effects of the microscope. Its lines lie along x, whatever the direction of the printer.
 SCANNED = {"feedback-lag", "piezo-nonlinearity", "tip-dilation"}
 EFFECTS = [name for name, one in CATALOGUE.items() if not one.per_scan and name not in SCANNED]
 
@@ -190,13 +190,13 @@ def of_other_axis(parameter: str) -> str:
 
 @pytest.mark.parametrize("name", UNEQUAL)
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_an_effect_of_the_exchanged_print_is_the_exchanged_effect(effect: str, name: str) -> None:
-    """This also holds for a part of a scan off the middle of the write field, with its lines along y."""
+def test_swapping_the_axes_of_a_print_swaps_those_of_the_effect(effect: str, name: str) -> None:
+    """The tested field is part of a scan away from the centre of the write field, with lines along y."""
     grid, one = UNEQUAL[name], get_effect(effect)
     numbers = {
         parameter: facts.typical * (1 + 0.2 * number)
         for number, (parameter, facts) in enumerate(one.parameters.items())
-        # At half a wave to a pixel a Fourier transform has no direction, which a shear needs.
+        # A shear needs a direction, which a Fourier transform does not have for a wave of two pixels.
         if facts.kind == "amplitude" and parameter != "shear_um2"
     }
     field = torch.from_numpy(relief(grid))[None, None]
@@ -210,7 +210,7 @@ def test_an_effect_of_the_exchanged_print_is_the_exchanged_effect(effect: str, n
     )
     turned = {of_other_axis(parameter): value for parameter, value in numbers.items()}
     if "stretch_um2" in turned:
-        # The effect adds along x what it subtracts along y.
+        # The effect adds as much along x as it subtracts along y.
         turned["stretch_um2"] *= -1
     changed = one(field, numbers, here)
     assert not torch.allclose(changed, field, rtol=0, atol=1e-6)
@@ -224,7 +224,7 @@ def test_a_resampled_height_is_that_at_the_pixel_s_place(name: str) -> None:
     def height(y: Array, x: Array) -> Array:
         return np.asarray(0.2 * np.sin(1.1 * y)[:, None] + 0.3 * np.cos(0.8 * x)[None, :])
 
-    # In the frame of a scan the origin is its corner.
+    # The origin of the frame of a scan is its corner.
     own = PixelGrid(grid.shape, grid.pitch_um)
     matrix = np.array([[1, 0, shift_um[1]], [0, 1, shift_um[0]], [0, 0, 1.0]])
     found, valid = resample_to_layout(
@@ -232,8 +232,8 @@ def test_a_resampled_height_is_that_at_the_pixel_s_place(name: str) -> None:
     )
     layout = PixelGrid.square(shape, pitch_um)
     wanted = height(layout.y_um - shift_um[0], layout.x_um - shift_um[1])
-    # A scan finer than the layout is averaged over the layout's pixel, and mirrored beyond its edge.
+    # A scan finer than the layout is averaged over the layout's pixels, and mirrored beyond its edge.
     inside = binary_erosion(valid, iterations=6)
     assert inside.sum() > 100
-    # Cubic splines at 60 pixels per wave. Averaging lowers the wave by (k σ)² / 2.
+    # Cubic splines at 60 pixels per wave are accurate, but averaging lowers the wave by (k σ)² / 2.
     np.testing.assert_allclose(found[inside], wanted[inside], atol=5e-4)

@@ -1,4 +1,4 @@
-"""The blind trials: draws, sizes, judgements, interrupted campaigns, and whole trials."""
+"""Check the blind trials: draws, sizes, judgements, interrupted campaigns, and whole trials."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ from tests.litho_models.prints import make_scans, write_store
 EARLIER = pd.read_csv(RESULTS / "earlier.csv", keep_default_na=False)
 
 
-# Draws
+# Drawing boards
 
 
 def test_singles_follow_from_their_seed_and_have_what_was_promised():
@@ -82,7 +82,7 @@ def test_singles_follow_from_their_seed_and_have_what_was_promised():
     assert Counter(draw.kind for draw in draws) == SINGLES
     assert all(len(draw.causes) == (draw.kind != "empty") for draw in draws)
     rms_nm = np.array([cause.wanted_rms_nm for draw in draws for cause in draw.causes])
-    # All drawn causes must count: above 8 nm, with room for the error of the search on four scans.
+    # Every drawn cause must be larger than 8 nm to count, also after the error of the search on four scans.
     assert SINGLES_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= SINGLES_RMS_NM[1]
     assert 0.87 * SINGLES_RMS_NM[0] > 8
     assert len({tuple(draw.printer.items()) for draw in draws}) == 48
@@ -95,7 +95,7 @@ def test_singles_follow_from_their_seed_and_have_what_was_promised():
 
 @pytest.mark.parametrize("seed", range(20267, 20271))
 def test_the_published_boards_are_drawn_as_they_were(seed):
-    """The board of single causes repeats the earlier one."""
+    """Check that drawing a board of single causes again gives the published draws."""
     was = EARLIER[EARLIER.board == seed]
     drawn = draw_board("singles", seed)
     assert [draw.seed for draw in drawn] == was.seed.tolist()
@@ -107,7 +107,7 @@ def test_mixtures_have_what_was_promised(seed):
     draws = draw_board("mixtures", seed)
     assert draws == draw_board("mixtures", seed) != draw_board("mixtures", seed + 1)
     assert Counter(draw.kind for draw in draws) == MIXTURES
-    # A fifth of the trials has no cause.
+    # A fifth of the trials have no cause.
     assert len(draws) >= 40
     assert 0.18 < MIXTURES["empty"] / len(draws) < 0.22
     causes = [cause for draw in draws for cause in draw.causes]
@@ -124,7 +124,7 @@ def test_mixtures_have_what_was_promised(seed):
     assert Counter(one.name for one in bases) == {n: 3 for n in FORMS if FORMS[n].deck == "base"}
     assert all(BASE_RMS_NM[0] <= one.wanted_rms_nm <= BASE_RMS_NM[1] for one in bases)
     for draw in draws:
-        # Two causes of one name could not be told apart by the judge.
+        # The judge could not tell apart two causes with the same name.
         names = [
             name for one in [*draw.causes, *([draw.base] if draw.base else [])] for name in names_of(one.name)
         ]
@@ -138,7 +138,7 @@ def test_the_page_lists_all_forms():
 
 
 def test_the_drawing_reads_no_catalogue():
-    """In a fresh interpreter, drawing and sizing a board loads neither the effects nor the loop."""
+    """Check in a fresh interpreter that drawing and sizing a board loads neither the effects nor the loop."""
     rooms = ("litho_models.effects", "litho_models.loop")
     code = (
         "import sys, litho_models.boards.draws, litho_models.boards.planting\n"
@@ -148,7 +148,7 @@ def test_the_drawing_reads_no_catalogue():
     assert not loaded.split()
 
 
-# Sizes
+# Sizes of causes
 
 
 def drawn(*causes: CauseDraw, kind: Kind = "mixture", **settings: object) -> Draw:
@@ -208,16 +208,16 @@ def test_a_form_does_nothing_at_strength_zero_and_the_same_twice(name):
     for strength, differs in ((0.0, False), (0.3 * FORMS[name].limit, True)):
         once, again = (noise_free_um(draw, [set_to(cause(name), strength)], jobs) for _ in range(2))
         np.testing.assert_array_equal(once, again)
-        # The last field that is printed comes after every step.
+        # Every cause that starts at some field acts on the field that is printed last.
         assert np.array_equal(once[-1], plain[-1]) != differs
 
 
 def test_a_full_hill_response_replaces_the_logistic():
-    """Without shrinkage and base layer the print follows a Hill curve of the dose."""
+    """Check that, without shrinkage and base layer, the print follows a Hill curve of the dose."""
     draw = drawn(printer={"loose_retention": 1.0, "base_um": 0.0})
     (job,) = trial_jobs(draw, 1, 64)
     fab = fab_of(draw, [], job, noise=Noise.off(), microscope=Microscope.aligned())
-    # At steepness 1e-4 the logistic is straight to 1e-5, so the print is proportional to the dose.
+    # At steepness 1e-4 the logistic is linear to 1e-5, so the print is proportional to the dose.
     straight = replace(fab, printer=replace(fab.printer, threshold_steepness=1e-4))
     dose = scan_job(straight, job).clean_um / fab.printer.full_height_um
     hill = scan_job(replace(fab, cause=FormCause({"hill-response": 1.0}, 9)), job)
@@ -241,7 +241,7 @@ def test_a_full_hill_response_replaces_the_logistic():
     ],
 )
 def test_a_planted_form_has_the_size_that_it_claims(name):
-    """The size is that of the residual after the plain fab and scan terms, and is large enough to count."""
+    """Check the size of a planted form: the residual that the plain fab and the scan terms cannot explain."""
     # A short reach of the polymer network saves time.
     draw = drawn(cause(name, 9.0), printer={"network_reach_um": 0.3})
     jobs = trial_jobs(draw, 2, 96)
@@ -254,18 +254,18 @@ def test_a_planted_form_has_the_size_that_it_claims(name):
         basis = term_maps(TermPixels(plain), POLICIES["full"] | {"warp"})
         change = (height - plain).ravel()
         squares.append(np.mean((change - least_squares(basis, change) @ basis) ** 2))
-    # A refit of the base can only explain more. Only one of the two sizes uses all pixels (5 %).
+    # A refit of the base can only explain more. Only one of the two sizes uses all pixels, so allow 5 %.
     assert 8.0 < planted.rms_nm < 1.05e3 * np.sqrt(np.mean(squares))
 
 
 @pytest.mark.long
 def test_what_the_base_can_imitate_does_not_count():
-    """A plain fab with other parameters is still the Physics model: a fit leaves nothing from any start."""
+    """Check that Physics fits a plain fab with other parameters without residual, from any start."""
     other = {"threshold_steepness": 2.2, "loose_retention": 0.45, "network_reach_um": 1.6}
     draw = drawn(printer=other)
     jobs = trial_jobs(draw, 4, 96)
     heights = [1.02 * height + 0.03 for height in noise_free_um(draw, [], jobs)]
-    # The change is more than 25 nm. Kernels that are cut at 4 σ leave 0.001 nm of it.
+    # The heights change by more than 25 nm. Of this, kernels truncated at 4 σ leave 0.001 nm.
     assert refitted_rms_nm(heights, jobs, Printer()) < 0.01
     assert refitted_rms_nm(heights, jobs, printer_of(draw)) < 0.01
 
@@ -300,7 +300,7 @@ def test_what_is_injected_into_a_store_is_what_the_fab_makes_of_its_layouts(tmp_
     changed = open_store(tmp_path / "injected.zarr")
     for job in jobs:
         step_nm = 1e3 * (changed.scan(job.id).height_um - store.scan(job.id).height_um)
-        # The change is zero or the whole step, in float32 at heights of some µm.
+        # Each height changes by zero or by the whole step, up to float32 rounding at heights of some µm.
         sides = np.unique(np.round(step_nm[np.isfinite(step_nm)], 2))
         np.testing.assert_allclose(sides, [0.0, 50.0], atol=0.02)
     assert [job.level.shape for job in middle(jobs, 32)] == [(32, 32)] * 2
@@ -332,7 +332,10 @@ def said(
     seen: Sequence[str] = (),
     **more: str,
 ) -> Answer:
-    """Return a loop's result with ``seen`` in single scans and verdicts ``more`` of candidates (_ for -)."""
+    """Return a loop's result with findings ``seen`` in single scans and verdicts ``more`` on candidates.
+
+    A candidate is named with _ in place of -.
+    """
     result = CloseLoop.model_construct(
         base_model="",
         errors=[],
@@ -366,7 +369,7 @@ LAW, TABLE = found("height-power-2", knowledge="law"), found("level-table", know
         (["vignetting"], said(verdict="nothing-missing", matters=True), ["noticed"], []),
         (["quantisation"], said(seen=["quantisation"]), ["right"], []),
         (["far-copy"], said(TABLE), ["noticed"], []),
-        # The larger cause is judged first. A law or a set counts once.
+        # The largest cause is judged first. A law or a set counts for one cause only.
         (["vignetting", "far-copy"], said(LAW), ["noticed", "lawful"], []),
         (["vignetting", "far-copy"], said(found("vignetting"), LAW), ["right", "lawful"], []),
         (["galvo-lag", "tip-dilation"], said(found("galvo-lag", "tip-dilation")), SHARED, []),
@@ -377,7 +380,7 @@ LAW, TABLE = found("height-power-2", knowledge="law"), found("level-table", know
         (["cubic-slope-loss"], said(found("slope-thinning")), ["noticed"], THINNING),
         ([], said(verdict="nothing-missing"), ["clean"], []),
         ([], said(TABLE), ["false-positive"], []),
-        # The fab's default noise has offsets of lines, but no rounding.
+        # The fab's default noise contains line offsets, but no rounding.
         ([], said(verdict="nothing-missing", seen=["scan-line-stripes"]), ["clean"], []),
         ([], said(verdict="nothing-missing", seen=["quantisation"]), ["false-positive"], ["quantisation"]),
         (["periodic-lines"], said(verdict="nothing-missing", seen=["scan-line-stripes"]), ["noticed"], []),
@@ -447,9 +450,9 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
                 height_um=made.height_um.astype(np.float32), usable=np.ones(shape, bool),
             )
         )  # fmt: skip
-    # The mean absolute value of normal noise, sd 5 nm, from 2 × 10⁴ pixels has a standard error of 0.6 %.
+    # The noise is normal with sd 5 nm. Over 2 × 10⁴ pixels its mean absolute value is known to 0.6 %.
     assert true_floor(draw, planted, jobs, scans, 0) == pytest.approx(5 * np.sqrt(2 / np.pi), rel=0.02)
-    # A cause in the wrong scans shows in the error.
+    # If the cause acts on the wrong scans, the error grows.
     swapped = [set_to(cause("galvo-lag", by="field", place="24", weak=0.5), 0.4)]
     assert true_floor(draw, swapped, jobs, scans, 0) > 6
 
@@ -457,7 +460,7 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
 def test_the_bias_is_that_of_the_base_and_only_where_it_can_be_right():
     draw = drawn(cause("vignetting"), printer={"threshold_dose": 0.25})
     own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14, "spot_um": 0.2}
-    # A logistic of steepness 1.6 is a tanh of steepness 0.8. The fab has no gain.
+    # A logistic of steepness 1.6 equals a tanh of steepness 0.8. The fab has no gain.
     true = {"alpha": 0.8, "gain": 1.0, **own}
     answer = Answer(
         base_values={name: 1.3 * own for name, own in true.items()},
@@ -510,24 +513,24 @@ def test_the_figures_count_failures_as_not_found_and_leave_out_small_causes():
     draws, trials = board_of_mixtures()
     values = [figure.value for figure in figures_of(make_scoreboard(draws, trials, ""))]
     assert [value.split(" (")[0] for value in values] == [
-        "1 of 2",  # of the catalogue: vignetting is found, tip-dilation is not, and galvo-lag is too small
-        "2 of 3",  # of another form: far-copy (by a law) and linear-slope-loss are found, fringes is not
+        "1 of 2",  # in the catalogue: vignetting is found, tip-dilation is not, and galvo-lag is too small
+        "2 of 3",  # in another form: far-copy (by a law) and linear-slope-loss are found, but fringes is not
         "3 of 5",
         "3 of 5",
         "1 of 1",
         "none of 0",
-        "1 of 4",  # false names, without those on the measured prints
+        "1 of 4",  # false names, except those on the measured prints
         "1 of 3",
         "0 of 1",
         "1 of 1",
         "1",
-        # Ratios 1/3 and 1/2.
+        # The ratios are 1/3 and 1/2.
         "25.0 %, 10.0 %; 0.42",
     ]
 
 
 def test_intervals_are_exact():
-    # Clopper and Pearson at 0 of n: 1 − 0.025^(1/n).
+    # The upper limit by Clopper and Pearson for 0 of n is 1 − 0.025^(1/n).
     assert share([False] * 8) == f"0 of 8 (0–{100 * (1 - 0.025 ** (1 / 8)):.0f} %)"
     assert share([True] * 21) == f"21 of 21 ({100 * 0.025 ** (1 / 21):.0f}–100 %)"
 
@@ -569,7 +572,10 @@ def test_the_published_table_is_the_committed_scoreboard():
 
 
 def earlier_row(seed: int, rows: pd.DataFrame) -> str:
-    """Return a row by the rules of that time: final error at most 1.05 × the floor, other forms 1.3 ×."""
+    """Return the row of an earlier board by its own rules.
+
+    They required a final error of at most 1.05 × the floor, or 1.3 × for other forms.
+    """
     other, empty = ("other-form", "off-catalogue"), ("empty", "none")
     large = rows[pd.to_numeric(rows.rms_nm, errors="coerce") > 8]
     in_form, unnamed = large[~large.kind.isin(other)], large[large.kind.isin(other)]
@@ -585,7 +591,7 @@ def earlier_row(seed: int, rows: pd.DataFrame) -> str:
     return f"| {seed} | {' | '.join(share(cell.tolist()) for cell in cells)} |"
 
 
-# Campaign
+# Interrupted campaigns
 
 
 def small_board(**changes: object) -> Draws:
@@ -653,7 +659,7 @@ def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
     assert "Traceback" in capfd.readouterr().err
 
 
-# Two trials from the raw folder
+# Two whole trials
 
 
 @pytest.mark.long

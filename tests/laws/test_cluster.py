@@ -1,4 +1,4 @@
-"""Results from a Dask cluster equal local results bit for bit, even if a worker dies half-way."""
+"""Check that a Dask cluster gives the same bits as a local run, even if a worker dies half-way."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Start a cluster of two workers with one thread each. A job may kill one worker, but not two."""
+    """Start a cluster of two one-thread workers. A job that kills one worker is retried, but only once."""
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, scheduler_kwargs={"allowed_failures": 1}
     ) as cluster:
@@ -66,9 +66,9 @@ def test_jobs_know_command_folder_and_large_objects(
         assert facts == ("litho-data build card.toml", str(tmp_path), os.environ.get("OMP_NUM_THREADS", "1"))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="settings of the C library of Linux")
+@pytest.mark.skipif(sys.platform != "linux", reason="these settings exist only in Linux")
 def test_a_worker_uses_freed_memory_again() -> None:
-    """By default Dask's workers return freed memory at once, so each array of 1 MiB takes 256 new pages."""
+    """Check that workers keep freed memory. Dask's default is to return it: 256 new pages per MiB."""
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
@@ -76,10 +76,10 @@ def test_a_worker_uses_freed_memory_again() -> None:
         before = client.submit(new_pages, 1, pure=False).result()
         after = [pages for _, pages in run_jobs(new_pages, [1] * 3, Workers(dask=cluster.scheduler_address))]
     assert before >= 20 * 250
-    assert max(after) <= 2 * 256  # new pages for the first array, and some for other objects
+    assert max(after) <= 2 * 256  # pages for the first array, and some for other objects
 
 
-def test_a_refusal_on_a_worker_is_the_message_here(address: str) -> None:
+def test_an_error_of_a_worker_has_the_same_message_in_the_main_process(address: str) -> None:
     with pytest.raises(InputError, match=r"^job \d, got nothing, wanted something$"):
         list(run_jobs(refuse, range(3), Workers(dask=address)))
 
@@ -91,7 +91,9 @@ def test_a_worker_of_other_software_or_other_files_is_refused(
     monkeypatch.setattr(
         module, "software_record", lambda: {**own, "versions": {**own["versions"], "numpy": "0"}}
     )
-    with pytest.raises(InputError, match=r"^numpy of Dask worker tcp://\S+, got \S+, wanted 0, as here"):
+    with pytest.raises(
+        InputError, match=r"^numpy of Dask worker tcp://\S+, got \S+, wanted 0, as on this machine"
+    ):
         list(run_jobs(refuse, [1], Workers(dask=address)))
     monkeypatch.setattr(module.os, "getcwd", lambda: "/nowhere")
     with pytest.raises(InputError, match=r"^Dask worker tcp://\S+, got no folder /nowhere"):
@@ -128,7 +130,7 @@ def test_a_job_whose_worker_dies_is_run_again(address: str, tmp_path: Path) -> N
 
 
 def test_a_job_that_kills_every_worker_is_named_in_one_line(address: str) -> None:
-    with pytest.raises(InputError, match=r"^the worker of scan 7, got died, .*; run it again") as said:
+    with pytest.raises(InputError, match=r"^the worker of scan 7 died, .*; run the command again") as said:
         list(run_jobs(die, [7], Workers(dask=address), name=lambda number: f"scan {number}"))
     assert "\n" not in str(said.value)
 
@@ -197,7 +199,7 @@ def test_designs_are_the_same_to_the_bit(
     for arm in arms:
         one, other = (Design.read(design_folder(tmp_path / name, arm, 0)) for name in "ab")
         assert one.fingerprint == other.fingerprint
-        # Hashes of levels, height, image and target.
+        # These are the hashes of levels, height, image and target.
         assert one.files == other.files != {}
         assert one.predicted == other.predicted
 
@@ -214,7 +216,7 @@ def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> N
         campaign.run_campaign(tmp_path / name, draws, numbers=[1, 3], **settings)
         trials = campaign.finished(tmp_path / name, draws)
         assert not any(trial.failure for trial in trials)
-        # Only the seconds depend on the machine.
+        # Only the processor time depends on the machine.
         records.append([trial.model_dump(exclude={"dataset_cpu_s"}) for trial in trials])
     assert records[0] == records[1]
 
@@ -222,7 +224,7 @@ def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> N
 def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
     draws = make_draws(board="singles", seed=0, n_scans=12, size_px=64, base="physics")
     campaign.open_campaign(tmp_path, draws)
-    # The time is long enough for a process to start, and too short for a trial.
+    # The time limit is long enough for a process to start, but too short for a trial.
     settings = {"workers": Workers(dask=address), "timeout_s": 0.3}
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **settings)
     assert [trial.failure for trial in campaign.finished(tmp_path, draws)] == ["not finished after 0.3 s"] * 2

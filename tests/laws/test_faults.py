@@ -1,4 +1,4 @@
-"""Each fault of ``tests/faults.py`` can still be put in: its text and its test files exist."""
+"""Check that each fault of ``tests/faults.py`` can still be put in: its text and its test files exist."""
 
 from __future__ import annotations
 

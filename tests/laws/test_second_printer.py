@@ -1,4 +1,4 @@
-"""Run from card to export with a second machine of other pitch, levels, field and microscope."""
+"""Run from card to export on a second machine with a different pitch, field, microscope and levels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LAYOUT = ("--pitch-um", 0.2, "--level-height-um", 0.02, "--levels", 64, "--set",
 
 
 def run(command, *words):
-    """Run one command as a user would, and return what it printed."""
+    """Run one command as a user would and return its output."""
     app = importlib.import_module(f"{command.replace('-', '_')}.cli.app").app
     done = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
     assert done.exit_code == 0, done.output
@@ -27,7 +27,7 @@ def run(command, *words):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Make a folder with prints, their dataset, a model, a design and its files for the printer."""
+    """Make a folder with prints, their dataset, a model, a design, and the design's files for the printer."""
     folder = tmp_path_factory.mktemp("second")
     run("litho-data", "simulate", "--preset", "second-printer", "--count", 3, "--out", folder / "fab")
     run("litho-data", "build", folder / "fab" / "raw" / "card.toml", "--out", folder / "prints.zarr")
@@ -56,11 +56,11 @@ def test_the_model_is_calibrated_for_it_and_beats_the_nominal_heights(made):
     assert model.card["calibrated_range_um"][1] == pytest.approx(MACHINE.full_height_um)
     scan = litho_data.open_store(made / "prints.zarr").scans()[0]
     errors = [
-        # Errors without the datum, which a scan does not show.
+        # Errors without the datum, which a scan does not measure.
         np.nanstd(np.where(scan.valid, scan.height_um - height, np.nan))
         for height in (model.predict(scan.layout_um), scan.layout_um)
     ]
-    # Nominal heights mainly lack the blur of the spot and the threshold.
+    # The nominal heights are wrong mainly because they ignore the threshold and the blur of the spot.
     assert errors[0] < 0.5 * errors[1]
 
 

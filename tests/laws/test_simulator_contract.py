@@ -1,4 +1,4 @@
-"""Check the contract of every simulator: the same tests for all models and variants."""
+"""Check the contract of simulators with the same tests for all models and variants."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ pytestmark = pytest.mark.numerics
 
 
 def fields_of(name: str, variant: str) -> dict[str, object]:
-    """Return the settings that make a variant, without its name."""
+    """Return the settings of a variant, without its name."""
     return build_model(name, variant).config.model_dump(exclude={"variant"})
 
 
-# A variant that equals the default is no separate case.
+# A variant with the same settings as the default is not tested separately.
 CASES = [
     (name, variant)
     for name in MODELS
@@ -45,7 +45,7 @@ NARROW = {
     "dmd-grayscale": {"spot.sigma_um": 0.1, "diffusion.sigma_um": 0.08},
     "fno": {"width": 6, "modes": (4, 4), "projection_channels": 8},
 }
-# Settings of the default variant only.
+# These settings apply to the default variant only.
 SMALL_PARTS = {
     "fno": {"tile_px": 32, "overlap_px": 16},
     "pbl": {
@@ -62,7 +62,7 @@ LOCAL = [name for name in MODELS if build_model(name).reach_px is not None]
 
 
 def make(name: str, variant: str = "default", **fields: object) -> Simulator:
-    """Return a model whose parameters all differ from their start, so that no part is idle."""
+    """Return a model whose parameters all differ from their start, so that every part has an effect."""
     torch.manual_seed(0)
     parts = SMALL_PARTS.get(name, {}) if variant == "default" else {}
     model = build_model(name, variant, **{**NARROW.get(name, {}), **parts, **fields})
@@ -105,7 +105,7 @@ def test_samples_of_a_batch_do_not_touch_each_other(name, variant):
     a, b = layout(seed=1), layout(seed=2)
     with torch.no_grad():
         together = model(torch.cat([a, b]))
-        # Other batch sizes may sum in another order, which gives a few float32 roundings of 1 µm.
+        # Another batch size may change the order of sums, and so a few float32 roundings at 1 µm.
         assert torch.allclose(together[:1], model(a), atol=2e-6)
         assert torch.allclose(together[1:], model(b), atol=2e-6)
 
@@ -124,8 +124,8 @@ def test_gradient_equals_finite_difference(name, variant):
         difference = float((weight * (high - low)).sum() / (2 * step))
     directional = float((gradient * direction).sum())
     assert gradient.isfinite().all()
-    # In double precision rounding is 1e-16/1e-6 = 1e-10 per pixel. A few of 4,000 pixels cross kinks of
-    # leaky ReLU and of the tables, where slopes change by a few per cent.
+    # In double precision, rounding errors are 1e-16/1e-6 = 1e-10 per pixel. A few of the 4,000 pixels cross
+    # kinks of leaky ReLU or of the tables, where slopes change by a few per cent.
     assert difference == pytest.approx(directional, rel=2e-3, abs=1e-4)
 
 
@@ -134,7 +134,7 @@ def test_a_print_without_its_border_is_the_print_cut(name, variant, tmp_path):
     model = load_frozen(save_frozen(make(name, variant), tmp_path / "model")).double()
     field = torch.cat([layout(130, 140, seed) for seed in (1, 2)]).double().requires_grad_()
     whole = model(field)
-    # The widest border leaves out whole tiles of 32 px, and is wider than most receptive radii.
+    # The widest border excludes whole tiles of 32 px, and is wider than most receptive radii.
     for border_px in (0, 3, 60):
         cut = whole[..., border_px : 130 - border_px, border_px : 140 - border_px]
         inside = model.inside(field, border_px)
@@ -143,8 +143,8 @@ def test_a_print_without_its_border_is_the_print_cut(name, variant, tmp_path):
             torch.autograd.grad((weight * height).sum(), field, retain_graph=True)[0]
             for height in (cut, inside)
         ]
-        # Double precision, sums of some thousand products of order one; no rule of the edge gets into the
-        # middle.
+        # The sums have some thousand products of order one, in double precision. The treatment of the edge
+        # does not reach the middle.
         assert torch.allclose(inside, cut, atol=1e-10, rtol=0)
         assert torch.allclose(*slopes, atol=1e-10, rtol=0)
     for impossible in (-1, 65):
@@ -166,7 +166,7 @@ def test_every_parameter_gets_a_gradient(name):
 
 
 def crop_difference_um(model, field, offset_px, border_px):
-    """Return the absolute differences between a field and its crop, without a border of the crop."""
+    """Return the absolute differences between predictions for a field and its crop, away from the border."""
     y, x = offset_px
     inner = (..., slice(border_px, -border_px or None), slice(border_px, -border_px or None))
     with torch.no_grad():
@@ -181,7 +181,7 @@ def test_a_crop_predicts_what_the_whole_field_does_beyond_the_receptive_radius(n
     size = 2 * reach + 40
     difference = crop_difference_um(model, layout(size + 24, size + 24), (10, 6), reach)
     assert difference.numel() >= 40 * 40
-    # The tolerance is some float32 roundings of 1 µm.
+    # The tolerance is some float32 rounding errors at 1 µm.
     assert difference.max() < 1e-5
 
 
@@ -189,9 +189,9 @@ def test_a_crop_predicts_what_the_whole_field_does_beyond_the_receptive_radius(n
 def test_a_model_without_a_receptive_radius_sees_the_crop(name, variant):
     model = make(name, variant)
     field = 0.7 * layout(150, 150)
-    field[..., :8, :4] = 1.2  # the crop loses the highest level
+    field[..., :8, :4] = 1.2  # the crop excludes the highest level
     difference = crop_difference_um(model, field, (10, 6), 32)
-    # A difference must exist, else the model would have a receptive radius. But it stays a small error.
+    # There must be a difference, or else the model would have a receptive radius. But the error stays small.
     assert 0 < difference.max() < 1
 
 
@@ -201,7 +201,7 @@ def test_a_crop_on_the_same_grid_of_tiles_predicts_what_the_whole_field_does(nam
     size, overlap = model.tile
     field = layout(150, 150)
     difference = crop_difference_um(model, field, (size - overlap, 2 * (size - overlap)), size)
-    # Tiles that start on the same pixels and do not reach the crop's edge have the same input.
+    # Tiles that start at the same pixels and do not touch the crop's edge have the same input.
     assert difference.max() < 1e-5
 
 
@@ -239,8 +239,8 @@ def test_a_frozen_model_is_the_model(name, variant, tmp_path):
     height = frozen(field, pitch_um=0.1)
     with torch.no_grad():
         learning = model(layout())
-    # Trainable and fixed weights may be summed in another order, which gives some roundings of 1e-7 of
-    # heights of 1 µm. With fixed weights the frozen model equals the model bit for bit.
+    # Trainable and fixed weights may be summed in different orders, so heights of 1 µm may differ by some
+    # 1e-7 of their value. With fixed weights, the frozen model equals the model bit for bit.
     assert torch.allclose(height, learning, rtol=0, atol=1e-6)
     assert torch.equal(height, model.requires_grad_(False)(layout()))
     height.sum().backward()
@@ -262,8 +262,8 @@ def test_a_frozen_model_takes_layouts_of_its_own_precision_only(name, tmp_path):
             frozen(layout().to(dtype))
     single, double = frozen(layout()), frozen.double()(layout().double())
     assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
-    # Slopes and layers of these small models amplify roundings of 1e-7 of 1 µm some tens of times. Edges of
-    # e-beam in flat resist amplify them by one over 5e-3.
+    # These small models amplify rounding errors of 1e-7 of 1 µm some tens of times. At the edges of e-beam
+    # in flat resist, the amplification is 1/5e-3.
     assert torch.allclose(single.double(), double, rtol=0, atol=1e-4 if name == "e-beam" else 1e-5)
 
 
@@ -285,6 +285,6 @@ def test_pointwise_networks_by_knots_equal_those_per_pixel():
     per_pixel.load_state_dict(by_knots.state_dict())
     with torch.no_grad():
         difference = (by_knots(layout()) - per_pixel(layout())).abs().max()
-    # 1,025 knots over 1.2 µm are 1.2 nm apart. Only a kink between two knots is missed, by at most a quarter
-    # of the spacing times the change of slope, which is below 0.1 here: 0.03 nm.
+    # 1,025 knots over 1.2 µm are 1.2 nm apart. The error is largest at a kink between two knots: a quarter
+    # of the spacing times the change of slope. This change is below 0.1, so the error is below 0.03 nm.
     assert float(difference) < 5e-5

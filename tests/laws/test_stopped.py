@@ -1,6 +1,6 @@
-"""A command that is stopped after any write and given again has the same result, with nothing else left.
+"""Check that a command that is stopped after any write and run again leaves the same files as without a stop.
 
-``python -m tests.stopped_commands NAME FOLDER every`` stops it after each.
+``python -m tests.stopped_commands NAME FOLDER every`` stops a command after each of its writes.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from litho_models.cli.app import app as models
 from tests.stopped_commands import COMMANDS
 
 ROOT = Path(__file__).parents[2]
-# One command for each way to write: a store, growing parts, a whole folder, a plan from kept tiles, a file.
+# Each of these commands writes in another way: a store, a growing folder, a whole folder, a plan that
+# continues from kept tiles, and a file.
 QUICK = ("build", "train-network", "freeze", "next-print", "export-design")
-# These are so short that the test stops them after each of their writes.
+# These commands are so short that the test stops them after each of their writes.
 EVERY = {"freeze", "export-design"}
-# These write one file, or a folder whose parts are written by other commands.
+# These commands write one file, or a folder whose parts are written by other commands.
 ELSEWHERE = {"level", "predict", "sheet-read"}
 
 
 def test_every_command_that_writes_a_folder_is_stopped() -> None:
-    """Every command that takes ``out`` has an entry, which may have a suffix where packages share a name."""
+    """Check that every command with the option ``out`` is in ``COMMANDS``, possibly with a suffix."""
     for app in (data, models, design):
         for name, command in _commands(get_command(app)):
             if name not in ELSEWHERE and any(one.name == "out" for one in command.params):
@@ -45,7 +46,7 @@ def _commands(group: click.Command, before: str = "") -> Iterator[tuple[str, cli
         yield from _commands(command, f"{before}-{name}".strip("-"))
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this test needs os.fork")
 @pytest.mark.parametrize(
     "name", [one if one in QUICK else pytest.param(one, marks=pytest.mark.long) for one in COMMANDS]
 )

@@ -1,4 +1,4 @@
-"""Write small AFM files for the reader tests. Each writer uses only the description of its format."""
+"""Write small AFM files to test the readers. Each writer follows only the description of its format."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-# ny != nx, no symmetry, and one corner that sticks out: a flip, a rotation or a transposition is noticed.
+# The map is not square, has no symmetry and one high corner, so that any flip or rotation is noticed.
 SHAPE = (5, 8)
 SIZE_UM = (2.5, 1.6)
 HEIGHT_UM = 0.001 * (10 * np.arange(5)[:, None] + np.arange(8)[None, :]).astype(float)
@@ -43,7 +43,7 @@ def write_gwy(
 
 
 def write_spm(path: Path, counts: np.ndarray, *, hard_v: float, sensitivity_nm_per_v: float) -> None:
-    """Write a Bruker Nanoscope file: 16-bit counts, rows from the bottom up."""
+    """Write a Bruker Nanoscope file with 16-bit counts and rows from bottom to top."""
     data = counts[::-1].astype("<i2").tobytes()
     ny, nx = counts.shape
     header = [
@@ -67,7 +67,7 @@ def write_spm(path: Path, counts: np.ndarray, *, hard_v: float, sensitivity_nm_p
 
 
 def write_sur(path: Path, counts: np.ndarray, *, height_per_count_um: float) -> None:
-    """Write a Digital Surf file: 32-bit counts, the first row at the top."""
+    """Write a Digital Surf file with 32-bit counts and rows from top to bottom."""
     ny, nx = counts.shape
     head = struct.pack("<12s4H30s30s", b"DIGITAL SURF", 0, 1, 1, 1, b"scan".ljust(30), b"".ljust(30))
     head += struct.pack("<5H2IH", 0, 0, 0, 0, 1, 0, 0, 32)
@@ -80,7 +80,7 @@ def write_sur(path: Path, counts: np.ndarray, *, height_per_count_um: float) -> 
 
 
 def write_ibw(path: Path, channels: dict[str, np.ndarray], note: str) -> None:
-    """Write an Igor binary wave 5 as Asylum does: wave[x, y, channel], y from the bottom up, metres."""
+    """Write an Igor binary wave 5 as Asylum does: wave[x, y, channel] in metres, with y upwards."""
     layers = np.stack([values[::-1].T for values in channels.values()], axis=2)
     nx, ny, count = layers.shape
     raw_note = note.encode("latin-1")
@@ -99,9 +99,9 @@ def write_ibw(path: Path, channels: dict[str, np.ndarray], note: str) -> None:
 
 
 def write_jpk(path: Path, counts: np.ndarray) -> None:
-    """Write a JPK image: TIFF pages with private tags, rows from the bottom up, two scalings of one page.
+    """Write a JPK image: TIFF pages with private tags, rows from bottom to top, and two scalings of one page.
 
-    The slot "nominal" is a decoy with 7 nm + 3 nm per count. The default slot has 5 nm + 0.25 nm per count.
+    The slot "nominal" is a decoy: 7 nm + 3 nm per count. The default slot has 5 nm + 0.25 nm per count.
     """
     import tifffile
 
@@ -134,7 +134,7 @@ def write_jpk(path: Path, counts: np.ndarray) -> None:
 
 
 def write_x3p(path: Path, height_m: np.ndarray) -> None:
-    """Write an ISO 25178-72 container: XML in a ZIP, float64 rows, the first row at the top."""
+    """Write an ISO 25178-72 file: a ZIP archive of XML and float64 rows from top to bottom."""
     import zipfile
 
     ny, nx = height_m.shape

@@ -16,27 +16,27 @@ NOISE_UM = 0.004
 
 
 def layout_of(seed: int, shape: tuple[int, int] = (112, 112)) -> np.ndarray:
-    """Return random smooth levels, uint8."""
+    """Return a layout of random smooth levels as uint8."""
     smooth = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(shape), 3.0)
     low, high = np.percentile(smooth, [2, 98])
     return np.clip((smooth - low) / (high - low) * (LEVELS - 1), 0, LEVELS - 1).round().astype(np.uint8)
 
 
 def height_of(layout: np.ndarray, seed: int) -> np.ndarray:
-    """Return the heights that a scan of the print shows, with a margin of ``MARGIN_PX``, µm."""
+    """Return the heights in µm of a scan of the print, including a margin of ``MARGIN_PX``."""
     print_um = ndimage.gaussian_filter(layout * LEVEL_HEIGHT_UM, 1.0)
     height = np.pad(print_um, MARGIN_PX, mode="edge")
     return height + NOISE_UM * np.random.default_rng(1000 + seed).standard_normal(height.shape)
 
 
 def write_scan(path: Path, height_um: np.ndarray) -> None:
-    """Write a text matrix in metres, in the style of the microscope that scanned the measured prints."""
+    """Write a scan as a text matrix in metres, in the format of the scans of the measured prints."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savetxt(path, height_um * 1e-6, fmt="%.5e", delimiter="\t", newline="\r\n")
 
 
 def write_campaign(folder: Path, count: int = 3, shape: tuple[int, int] = (112, 112), **card: str) -> Path:
-    """Write layouts ``P11``, ``P12``, … with scans of one size, and return the path of ``card.toml``."""
+    """Write layouts ``P11``, ``P12``, … and their scans, and return the path of ``card.toml``."""
     for index in range(count):
         layout = layout_of(index, shape)
         scan_id = f"P{1 + index // 2}{1 + index % 2}"
@@ -52,7 +52,7 @@ def write_campaign(folder: Path, count: int = 3, shape: tuple[int, int] = (112, 
 def card_text(
     size_um: str = "[12.8, 12.8]", *, unit: str = '"m"', pitch_um: str = "0.1", more: str = ""
 ) -> str:
-    """Return the text of a card. Values are TOML; ``more`` is appended."""
+    """Return the text of a card. The arguments are written as TOML values, and ``more`` is appended."""
     return f"""
 name = "test-prints"
 [layout]

@@ -1,4 +1,4 @@
-"""Provide one small built store for all tests of the store. Tests that change it work on a copy."""
+"""Provide one small store for all tests of the store. Tests that change it work on a copy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.litho_data.campaigns import write_campaign
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with ``card.toml``, three scans, and the built ``prints.zarr``.
 
-    It must not be changed.
+    Tests must not change the folder.
     """
     folder = tmp_path_factory.mktemp("campaign")
     build_dataset(write_campaign(folder), folder / "prints.zarr")
@@ -24,5 +24,5 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def own_campaign(campaign: Path, tmp_path: Path) -> Path:
-    """A copy of ``campaign`` that a test may damage."""
+    """Return a copy of ``campaign`` that a test may change or damage."""
     return Path(shutil.copytree(campaign, tmp_path / "campaign"))

@@ -1,4 +1,4 @@
-"""Surfaces under tips of known radius, on a grid four times as fine as the scan."""
+"""Simulate scans of surfaces with a tip of known radius, on a grid four times as fine as the scan."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OVER = 4
 def print_under_tip(
     kind: str, radius_um: float, height_um: float, seed: int = 11, size_px: int = SIZE_PX
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image (size, size) under a paraboloid, µm, and the share of each pixel that is touched."""
+    """Return the image of a surface by a paraboloid, in µm, and the share of each pixel that it touches."""
     fine_um = PITCH_UM[0] / OVER
     reach = int(np.ceil(np.sqrt(2 * radius_um * height_um) / fine_um)) + 1
     parabola = -((np.arange(-reach, reach + 1) * fine_um) ** 2) / (2 * radius_um)
@@ -25,7 +25,7 @@ def print_under_tip(
 
     surface = fine_surface(kind, height_um, seed, size_px)
     image = dilated(surface)
-    # A contact may lie between two points of the fine grid. There the image misses the surface by up to
+    # Where a contact lies between two points of the fine grid, the image misses the surface by up to
     # fine²/2R.
     touched = -dilated(-image) - surface < 2 * fine_um**2 / radius_um
     share = touched.reshape(size_px, OVER, size_px, OVER).mean(axis=(1, 3))
@@ -33,7 +33,7 @@ def print_under_tip(
 
 
 def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX) -> np.ndarray:
-    """Return pillars of one height, or spikes or bumps of several, µm, OVER times as fine as the scan."""
+    """Return a surface in µm of equal pillars, or of different spikes or bumps, on the fine grid."""
     rng, size = np.random.default_rng(seed), size_px * OVER
     surface = np.zeros((size, size))
     for _ in range(size_px**2 // 2000):
@@ -51,5 +51,5 @@ def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX)
 
 
 def noise_of_snr(shape: tuple[int, ...], height_um: float, snr: float, seed: int) -> np.ndarray:
-    """Return white noise, µm, whose standard deviation is ``height_um / snr``."""
+    """Return white noise in µm whose standard deviation is ``height_um / snr``."""
     return np.random.default_rng(seed + 1).standard_normal(shape) * height_um / snr

@@ -17,7 +17,7 @@ PITCH_UM = 0.15
 LEVEL_HEIGHT_UM = 0.08
 LEVELS = 13
 MARGIN_PX = 20
-# Width of bare substrate that a store keeps around a field that stands alone.
+# A store keeps this width of bare substrate around an isolated field.
 RIM_PX = 2
 JITTER_UM = 0.006
 SIDE_PX = 160
@@ -27,7 +27,7 @@ _ANGLES_DEG = (0.0, 1.5, -2.5, 4.0, -1.0, 3.0)
 
 
 def layout_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
-    """Return random smooth levels with a few blocks, uint8."""
+    """Return a layout of random smooth levels with a few blocks, as uint8."""
     rng = np.random.default_rng(IDS.index(scan_id) + 50)
     smooth = ndimage.gaussian_filter(rng.standard_normal((side_px, side_px)), 5.0)
     low, high = np.percentile(smooth, [3, 97])
@@ -39,14 +39,14 @@ def layout_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
 
 
 def print_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
-    """Return the true heights on the layout's grid, with the bare substrate around them, µm."""
+    """Return the true heights in µm on the layout's grid, including the bare substrate around them."""
     level = np.pad(layout_of(scan_id, side_px).astype(float) + 2.0, 2 * MARGIN_PX)
     exposed = ndimage.gaussian_filter(level, 1.6)
     return LEVEL_HEIGHT_UM * (exposed + 0.015 * exposed**2)
 
 
 def scan_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
-    """Return the scan, µm: the print turned, with a tilt, a bow, an offset of each line, and noise."""
+    """Return a scan in µm: the rotated print with a tilt, a bow, line offsets and noise."""
     rng = np.random.default_rng(IDS.index(scan_id) + 7)
     truth = print_of(scan_id, side_px)
     if scan_id == MIRRORED:
@@ -61,7 +61,7 @@ def scan_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
 
 
 def write_lab(folder: Path, side_px: int = SIDE_PX, ids: tuple[str, ...] = IDS, **changed: str) -> Path:
-    """Write layouts, scans, table and card. ``changed`` maps keys of the card to other TOML values."""
+    """Write layouts, scans, table and card. ``changed`` replaces values of the card by other TOML values."""
     (folder / "layouts").mkdir(parents=True)
     (folder / "scans").mkdir()
     for scan_id in ids:
@@ -110,7 +110,7 @@ def _write(folder: Path, scan_id: str, height_um: np.ndarray) -> None:
 
 
 def errors_nm(store: object) -> dict[str, float]:
-    """Return the mean absolute error of each scan against the true heights, nm, after a free offset."""
+    """Return the mean absolute error of each scan in nm, after the median error is subtracted."""
     found = {}
     for scan in store.scans():  # type: ignore[attr-defined]
         inner = slice(2 * MARGIN_PX, -2 * MARGIN_PX)

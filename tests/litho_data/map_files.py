@@ -1,4 +1,4 @@
-"""Write height maps as other programs do: known maps in many containers, units, axes, marks, channels."""
+"""Write known height maps as other programs do, in many formats, units and arrangements."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.litho_data import afm_files
 
 @dataclass
 class MapFile:
-    """A written map: heights in µm with NaN where missing, and the arguments that a reader needs.
+    """Describe a written map: its heights in µm, NaN where missing, and the arguments that a reader needs.
 
-    ``says_size`` and ``asks`` are facts of the format: whether the file states the size, and whether it
-    cannot be read without the arguments. ``atol_um`` is half a step of the written numbers.
+    ``says_size`` tells whether the file states the size of the map. ``asks`` tells whether the file cannot be
+    read without the arguments. ``atol_um`` is half a step of the written numbers.
     """
 
     height_um: np.ndarray
@@ -36,7 +36,7 @@ class MapFile:
     atol_um: float = 1e-9
 
     def in_unit(self) -> np.ndarray:
-        """Return the heights in the file's unit, with the mark in place of NaN."""
+        """Return the heights in the file's unit, with NaN replaced by the mark of missing pixels."""
         values = self.height_um / um_per(self.unit)
         return (
             values
@@ -45,20 +45,20 @@ class MapFile:
         )
 
     def needs(self, **arguments: Any) -> None:
-        """Record that the file cannot be read without these arguments."""
+        """Record that a reader cannot read the file without these arguments."""
         self.arguments |= arguments
         self.asks = True
 
     def needs_mark(self) -> None:
-        """Record that the reader must be told the mark.
+        """Record that the reader must be told which value marks missing pixels.
 
-        The file does not say that the mark means a missing pixel.
+        The file itself does not say so.
         """
         if self.mark is not None and np.isnan(self.height_um).any():
             self.needs(missing=[self.mark])
 
     def rows(self, separator: str = "\t", decimal: str = ".") -> list[str]:
-        """Return lines of numbers with ten digits."""
+        """Return the rows of the map as lines of text, with ten digits per number."""
 
         def cell(value: float) -> str:
             if np.isnan(value):
@@ -69,12 +69,12 @@ class MapFile:
 
     @property
     def size_um(self) -> tuple[float, float]:
-        """Size (y, x) from edge to edge, µm."""
+        """Return the size (y, x) of the map in µm, from edge to edge."""
         return self.height_um.shape[0] * self.pitch_um, self.height_um.shape[1] * self.pitch_um
 
 
 def random_map(rng: np.random.Generator) -> np.ndarray:
-    """Return heights of 0.1 to 1 µm without any symmetry, in steps of 0.1 nm."""
+    """Return an asymmetric map of heights between 0.1 and 1 µm, in steps of 0.1 nm."""
     ny, nx = rng.choice(np.arange(9, 24), 2, replace=False)
     y, x = np.mgrid[0:ny, 0:nx]
     height = 0.1 + 0.4 * rng.random((ny, nx)) + 0.01 * y + 0.005 * x
@@ -86,7 +86,7 @@ Writer = Callable[[Path, MapFile, np.random.Generator], None]
 
 
 def text(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a matrix, with or without a header, in one of the spellings that occur."""
+    """Write a text matrix, with or without a header, in one of the notations that occur in practice."""
     separator, decimal = [("\t", "."), (" ", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")][
         rng.integers(6)
     ]
@@ -110,7 +110,7 @@ def text(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write Gwyddion's export of two channels, separated by a blank line or by headers."""
+    """Write two channels as Gwyddion exports them to text, separated by a blank line or by headers."""
     rows = one.rows()
     other = ["\t".join(f"{value:.3f}" for value in row) for row in np.nan_to_num(one.height_um) * 30]
     if rng.random() < 0.5:
@@ -131,7 +131,7 @@ def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> 
 
 
 def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a matrix as spreadsheets do: coordinates in µm fill its first row and its first column."""
+    """Write a matrix as spreadsheets do, with coordinates in µm in its first row and column."""
     separator, decimal = [(",", "."), (";", ","), ("\t", ".")][rng.integers(3)]
     rows = one.rows(separator, decimal)
     nx = one.height_um.shape[1]
@@ -162,7 +162,7 @@ def frame(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def points(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write the points x, y, z of the whole grid, one per line. Missing pixels may have no point."""
+    """Write the points x, y, z of the grid, one per line. Missing pixels may be left out."""
     ny, nx = one.height_um.shape
     y, x = (axis.ravel() * one.pitch_um / um_per(one.unit) for axis in np.mgrid[0:ny, 0:nx])
     table = np.column_stack([x, y, one.height_um.ravel() / um_per(one.unit)])
@@ -174,7 +174,7 @@ def points(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def surfer(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Surfer grid of one of the three kinds, coordinates in µm."""
+    """Write a Surfer grid of one of the three kinds, with coordinates in µm."""
     ny, nx = one.height_um.shape
     blank, upward = 1.70141e38, one.height_um[::-1] / um_per(one.unit)
     values = np.where(np.isnan(upward), blank, upward)
@@ -213,7 +213,7 @@ def esri(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def wyko(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write Wyko ASCII: columns from the bottom up, in nm or in waves."""
+    """Write Wyko ASCII: column by column, each from bottom to top, in nm or in waves."""
     ny, nx = one.height_um.shape
     real = rng.integers(2)
     values = one.height_um * 1e3 / (1 if real else 632.8)
@@ -228,7 +228,7 @@ def wyko(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def tiff(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a TIFF of real numbers, or of counts with a calibration by ImageJ or GDAL."""
+    """Write a TIFF of real numbers, or of counts with a calibration as ImageJ or GDAL state it."""
     kind = rng.integers(3)
     values = one.in_unit()
     if kind == 0:
@@ -252,7 +252,7 @@ def tiff(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def hdf5(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write HDF5 that follows no program: counts with the attributes of the CF conventions."""
+    """Write HDF5 in the style of no particular program: counts with attributes of the CF conventions."""
     counts = np.where(np.isnan(one.height_um), -1, np.round(one.height_um * 1e4)).astype(np.int32)
     with h5py.File(path, "w") as file:
         data = file.create_dataset("scan/height", data=counts)
@@ -263,7 +263,7 @@ def hdf5(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def netcdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write NetCDF 3 or 4 with xarray: dimensions in either order, coordinates in µm."""
+    """Write NetCDF 3 or 4 with xarray, with the dimensions in either order and coordinates in µm."""
     import xarray as xr
 
     ny, nx = one.height_um.shape
@@ -283,7 +283,7 @@ def netcdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def matlab(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write MATLAB 5, or MATLAB 7.3: HDF5 behind a header, arrays column by column."""
+    """Write a MATLAB file of version 5, or of version 7.3, which is HDF5 with transposed arrays."""
     from scipy.io import savemat
 
     if rng.random() < 0.5:
@@ -298,7 +298,7 @@ def matlab(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Nanosurf file: counts over the range of int32, two signals, the image flat or in lines."""
+    """Write a Nanosurf file with two signals as int32 counts, each image flat or in lines."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     counts = np.round(one.height_um * 1e-6 / 2e-6 * (2**31 - 1)).astype(np.int32)
@@ -317,7 +317,7 @@ def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Digital Surf file, uncompressed or compressed in two streams."""
+    """Write a Digital Surf file, either uncompressed or compressed in two streams."""
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     afm_files.write_sur(path, np.round(one.height_um * 1e4).astype(int), height_per_count_um=1e-4)
     if rng.random() < 0.6:
@@ -329,14 +329,14 @@ def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
         )
         path.write_bytes(b"DSCOMPRESSED" + raw[12:512] + struct.pack("<I", 2) + sizes + b"".join(packed))
     one.mark, one.atol_um = None, 1e-6
-    one.says_size = False  # that of the other tests' writer
+    one.says_size = False  # as the writer of the other tests does
     one.pitch_um = float("nan")
 
 
 def park(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Park Systems file: a picture in the page, counts and their scale in private tags.
+    """Write a Park Systems file: a TIFF page with a preview, and the counts and their scale in private tags.
 
-    The last row comes first.
+    The rows run from bottom to top.
     """
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
@@ -368,7 +368,7 @@ def park(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def sdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write ISO 25178-71 as text: heights times Zscale are metres."""
+    """Write an ISO 25178-71 text file, in which a number times Zscale is a height in metres."""
     ny, nx = one.height_um.shape
     head = {
         "ManufacID": "TEST", "CreateDate": "010120200000", "ModDate": "010120200000", "NumPoints": nx,
@@ -383,7 +383,7 @@ def sdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def bcr(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a BCR file: a text header of 2048 bytes, counts of 16 bits, lengths in nm."""
+    """Write a BCR file: a text header of 2048 bytes with lengths in nm, then 16-bit counts."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     says = {
@@ -396,7 +396,7 @@ def bcr(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def gsf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Gwyddion Simple Field."""
+    """Write a Gwyddion Simple Field file (GSF)."""
     size_y, size_x = one.size_um
     header = {"XReal": f"{size_x * 1e-6!r}", "YReal": f"{size_y * 1e-6!r}", "XYUnits": "m", "ZUnits": "m"}
     afm_files.write_gsf(path, one.height_um * 1e-6, header)
@@ -404,7 +404,7 @@ def gsf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def numpy_archive(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write NPY, or NPZ with two maps."""
+    """Write an NPY file, or an NPZ file with two maps."""
     stream = io.BytesIO()
     if rng.random() < 0.5:
         np.save(stream, one.in_unit())

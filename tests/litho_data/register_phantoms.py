@@ -1,4 +1,4 @@
-"""Make phantoms: scans of prints whose warp is known, clean, with defects, or with creep of the scanner."""
+"""Make phantoms: scans of prints with a known warp, some with defects or with creep of the scanner."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Seen = Callable[[np.ndarray], np.ndarray]
 
 
 def random_layout(shape: tuple[int, int], seed: int, blob_px: float = 8.0, levels: int = 13) -> np.ndarray:
-    """Return low-passed noise, stretched over the levels."""
+    """Return a random layout: low-pass noise scaled to the range of levels."""
     noise = gaussian_filter(np.random.default_rng(seed).standard_normal(shape), blob_px, mode="wrap")
     noise = (noise - noise.min()) / np.ptp(noise)
     return np.minimum(noise * levels, levels - 1).astype(np.uint8)
@@ -45,7 +45,7 @@ def warp_about_centre(
     margin_px: tuple[float, float] = (14.0, 14.0),
     perspective: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Return the map from layout index to scan index, about the middle of the layout. Pairs are (x, y)."""
+    """Return the matrix from layout to scan indices, given a warp about the centre; pairs are (x, y)."""
     angle = np.radians(rotation_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     middle = centre(shape)
@@ -68,10 +68,10 @@ def scan_of(
     orientation: str = "identity",
     polarity: int = 1,
 ) -> np.ndarray:
-    """Return the heights, µm, of the blurred print seen through a warp, with noise, turned and signed.
+    """Return a scan in µm: the blurred print, warped, with noise, re-oriented, and times ``polarity``.
 
-    ``snr`` is the standard deviation of the print over that of white noise. ``orient(result, orientation)``
-    turns the result upright again.
+    ``snr`` is the standard deviation of the print divided by that of the white noise. The function
+    ``orient(result, orientation)`` makes the result upright again.
     """
     height = LEVEL_HEIGHT_UM * gaussian_filter(layout_level.astype(float), PRINT_BLUR_PX, mode="constant")
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan_shape)
@@ -86,7 +86,7 @@ def scan_of(
 def true_scan_to_layout(
     layout_to_scan: np.ndarray, orientation: str, scan_shape: tuple[int, int]
 ) -> np.ndarray:
-    """Return the true map, µm, for a scan of ``scan_of``. ``scan_shape`` is the shape of the upright scan."""
+    """Return the true matrix in µm of a result of ``scan_of``; ``scan_shape`` is that of the upright scan."""
     back = INVERSE.get(orientation, orientation)
     frame = index_to_um((PITCH_UM, PITCH_UM))
     to_turned = orientation_matrix(back, scan_shape) @ layout_to_scan
@@ -94,7 +94,7 @@ def true_scan_to_layout(
 
 
 def warp_error_px(found: np.ndarray, true: np.ndarray, layout_shape: tuple[int, int]) -> float:
-    """Return the largest distance between two ``scan_to_layout`` maps over the layout, in layout pixels."""
+    """Return by how many layout pixels two ``scan_to_layout`` matrices differ at most on the layout."""
     ny, nx = layout_shape
     y, x = np.meshgrid(np.linspace(0, ny, 9), np.linspace(0, nx, 9), indexing="ij")
     points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
@@ -103,12 +103,12 @@ def warp_error_px(found: np.ndarray, true: np.ndarray, layout_shape: tuple[int, 
 
 
 def register(scan: np.ndarray, layout: np.ndarray, **options: Any) -> Registration:
-    """Register a phantom as a build does."""
+    """Register a phantom in the same way as a build does."""
     return register_scan(scan, layout, scan_pitch_um=(PITCH_UM,) * 2, layout_pitch_um=PITCH_UM, **options)
 
 
 def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a layout, and the map from its indices to those of its scan."""
+    """Return a layout and the matrix from its indices to those of its scan."""
     layout = random_layout(SHAPE, seed, blob_px=7.0)
     warp = warp_about_centre(
         SHAPE, rotation_deg=0.6, scale=(1.015, 0.99), shift_px=(3.3, -2.2), margin_px=(28.0, 28.0)
@@ -117,7 +117,7 @@ def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rms_error_px(found: Registration, warp: np.ndarray, seen: Seen | None = None) -> float:
-    """Return the rms error of a registration over the layout, 8 px from its border, in layout pixels.
+    """Return the rms error of a registration in layout pixels, without a border of 8 px.
 
     ``seen`` maps true points of the scan to the points where they appear.
     """
@@ -132,7 +132,7 @@ def rms_error_px(found: Registration, warp: np.ndarray, seen: Seen | None = None
 
 
 def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Add eight particles of 0.5 to 1.6 µm radius, 1 to 4 µm high."""
+    """Add eight dust particles with radii of 0.5 to 1.6 µm and heights of 1 to 4 µm to a scan."""
     y, x = np.mgrid[: scan.shape[0], : scan.shape[1]]
     for _ in range(8):
         middle, radius = rng.uniform(0.08, 0.92, 2) * scan.shape, rng.uniform(5, 16)
@@ -142,14 +142,14 @@ def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def missing_corner(scan: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
-    """Put bare substrate in a corner that takes this share of both sides of the print."""
+    """Replace a corner of the print by bare substrate. Its sides are this share of the sides of the print."""
     scan, side = scan.copy(), 28 + round(share * SHAPE[0])
     scan[:side, :side] = BARE_UM * rng.standard_normal((side, side))
     return scan
 
 
 def delaminated(scan: np.ndarray, rng: np.random.Generator, lift_um: float) -> np.ndarray:
-    """Lift a tenth of the print, or remove it where ``lift_um`` is 0."""
+    """Lift a tenth of the print by ``lift_um``, or remove it if ``lift_um`` is 0."""
     smooth = gaussian_filter(rng.standard_normal(scan.shape), 25)
     off = smooth > np.quantile(smooth, 0.9)
     return np.where(off, scan + lift_um if lift_um else BARE_UM * rng.standard_normal(scan.shape), scan)
@@ -168,9 +168,9 @@ DEFECTS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 def creeping(
     layout: np.ndarray, warp: np.ndarray, creep_um: float, slow: int, constant: float = 0.25
 ) -> tuple[np.ndarray, Seen]:
-    """Return a scan whose scanner settles with a time constant, and the map of its distortion.
+    """Return a scan by a scanner that creeps exponentially, and the function of its distortion.
 
-    The map takes true points to the points where they appear, µm.
+    The function takes true points in µm to the points where they appear.
     """
     place = np.arange(SCAN_SHAPE[0])
     settling_px = creep_um / PITCH_UM * np.exp(-place / (constant * SCAN_SHAPE[0]))

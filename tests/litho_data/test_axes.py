@@ -1,4 +1,4 @@
-"""Test axes, signs and half pixels on grids where an error in any of them is noticed."""
+"""Test axes, signs and half-pixel offsets on grids where an error in any of them is noticed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_canvas_surrounds_its_layout_and_the_layout_is_centred_on_its_place(sh
     np.testing.assert_allclose(canvas.x_um[0, inside], grid.x_um, atol=1e-12)
     for axis, offset in enumerate(canvas.field_offset_um()):
         along = np.ravel(offset)[inside]
-        # The pixel centres lie on both sides of the centre of the layout, and that centre lies at its place.
+        # The pixel centres are symmetric about the centre of the layout, which lies at its place.
         assert along.mean() == pytest.approx(place_um[axis], abs=1e-12)
         assert along[-1] - along[0] == pytest.approx((shape[axis] - 1) * pitch_um)
 
@@ -81,16 +81,16 @@ def test_the_matrix_of_an_orientation_says_where_each_pixel_goes(
 def test_a_bend_read_from_the_store_equals_the_one_that_registration_found(
     orientation: str, shape: tuple[int, int], pitch_um: tuple[float, float]
 ) -> None:
-    """Registration finds the bend on indices of the turned scan.
+    """Check that a bend is the same in the store.
 
-    The store keeps it in the frame of the raw scan.
+    Registration finds the bend in indices of the re-oriented scan, but the store states it for the raw scan.
     """
     layout_pitch_um = 0.1
     case = _Case(np.zeros(shape), np.zeros((50, 62), int), pitch_um, layout_pitch_um, 0, None, {})
     ny, nx = (round(n * p / layout_pitch_um) for n, p in zip(shape, pitch_um, strict=True))
     turned = orient(np.zeros((ny, nx)), orientation).shape
     bend = Bend.none_yet((turned[0], turned[1]))
-    # The bend is a few pixels at the rim, with different amounts along x and y.
+    # The bend is a few pixels at the border, and differs between x and y.
     bend = Bend(np.array([[2.0, 0.7, -1.1], [-0.4, 1.3, 0.9]]), bend.middle, bend.half)
     layout_to_oriented = np.array([[1.02, 0.01, 3.0], [-0.02, 0.97, -5.0], [0, 0, 1]])
     found = SimpleNamespace(layout_to_scan=layout_to_oriented, bend=bend)
@@ -108,7 +108,7 @@ def test_a_bend_read_from_the_store_equals_the_one_that_registration_found(
     )
     wanted = apply_transform(frame @ np.linalg.inv(layout_to_oriented), bend.straighten(oriented))
     got = apply_transform(np.linalg.inv(layout_to_scan), stored.straighten(points_um))
-    # Each of six amounts is rounded to a millionth of a micrometre and weighted by 2/3 or 1 at most.
+    # Each of six coefficients is rounded to a millionth of a micrometre and has a weight of at most 1.
     np.testing.assert_allclose(got, wanted, atol=6e-6)
 
 

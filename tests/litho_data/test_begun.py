@@ -1,4 +1,4 @@
-"""Stop a command after any of its writes and repeat it: the result is the same."""
+"""Check that a command that is stopped after any of its writes and repeated gives the same result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FACTS = {"dataset": {"name": "prints"}, "settings": {"seed": 0}}
 
 
 def grow(out: Path, facts: dict[str, object] = FACTS) -> None:
-    """Run a command that keeps its finished parts: a folder, a file, and last the record."""
+    """Run a command that keeps finished parts when stopped. It writes a folder, a file and a record."""
     with growing_folder(out, "sums.json", facts) as begun:
         if not (begun.folder / "part").exists():
             with atomic_folder(begun.folder / "part") as part:
@@ -30,14 +30,14 @@ def grow(out: Path, facts: dict[str, object] = FACTS) -> None:
 
 
 def replace(out: Path) -> None:
-    """Run a command whose result appears as a whole."""
+    """Run a command that replaces its result as a whole."""
     with whole_folder(out, "*.txt", "sums.json", record="sums.json", facts=FACTS) as folder:
         (folder / "a.txt").write_text("1")
         (folder / "sums.json").write_text(json.dumps(FACTS))
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Return everything below a folder: the text of each file, hidden ones too."""
+    """Return the text of every file in a folder, including hidden files."""
     return {
         str(path.relative_to(folder)): path.read_text() if path.is_file() else ""
         for path in folder.rglob("*")
@@ -89,7 +89,7 @@ def test_a_begun_folder_is_continued_by_the_same_command_only(tmp_path: Path) ->
 
 
 def test_continuing_a_folder_does_not_rewrite_its_mark(tmp_path: Path) -> None:
-    """A process that is stopped while it rewrites the mark would leave parts without a valid mark."""
+    """Check this because a process stopped while it rewrites the mark would leave parts without a mark."""
     assert stopped_after(5, lambda: grow(tmp_path), tmp_path)
     os.utime(tmp_path / BEGUN, (0, 0))
     with growing_folder(tmp_path, "sums.json", FACTS) as begun:
@@ -104,7 +104,7 @@ def test_a_command_that_fails_before_its_first_part_leaves_nothing(tmp_path: Pat
         with pytest.raises(ZeroDivisionError), growing_folder(tmp_path / name, "sums.json"):
             raise ZeroDivisionError
         assert (tmp_path / name).exists() is stays
-    # A command was stopped after it created the mark and before it wrote to it.
+    # This is what a command leaves that is stopped after creating the mark and before writing to it.
     (tmp_path / "empty" / BEGUN).touch()
     grow(tmp_path / "empty")
     (tmp_path / "empty" / "sums.json").unlink()

@@ -1,4 +1,4 @@
-"""Test what all benchmarks share: where their text goes on a page, and what their records state."""
+"""Test what all benchmarks share: how they put text on a page, and what their records state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_record_states_the_command_and_commit_that_made_it(tmp_path, monkeypat
     assert record["command"].endswith("--repeats 1")
     assert record["commit"] == run_facts()["commit"]
     assert record["versions"]["numpy"] == np.__version__
-    # A module is named as it is started.
+    # A module is recorded in the form in which it was started.
     asked = "from benchmarks.record import origin; print(origin()['command'])"
     (tmp_path / "asked.py").write_text(asked)
     places = os.pathsep.join([str(Path(__file__).parents[2]), str(tmp_path)])

@@ -1,4 +1,4 @@
-"""A build keeps good scans, names bad ones, is repeatable, and never leaves half a store."""
+"""Check that a build keeps good scans, names bad ones, is repeatable, and never leaves half a store."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ def test_heights_come_back_on_the_layout(campaign: Path) -> None:
         np.testing.assert_array_equal(scan.mask_level, layout)
         truth = height_of(layout, index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
         assert scan.valid.all()
-        # The scan lies on the layout's grid, shifted by whole pixels. Resampling keeps 0.76 of the noise
-        # variance, so the difference of two noises has less than twice the sd of one. A registration error of
-        # 0.02 px adds about 2 nm.
+        # The scan is shifted from the layout's grid by whole pixels. Resampling keeps 0.76 of the noise
+        # variance, so the difference of the two noises has less than twice the sd of one. A registration
+        # error of 0.02 px adds about 2 nm.
         assert np.std(scan.height_um - truth) < 2 * NOISE_UM
         assert scan.print_id == scan.id[1]
         assert scan.order == index
         assert scan.layout_um[5, 7] == pytest.approx(layout[5, 7] * LEVEL_HEIGHT_UM)
         corner = scan.scan_to_layout @ [MARGIN_PX * 0.1, MARGIN_PX * 0.1, 1]
-        # The held-out registration error of these scans is below 0.05 px = 0.005 µm. The corner may be off by
-        # three times that.
+        # The held-out registration error of these scans is below 0.05 px, or 0.005 µm. At the corner, three
+        # times that is allowed.
         np.testing.assert_allclose(corner, [0, 0, 1], atol=0.015)
 
 
 def test_raw_heights_are_kept_as_read(campaign: Path) -> None:
     store = open_store(campaign / "prints.zarr")
     text = np.loadtxt(campaign / "scans" / "P12.txt") * 1e6
-    # float32 keeps 24 bits.
+    # float32 numbers have 24 significant bits.
     np.testing.assert_allclose(store.scan_frame("P12", "raw_height_um"), text, rtol=2**-24)
     np.testing.assert_array_equal(store.scan_frame("P12", "removed_um"), 0)
 
@@ -85,18 +85,18 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     card = write_campaign(tmp_path, count=3)
     good = (tmp_path / "scans" / "P11.txt").read_text()
     bad = {
-        "P31": good[: len(good) // 2],  # a text that ends within a row
+        "P31": good[: len(good) // 2],  # the text ends within a row
         "P32": "\n".join(["nan\t" * 127 + "nan"] * 128),
         "P33": "\n".join(good.splitlines()[:125]),  # readable, but rows are missing
         "P34": "\x00\x01 no heights",
         "P35": good,  # its layout has too many levels
-        "P37": "\n".join(good.splitlines()[:64]),  # half the rows: cannot be registered
+        "P37": "\n".join(good.splitlines()[:64]),  # with half of the rows, it cannot be registered
     }
     for scan_id, text in bad.items():
         shutil.copy(tmp_path / "layouts" / "P11.tif", tmp_path / "layouts" / f"{scan_id}.tif")
         (tmp_path / "scans" / f"{scan_id}.txt").write_text(text)
     tifffile.imwrite(tmp_path / "layouts" / "P35.tif", layout_of(0) + 4)
-    write_scan(tmp_path / "scans" / "P36.txt", height_of(layout_of(6), 6))  # without layout
+    write_scan(tmp_path / "scans" / "P36.txt", height_of(layout_of(6), 6))  # it has no layout
 
     result = build_dataset(card, tmp_path / "prints.zarr")
     skipped = result.skipped
@@ -105,7 +105,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     assert "finite" in skipped["P32"]
     assert "rows or columns are missing" in skipped["P33"]
     assert "highest level" in skipped["P35"]
-    assert skipped["P37"].endswith("pixels of 0.2 × 0.1 µm (y × x): are rows missing?")
+    assert skipped["P37"].endswith("the pixels are 0.2 × 0.1 µm (y × x): are rows missing?")
     assert [*result.unpaired] == ["P36"]
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("skipped ")]
     assert sorted(line.split()[1].rstrip(":") for line in lines) == sorted(bad)
@@ -151,8 +151,8 @@ def test_isolated_gaps_are_not_valid(tmp_path: Path) -> None:
     build_dataset(card, tmp_path / "prints.zarr")
     scan = open_store(tmp_path / "prints.zarr").scan("P11")
     assert not scan.valid[row, column]
-    # Invalid are the gap and the pixels whose interpolation uses it: at most 6 x 6, never the rest of the
-    # field.
+    # Only the gap and the at most 6 x 6 pixels whose interpolation uses it are invalid, never the rest of
+    # the field.
     assert 0 < (~scan.valid).sum() <= 36
     np.testing.assert_array_equal(np.isnan(scan.height_um), ~scan.valid)
 
@@ -170,7 +170,7 @@ def test_smaller_layouts_are_padded_and_cut_again(tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=1, shape=(144, 144))
     small = layout_of(5, (144, 128))
     tifffile.imwrite(tmp_path / "layouts" / "P12.tif", small)
-    # Both files state the same size. A wider margin around the smaller field keeps the shape of the scan.
+    # Both scans must have the same size, so the margin around the smaller field is wider.
     margin = MARGIN_PX + 8
     height = np.pad(height_of(small, 5)[:, MARGIN_PX:-MARGIN_PX], ((0, 0), (margin, margin)), mode="edge")
     write_scan(tmp_path / "scans" / "P12.txt", height)
@@ -210,7 +210,7 @@ def test_references_are_kept_apart_from_the_dataset(tmp_path: Path) -> None:
     assert (result.n_scans, result.n_references) == (1, 1)
     assert store.ids == ["P11"]
     assert store.references() == {"bare": "substrate"}
-    # White noise of 1 nm over 128² pixels: its standard deviation is known to 1 / sqrt(2 · 128²) = 0.6 %.
+    # From 128² pixels, the standard deviation of white noise is known to 1 / sqrt(2 · 128²) = 0.6 %.
     assert store.scan_frame("bare", "levelled_height_um").std() == pytest.approx(0.001, rel=0.03)
     assert verify(tmp_path / "prints.zarr").findings == ()
 
@@ -228,9 +228,9 @@ def test_a_levelling_recipe_is_applied_and_recorded(tmp_path: Path) -> None:
     raw, levelled = (
         store.scan_frame("P11", f"{name}_height_um").astype(float) for name in ("raw", "levelled")
     )
-    np.testing.assert_allclose(levelled + removed, raw, atol=1e-6)  # three float32 roundings of ~1 µm
+    np.testing.assert_allclose(levelled + removed, raw, atol=1e-6)  # three float32 roundings at ~1 µm
     slope = np.polyfit(np.arange(128), levelled.mean(axis=0), 1)[0]
-    assert abs(slope) < 1e-8  # least squares leaves no slope, up to float32 rounding
+    assert abs(slope) < 1e-8  # least squares removes the slope, up to float32 rounding
     assert store.quality["removed_sd_nm"][0] > 50
     assert store.manifest["recipe"]["step"][0]["op"] == "plane"
 
@@ -244,8 +244,8 @@ def test_layout_aware_levelling_locates_the_layout_first(tmp_path: Path) -> None
     write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
     build_dataset(card, tmp_path / "prints.zarr")
     removed = open_store(tmp_path / "prints.zarr").scan_frame("P11", "removed_um").astype(float)
-    # The margin has no layout, and the response is piecewise linear. Together they may take up to 5 % of the
-    # tilt.
+    # The margin has no layout, and the response is fitted as piecewise linear. Together, these may change the
+    # fitted tilt by up to 5 %.
     np.testing.assert_allclose(np.polyfit(np.arange(128), removed.mean(axis=0), 1)[0] * 128, 0.3, rtol=0.05)
     steps = [step.op for _, step in read_steps(open_store(tmp_path / "prints.zarr"))["P11"]]
     assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample", "uncertainty"]
@@ -288,7 +288,7 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
         content = bytearray(damaged.read_bytes())
         content[len(content) // 2] ^= 1
         damaged.write_bytes(content)
-        # Zarr leaves such a file when a write is interrupted.
+        # Zarr leaves behind such a file when a write is interrupted.
         (partial.store / "scans" / "zarr.0123.partial").write_text("{")
     text = (own_campaign / "scans" / "P12.txt").read_text()
     (own_campaign / "scans" / "P12.txt").write_text(text.replace("\t", " ", 1))

@@ -1,4 +1,4 @@
-"""All 24 measured prints build in bounded memory, with the same result for one and two workers."""
+"""Check that the 24 measured prints are built in bounded memory, and identically with one or two workers."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if __name__ == "__main__":
 
 
 def _built(out: Path, workers: int) -> tuple[str, int, float, float]:
-    """Return hash, scans, seconds and peak memory, MiB.
+    """Build the dataset and return its hash, the number of scans, the seconds, and the peak memory in MiB.
 
-    The peak is that of the process plus, for each worker, that of the largest worker.
+    The peak memory is that of the main process, plus the number of workers times that of the largest worker.
     """
     script = out.with_suffix(".py")
     script.write_text(_BUILD, encoding="utf-8")
@@ -49,14 +49,14 @@ def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_p
     sha256, scans, seconds, peak_mib = _built(tmp_path / "prints.zarr", workers=2)
     print(f"{scans} scans, 2 workers: {seconds:.1f} s, peak at most {peak_mib:.0f} MiB")
     assert scans == 24
-    # Measured: 309 + 2 x 250 MiB.
+    # A measurement gave 309 + 2 x 250 MiB.
     assert peak_mib < 1024
     store = open_store(tmp_path / "prints.zarr")
     assert store.sha256 == sha256
     assert store.quality["passed"].all()
     assert verify(tmp_path / "prints.zarr").findings == ()
 
-    # Two scans built alone, in another order and in one process, have the same arrays.
+    # Two scans that are built alone, in another order and in one process, have the same arrays as before.
     for name in ("afm_ug/FOV42.txt", "afm_ug/FOV72.txt", "mask_ug/FOV42.tif", "mask_ug/FOV72.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(measured_prints / name, tmp_path / name)

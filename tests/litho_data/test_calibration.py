@@ -1,4 +1,4 @@
-"""Gratings and steps give scales with a valid uncertainty, and a build applies both."""
+"""Check the scales found from gratings and steps, their uncertainties, and their use in a build."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ SCALE = {"x": 1.03, "y": 0.98, "z": 1.05}
 def _grating(
     rng: np.random.Generator, axis: str, scale_x: float, scale_y: float, degrees: float, size: int = 192
 ) -> np.ndarray:
-    """Return a scan of ridges 0.1 µm high, with noise of pixels and lines.
+    """Return a scan of ridges 0.1 µm high, with pixel noise and line noise.
 
-    The scanner has errors of scale.
+    The scales of the scanner are wrong by the given factors.
     """
     y, x = (np.arange(size) * PITCH_UM * scale for scale in (scale_y, scale_x))
     turn = np.radians(degrees)
@@ -42,7 +42,7 @@ def _grating(
 
 
 def _step(rng: np.random.Generator, height_um: float, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
-    """Return a step across x on a tilted field, with noise of pixels and of lines."""
+    """Return a scan of a step across x on a tilted field, with pixel noise and line noise."""
     profile = height_um * gaussian_filter((np.arange(shape[1]) >= 70).astype(float), 2.0)
     tilt = np.linspace(0, 0.1, shape[1])[None, :] + np.linspace(0, 0.3, shape[0])[:, None]
     return profile + tilt + 0.01 * rng.standard_normal(shape) + 0.05 * rng.standard_normal((shape[0], 1))
@@ -61,20 +61,20 @@ def test_a_stretched_grating_gives_both_factors_within_their_uncertainty():
         ratios.append(
             [(found[a].factor - s) / found[a].uncertainty for a, s in zip("xy", scales, strict=True)]
         )
-        # The factors are known to one part in a thousand, and the stretch is 3 %, thirty times as much.
+        # The factors are known to one part in a thousand, and the stretch of 3 % is thirty times as large.
         assert max(found[a].uncertainty for a in "xy") < 2e-3
     inside = [float((np.abs(ratios) < limit).mean()) for limit in (1, 2)]
-    # The shares of 80 draws are 0.68 ± 0.05 and 0.95 ± 0.024. The limits allow three times these deviations.
+    # For 80 draws, 0.68 ± 0.05 and 0.95 ± 0.024 are expected. The limits allow three times these deviations.
     assert 0.53 < inside[0] < 0.83
     assert inside[1] > 0.88
 
 
 def test_the_scale_of_a_turned_grating_depends_on_the_other_axis_only_to_second_order():
-    """A grating of exactly known frequency is turned by 3°. The scale of the other axis is 2 % off."""
+    """Check a grating that is rotated by 3°, while the scale of the other axis is wrong by 2 %."""
     rng = np.random.default_rng(3)
     wave = find_wave(_grating(rng, "x", 1.03, 1.02, 3.0), (PITCH_UM,) * 2, PERIOD_UM, "x")
     found = axis_scales([(wave, PERIOD_UM, 0.0)], ["x"])["x"]
-    # The error of the axis that is not calibrated enters with (sin 3°)².
+    # The error of the axis that is not calibrated is multiplied by (sin 3°)².
     assert found.factor == pytest.approx(1.03, abs=3 * found.uncertainty + 0.02 * np.sin(np.radians(3)) ** 2)
 
 
@@ -89,7 +89,7 @@ def test_a_step_is_found_and_measured_within_its_uncertainty():
     rng = np.random.default_rng(0)
     found = [find_step(_step(rng, STEP_UM), PITCH_UM) for _ in range(60)]
     ratios = np.array([(step.height_nm - 1e3 * STEP_UM) / step.uncertainty_nm for step in found])
-    # The share of 60 draws is 0.68 ± 0.06. The limits allow three times this deviation.
+    # For 60 draws, a share of 0.68 ± 0.06 is expected. The limits allow three times this deviation.
     assert 0.5 < (np.abs(ratios) < 1).mean() < 0.86
     assert find_step(_step(rng, STEP_UM).T, PITCH_UM, axis="y").height_nm == pytest.approx(200, abs=5)
     grooves = np.tile(np.repeat([0.0, -0.3], 16), 4)[None, :] + np.zeros((20, 1))
@@ -97,7 +97,7 @@ def test_a_step_is_found_and_measured_within_its_uncertainty():
 
 
 def test_lines_that_vary_together_count_as_fewer() -> None:
-    """The autocorrelation counts up to its first negative value. Here only neighbouring lines count."""
+    """Check the number of independent lines. Here only neighbouring lines have a positive correlation."""
     wave = np.cos(np.pi * np.arange(60) / 3)
     height = np.zeros((60, 80))
     height[:, 40:] = 0.2 + 0.01 * wave[:, None]
@@ -108,7 +108,7 @@ def test_lines_that_vary_together_count_as_fewer() -> None:
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build a campaign with scans of gratings and a step. All three scales of its microscope are wrong."""
+    """Build a campaign whose microscope has three wrong scales, with scans of gratings and a step."""
     folder = tmp_path_factory.mktemp("calibrated")
     write_campaign(folder)
     rng = np.random.default_rng(5)
@@ -137,13 +137,13 @@ def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Pa
     for axis, true in SCALE.items():
         error = np.abs(quality[f"scale_{axis}"] - true) / quality[f"scale_{axis}_uncertainty"]
         assert error.max() < 3
-    # With corrected lengths the layouts are neither stretched nor compressed. Noise leaves 0.02 px of 112.
+    # With corrected lengths, scan and layout have the same scale, up to 0.02 px of 112 due to noise.
     assert quality["singular_max"].max() < 1.004
     assert quality["singular_min"].min() > 0.996
     for index, scan in enumerate(store.scans()):
         truth = height_of(layout_of(index), index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
         difference = (scan.height_um - truth)[scan.valid]
-        # The z scale is known to 1 %. Heights with an sd of 0.35 µm are then known to 3.5 nm, plus the noise.
+        # The z scale is known to 1 %, so heights with an sd of 0.35 µm are known to 3.5 nm, plus noise.
         assert difference.std() < np.hypot(2 * NOISE_UM, 3 * 0.0035)
         spread = scan.height_um[scan.valid].std()
         known = 1e3 * spread * quality["scale_z_uncertainty"][index] / quality["scale_z"][index]
@@ -155,8 +155,8 @@ def test_a_blind_tip_is_found_in_calibrated_lengths(calibrated: Path) -> None:
     found, true = tip_of(job), peak_radius(height_of(layout_of(0), 0), (PITCH_UM, PITCH_UM))
     assert found is not None
     assert found.radius_um is not None
-    # The scales are known to 1 %, and the radius scales as a squared length over a height. Without one of the
-    # scales the radius would be 5 or 6 % off. Without both, the depth would be 5 % off.
+    # The scales are known to 1 %. The radius is proportional to a squared length over a height, so without
+    # one of the corrections it would be wrong by 5 or 6 %. Without both, the depth would be wrong by 5 %.
     assert found.radius_um == pytest.approx(true.radius_um, rel=0.03)
     assert found.depth_um == pytest.approx(true.depth_um, rel=0.02)
 

@@ -1,4 +1,4 @@
-"""A card is read strictly: every wrong key or value is named together with the expected one."""
+"""Check that every wrong key or value of a card is reported together with what is expected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ GOOD: dict[str, Any] = tomllib.loads(card_text())
 
 
 def changed(key: str, value: object) -> dict[str, Any]:
-    """Return the good card with one key set, or removed where the value is None."""
+    """Return a valid card with one key changed, or removed if the value is None."""
     card = copy.deepcopy(GOOD)
     *tables, last = key.split(".")
     table = card

@@ -1,4 +1,4 @@
-"""The commands `masks` and `simulate` only parse, so a few calls check the arguments that they pass on."""
+"""Check the arguments that `masks` and `simulate` pass on; the work is done and tested elsewhere."""
 
 from __future__ import annotations
 
@@ -63,17 +63,17 @@ def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path):
             int(level): scan.height_um[even & scan.valid & (scan.mask_level == level)]
             for level in np.unique(scan.mask_level[even])
         }
-        # The three treads are 38 px wide. Without 10 px at each edge they are 18 px wide and 96 px long.
+        # The three treads are 38 px wide. Without 10 px at each edge, 18 px by 96 px remain.
         assert min(values.size for values in heights_um.values()) > 1000
         assert {0, 6, 12} <= set(heights_um)
-        # The spread comes from the roughness of 15.9 nm and from neighbours within the 2 µm that affect
-        # shrinkage. Pixels beyond an edge would make it larger.
+        # The spread is due to the roughness of 15.9 nm, and to shrinkage that depends on the surroundings
+        # within 2 µm. Pixels beyond an edge would increase it.
         assert max(values.std() for values in heights_um.values()) < 0.05
         step_um = float(heights_um[12].mean() - heights_um[0].mean())
         fill[scan.dose] = step_um
         assert step_um > previous
         previous = step_um
-    # With two-photon absorption and a threshold, heights grow faster than the dose, which grows by 1.3 / 0.7.
+    # With two-photon absorption and a threshold, heights grow by a larger factor than the dose, 1.3 / 0.7.
     assert fill[scans[-1].dose] > 1.3 / 0.7 * fill[scans[0].dose]
 
 
@@ -121,7 +121,7 @@ def test_options_that_a_card_already_fixes_are_refused(app, tmp_path):
     run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size-px", 64)
     card = ("--layouts", tmp_path / "m" / "card.toml")
     for option in (("--count", 3), ("--size-px", 64), ("--write-field-um", 100)):
-        with pytest.raises(InputError, match="beside --layouts"):
+        with pytest.raises(InputError, match="given with --layouts"):
             run(app, "simulate", "--out", tmp_path / "s", *card, *option)
     with pytest.raises(InputError, match="references"):
         run(app, "simulate", "--out", tmp_path / "s", *card, "--references")

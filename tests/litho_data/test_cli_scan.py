@@ -1,4 +1,4 @@
-"""Test `level` and `inspect` on files: what they write, what they print, how they fail."""
+"""Test what `level` and `inspect` write and print, and how they fail."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
 
 
 def test_a_levelling_step_warns_on_stderr_only(app, tmp_path: Path) -> None:
-    """A block covers half of some lines, so that row alignment shifts them."""
+    """Check the warning about row alignment for a scan in which a block covers half of some lines."""
     height = 0.003 * np.random.default_rng(0).standard_normal((128, 128))
     height[30:90, 20:90] += 0.8
     np.savetxt(tmp_path / "scan.txt", height * 1e-6)
@@ -141,7 +141,7 @@ def test_pictures_show_row_0_on_top(tmp_path: Path) -> None:
 
     picture = cv2.imread(str(write_picture(scan, tmp_path / "a.png")))
     rows, columns = picture.shape[:2]
-    # Viridis ends in yellow, strong in red and weak in blue (channels are blue, green, red).
+    # Viridis ends in yellow, which is strong in red and weak in blue. The order is blue, green, red.
     top_left, bottom_right = picture[rows // 4, columns // 4], picture[3 * rows // 4, columns // 2]
     assert top_left[2] > 200 > 100 > top_left[0]
     assert bottom_right[2] < 100

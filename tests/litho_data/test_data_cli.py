@@ -1,4 +1,4 @@
-"""The command line: one clear line and code 2 for bad input, code 1 for a changed store, else code 0."""
+"""Check the command line: exit code 2 and one line for bad input, code 1 for a changed store, else 0."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def test_a_recipe_is_suggested_for_the_card_in_a_folder_beside_the_store(
     folder = tmp_path / "a-levelling"
     assert asked == [(Path("card.toml"), folder, tmp_path)]
     assert said == [
-        "plane: not explained by the layout: P11 1.2 nm",
-        "lines: not explained by the layout: P11 4.0 nm (moves lines)",
-        "suggested: plane; build new.toml",
+        "plane: rms residual of the fit to the layout: P11 1.2 nm",
+        "lines: rms residual of the fit to the layout: P11 4.0 nm (moves lines)",
+        "suggested recipe: plane; to use it, build new.toml",
         f"pictures {folder / 'report.html'}",
     ]
 

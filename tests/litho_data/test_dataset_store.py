@@ -1,4 +1,4 @@
-"""Opening a store checks its contract, and hashes depend on values and nothing else."""
+"""Check that opening a store tests its contract, and that hashes depend only on values."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_the_whole_store_opens_as_one_tree(campaign: Path) -> None:
 def test_one_chunk_is_one_scan(campaign: Path) -> None:
     array = array_of(open_store(campaign / "prints.zarr").root, "height_um")
     assert array.chunks == (1, 112, 112)
-    # With several scans per shard, other tools could not copy single scans.
+    # If a shard held several scans, other tools could not copy single scans.
     assert array.shards is None
 
 
@@ -148,7 +148,7 @@ def test_a_copy_or_a_part_by_xarray_is_a_store_again(campaign: Path, tmp_path: P
     part.to_netcdf(tmp_path / "copy.nc")
     with xarray.open_dataset(tmp_path / "copy.nc") as back:
         np.testing.assert_array_equal(back["height_um"], part["height_um"])
-        # The coordinates of the pixel centres select by length.
+        # The coordinates of the pixel centres allow a selection by length.
         assert float(back.sel(x=5.04, y=1.01, method="nearest")["x_um"]) == pytest.approx(5.05)
 
 

@@ -1,4 +1,4 @@
-"""Fetch from a server: correct files are kept, wrong files are named and never used."""
+"""Check that a fetch from a server keeps correct files, and names wrong files and never uses them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _CountingHandler(http.server.SimpleHTTPRequestHandler):
 
 
 class Served:
-    """A local server with a dataset, the card that points to it, and the paths it was asked for."""
+    """Describe a local server with a dataset: its card, and the paths that were requested."""
 
     def __init__(self, folder: Path, url: str, asked: list[str]):
         self.files, self.url, self.asked = folder / "served", url, asked
@@ -79,7 +79,7 @@ def test_an_interrupted_fetch_goes_on(served: Served, tmp_path: Path) -> None:
     into = tmp_path / "into"
     (into / "scans").mkdir(parents=True)
     (into / "scans" / "P11.txt").write_bytes(CONTENT["scans/P11.txt"])
-    (into / "elsewhere.bmp").write_bytes(b"pict")  # half of it
+    (into / "elsewhere.bmp").write_bytes(b"pict")  # half of the file
     fetch(served.card, into)
     assert sorted(served.asked) == ["/base/layouts/P11.tif", "/other/picture.bmp"]
     assert (into / "elsewhere.bmp").read_bytes() == CONTENT["elsewhere.bmp"]
@@ -146,7 +146,7 @@ def test_the_cards_are_part_of_an_installed_package() -> None:
 
 @pytest.mark.measured
 def test_the_registry_of_the_measured_prints_is_right(measured_prints: Path) -> None:
-    # LITHO_DATA_DIR is set where this test runs: every file there has its registered hash.
+    # Every file in the folder LITHO_DATA_DIR must have its registered hash.
     assert fetch("neural-lithography").resolve() == measured_prints
     lines = (CARDS / "neural-lithography.sha256").read_text(encoding="utf-8").splitlines()
     names = {line.split()[0] for line in lines if line and not line.startswith("#")}

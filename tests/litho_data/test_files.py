@@ -1,4 +1,4 @@
-"""A file or a folder is replaced as a whole or not at all. If the writing stops, the older one stays."""
+"""Check that files and folders are replaced as a whole, and that the older one stays if writing stops."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from litho_data.foundation.files import atomic_file, atomic_folder, unfinished
 
 @pytest.fixture
 def older(tmp_path: Path) -> Path:
-    """Return a folder that holds a finished result of two files."""
+    """Return a folder with a finished result of two files."""
     folder = tmp_path / "result"
     (folder / "part").mkdir(parents=True)
     (folder / "part" / "a.txt").write_text("weeks of work")
@@ -97,7 +97,7 @@ def test_an_older_folder_that_a_killed_process_had_moved_away_is_restored(older:
 
 
 def test_writers_of_one_folder_take_turns(tmp_path: Path) -> None:
-    """Two commands that share a cache write the same fit there, one after the other."""
+    """Check that two commands that write the same fit to a shared cache do so one after the other."""
 
     def write(number: int) -> None:
         for turn in range(20):

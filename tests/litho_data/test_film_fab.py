@@ -1,4 +1,4 @@
-"""Test the fab for films: its knobs move edges as stated, and its run is built like any other."""
+"""Test the virtual fab for films: its knobs move edges as stated, and a build accepts its files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PLAIN = FilmKnobs()
 
 
 def stripes(width_px: int = 32, size_px: int = 128) -> np.ndarray:
-    """Return stripes of film and ground in turn, each ``width_px`` wide."""
+    """Return alternating stripes of film and ground, each ``width_px`` wide."""
     return np.tile(np.arange(size_px) // width_px % 2, (size_px, 1))
 
 
@@ -38,7 +38,7 @@ def film_width_px(distance_px: np.ndarray, count: int = 2) -> float:
 
 @pytest.mark.parametrize("knobs", [PLAIN, FilmKnobs(diffusion_um=0.02), FilmKnobs(backscatter=0.3)])
 def test_a_threshold_of_half_the_dose_keeps_straight_edges_in_place(knobs: FilmKnobs) -> None:
-    # Film and ground take equal areas. This symmetry keeps the edges in place, to a quarter of a pixel.
+    # Film and ground have equal areas. By symmetry the edges stay in place, within a quarter of a pixel.
     assert film_width_px(edge_distance_px(stripes(), BEAM, knobs)) == pytest.approx(32, abs=0.26)
 
 
@@ -46,8 +46,8 @@ def test_a_bias_and_a_dose_move_edges_by_the_stated_amount() -> None:
     wide = edge_distance_px(stripes(), BEAM, FilmKnobs(etch_bias_um=0.008))
     # Each edge is known to a quarter of a pixel.
     assert film_width_px(wide) == pytest.approx(32 + 2 * 2, abs=0.51)
-    # An edge blurred by a Gaussian of 5 px falls to 0.5 / 1.2 of its height at this distance: a Gaussian
-    # quantile.
+    # The distance at which an edge blurred by a Gaussian of 5 px falls to 0.5 / 1.2 of its height is a
+    # quantile of the Gaussian.
     dosed = edge_distance_px(stripes(), BEAM, FilmKnobs(dose_error=0.2))
     assert film_width_px(dosed) == pytest.approx(32 + 2 * 5 * 0.2104, abs=0.51)
 
@@ -84,20 +84,20 @@ def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
     for scan in open_store(tmp_path / "films.zarr").scans():
         distance = np.load(tmp_path / "fab" / "truth" / f"{scan.id}.npy")
         share = (distance > 0).reshape(160, 4, 160, 4).mean(axis=(1, 3))
-        # The contour lies on the flank of the rim, off by a fraction of a pixel. At edges this is some
-        # percent of the height.
+        # The contour follows the flank of the rim and is displaced by a fraction of a pixel. At edges, this
+        # changes the height by a few per cent.
         off = np.abs(scan.height_um / BEAM.film_um - share)[scan.usable]
         assert off.mean() < 0.05
         assert scan.usable.mean() > 0.8
 
 
 def test_shifted_edges_are_not_taken_for_defects(tmp_path: Path) -> None:
-    """All edges are shifted by 2.5 px, which is many times the usual misfit, in connected areas."""
+    """Check a film whose edges are all shifted by 2.5 px, which is many times the usual misfit."""
     knobs = FilmKnobs(etch_bias_um=0.01)
     card = simulate_films(tmp_path / "fab", "e-beam", count=1, size_px=208, seed=303, knobs=knobs)
     build_dataset(card, tmp_path / "films.zarr")
     (scan,) = open_store(tmp_path / "films.zarr").scans()
-    # The microscope adds no shift, turn or scale; the affine takes up a part of the shift of the edges.
+    # The microscope does not shift, rotate or scale. The affine warp fits part of the shift of the edges.
     assert scan.scan_to_layout == pytest.approx(np.eye(3), abs=0.02)
     assert scan.usable.mean() > 0.8
 
@@ -111,7 +111,7 @@ def test_a_field_lies_alone_on_bare_ground(tmp_path: Path) -> None:
     wide = edge_distance_px(np.pad(level, 200), BEAM, knobs)[800:-800, 800:-800]
     # Edges are searched in steps of a quarter of a pixel. A wider canvas moves them by at most one step.
     assert np.abs(wide - np.load(tmp_path / "fab" / "truth" / "F00.npy")).max() < 0.3
-    # If the field repeats itself, more electrons are scattered back, so more film stays.
+    # If the field were repeated periodically, more electrons would scatter back, and more film would stay.
     assert (edge_distance_px(level, BEAM, knobs) > 0).sum() > 1.05 * (wide > 0).sum()
 
 

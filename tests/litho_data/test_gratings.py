@@ -1,4 +1,4 @@
-"""A grating of known period shows the distortion of the scanner, not that of the printer."""
+"""Check that a scan of a known grating measures the distortion of the scanner, not that of the printer."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def test_the_bow_of_a_line_is_the_scanners_and_not_the_printers():
         for seed in (3, 4, 5):
             scan, found = scanned(KnobSetting(name, strength), seed=seed)
             line_um = scan.frame.size_um[1]
-            # The displacement is strength·x(1 − x/L), which is strength·L/4 in the middle.
+            # The displacement is strength·x(1 − x/L), so it is strength·L/4 in the middle.
             expected = strength * line_um / 4 if name == "piezo-nonlinearity" else 0.0
             assert found.line_um == pytest.approx(line_um)
             assert found.bow_um is not None
             assert found.bow_sd_um is not None
-            # All nine fits agree within four of their uncertainties. The uncertainty is a tenth of the bow.
+            # All nine fits agree within four times their uncertainty, which is a tenth of the bow.
             assert abs(found.bow_um - expected) < 4 * found.bow_sd_um
             assert found.bow_sd_um < 0.02
 
 
 def test_the_zero_of_the_heights_of_a_grating_does_not_matter():
-    # The period is 19.9 pixels: over windows of whole pixels the mean is not exactly zero.
+    # The period is 19.9 pixels, so the mean over a window of whole pixels is not exactly zero.
     scan, found = scanned(KnobSetting("piezo-nonlinearity", 0.04), scale=0.03)
     lifted = grating_scan("G", scan.height_um + 50.0, (scan.frame.pitch_um,) * 2, KNOWN)
     for name in ("bow_um", "bow_sd_um", "scale_x", "scale_y"):
-        # A float32 of 50 µm is known to 4 nm. The mean over thousands of pixels is better.
+        # A float32 of 50 µm is exact to 4 nm, and the mean over thousands of pixels is better.
         assert getattr(lifted, name) == pytest.approx(getattr(found, name), rel=1e-3)
 
 
@@ -67,10 +67,10 @@ def test_a_grating_bounds_the_tip():
         scanned(*(KnobSetting("tip-dilation", radius) for radius in radii))[1].tip_at_most_um
         for radii in ((), (0.8,), (1.8,))
     )
-    # Without a tip the flanks of the bars set the bound. A tip of 0.8 µm reaches 0.9 µm, into bars of 1 µm.
+    # Without a tip, the flanks of the bars set the bound. A tip of 0.8 µm has a reach of 0.9 µm.
     assert sharp < 0.4
     assert 0.8 < blunt < 1.25 * 0.8
-    # A tip of 1.8 µm bridges the gaps, so the result is only a bound.
+    # A tip of 1.8 µm bridges the gaps, so the result is only an upper bound.
     assert bridging > 1.8
 
 

@@ -1,4 +1,4 @@
-"""Test the uncertainty of a height: each part by its closed form, all parts on prints of known surface."""
+"""Test the uncertainty of heights: each part against its closed form, and all on prints of known surface."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.litho_data.campaigns import layout_of
 
 
 def _print(seed: int, size: int) -> np.ndarray:
-    """Return a smooth print, rms 0.5 µm, as fine as a spot of 0.25 µm writes on a grid of 0.1 µm; in µm."""
+    """Return a print with an rms of 0.5 µm, blurred like that of a 0.25 µm spot on a grid of 0.1 µm."""
     white = np.random.default_rng(seed).standard_normal((size, size))
     return 0.5 * gaussian_filter(white, 2.5) / gaussian_filter(white, 2.5).std()
 
@@ -43,10 +43,10 @@ def test_noise_of_pixels_and_lines_is_told_from_a_print(fast_axis):
         height[100:110, 30:60] = np.nan
         found.append(white_noise(height, fast_axis=fast_axis))
     pixel_nm, line_nm = np.mean(found, axis=0)
-    # Eighth-order differences of n values count as n / 3.63 independent ones (the sum of their squared
-    # correlations), and the median deviation has an efficiency of 0.37. The standard error is 0.7 % per scan
-    # of 240 x 240 pixels and 14 % for 240 lines. Over six scans it is 0.3 % and 6 %; three times that is
-    # allowed. The print adds less than 1 % of the pixel noise.
+    # The eighth-order differences of n values are worth n / 3.63 independent ones (the sum of their squared
+    # correlations), and the median deviation has an efficiency of 0.37. The standard error for one scan of
+    # 240 x 240 pixels is 0.7 %, and 14 % for its 240 lines. For six scans these are 0.3 % and 6 %. The limits
+    # allow three times that. The print adds less than 1 % of the pixel noise.
     assert pixel_nm == pytest.approx(0.8, rel=0.02)
     assert line_nm == pytest.approx(3.0, rel=0.18)
 
@@ -61,19 +61,19 @@ def test_the_noise_is_unknown_where_gaps_leave_too_few_neighbouring_pixels():
 def test_the_stated_loss_of_resampling_is_that_of_a_resampled_wave(frequency):
     x_px = np.arange(400)
     wave = np.broadcast_to(np.cos(2 * np.pi * frequency * x_px), (8, 400)).astype(np.float64)
-    # The scale differs by 1 part in 350, so that all sub-pixel positions are equally frequent.
+    # The scale differs by one part in 350, so that all sub-pixel positions are equally frequent.
     matrix = np.diag([1 + 1 / 350, 1.0, 1.0])
     out, valid = resample_to_layout(wave, matrix, (8, 380), scan_pitch_um=(0.1, 0.1), layout_pitch_um=0.1)
     at_px = (np.arange(380) + 0.5) / (1 + 1 / 350) - 0.5
     error = (out - np.cos(2 * np.pi * frequency * at_px))[4, 20:370]
     assert valid[4, 20:370].all()
     known, loss = transfer_error(0.1, 0.1)
-    # A real wave of amplitude 1 has half the power of a complex one; the aliased share of 350 samples beats.
+    # A real wave of amplitude 1 has half the power of a complex one. Aliases beat over the 350 samples.
     assert (error**2).mean() == pytest.approx(np.interp(10 * frequency, known, loss) / 2, rel=0.1)
 
 
 def test_an_uncertain_warp_moves_a_plane_by_its_slope():
-    """A plane with slopes p, q is shifted by a, b along x, y and rotated by c.
+    """Check a plane with slopes p, q whose shifts along x, y and rotation have the uncertainties a, b, c.
 
     The variance of its height is (pa)² + (qb)² + c²(qx − py)².
     """
@@ -81,13 +81,13 @@ def test_an_uncertain_warp_moves_a_plane_by_its_slope():
     y, x = np.mgrid[:40, :60].astype(float)
     scale = normalisation(shape)[0, 0]
     error = WarpError(np.diag([a, b, c]) ** 2, 0.0, 0.0, False)
-    # Amounts are in the normalised frame: a shift of a is a / scale pixels.
+    # Amounts refer to the normalised frame, where a shift of a means a / scale pixels.
     known = ((p * a) ** 2 + (q * b) ** 2) / scale**2 + c**2 * (q * (x - 29.5) - p * (y - 19.5)) ** 2
     np.testing.assert_allclose(error.warp_variance(p * x + q * y), known, rtol=1e-9)
 
 
 def test_the_spread_of_fitted_warps_equals_the_stated_uncertainty():
-    """Fit one layout under independent errors that are correlated over 4 px."""
+    """Check the spread of fits to prints of one layout whose errors are correlated over 4 px."""
     layout = layout_of(3, (256, 256))
     stated, moved = [], []
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
@@ -98,15 +98,15 @@ def test_the_spread_of_fitted_warps_equals_the_stated_uncertainty():
         smooth, predicted = gaussian_filter(height, SCAN_BLUR_PX), predicted_topography(layout, 2.0)
         coefficients = solve_gram(aligned_gram(smooth, predicted, LADDER["affine"]).sum(axis=(0, 1)))
         moved.append(coefficients[NUISANCES:] / coefficients[0])
-    # There are 12 draws of 6 amounts. If the stated variances are right, the mean of the squared amounts over
-    # their stated mean is 1 ± 0.17. The 16 blocks for 13 numbers may add an error of a third.
+    # There are 12 draws of 6 amounts. If the stated variances are right, the mean square of the amounts
+    # divided by its stated value is 1 ± 0.17. Using 16 blocks for 13 numbers may add an error of a third.
     ratio = np.sqrt(np.mean(np.square(moved), axis=0) / np.mean(stated, axis=0))
     assert 0.7 < np.sqrt((ratio**2).mean()) < 1.4
 
 
 @pytest.mark.parametrize(("size", "sees_the_border"), [(416, True), (256, False)])
 def test_the_error_of_the_magnification_includes_the_pull_of_a_displaced_border(size, sees_the_border):
-    """The outermost 32 px are displaced outwards by 0.1 px on all sides. There is no other error."""
+    """Check a print whose only error is that its outermost 32 px are displaced outwards by 0.1 px."""
     layout = layout_of(3, (size, size))
     topography = predicted_topography(layout, 2.0)
     y, x = np.indices(topography.shape) - (size - 1) / 2
@@ -117,8 +117,8 @@ def test_the_error_of_the_magnification_includes_the_pull_of_a_displaced_border(
     height = topography - 0.1 * outwards
     found = solve_gram(aligned_gram(height, topography, LADDER["affine"]).sum(axis=(0, 1)))
     pull, stated = found[NUISANCES + 3] / found[0], warp_error(height, layout, 2.0, "affine").covariance[3, 3]
-    # Apart from smoothing across their edge, the inner cells show no displacement. The jackknife sees that
-    # blocks differ, but states less than half of the pull.
+    # Inner cells show no displacement, apart from the smoothing across their edges. The jackknife notices
+    # that blocks differ, but states less than half of the error.
     assert (stated**0.5 > 0.9 * abs(pull)) == sees_the_border
     assert stated**0.5 < 1.5 * abs(pull)
 
@@ -131,24 +131,24 @@ def test_the_variance_of_a_fit_is_subtracted_from_a_seen_surface_and_added_to_a_
 
 
 def test_random_tilt_and_bow_scatter_the_share_of_pixels_within_one_sigma():
-    """Each error surface is a random sum of five tilt and bow terms of equal rms. Its rms is taken as σ."""
+    """Check random sums of five tilt and bow terms of equal rms, where σ is the rms of each sum."""
     basis = quadratic_basis((48, 48))[1:].reshape(5, -1)
     basis = (basis - basis.mean(axis=1, keepdims=True)) / basis.std(axis=1, keepdims=True)
     surfaces = np.random.default_rng(0).standard_normal((6000, 5)) @ basis
     errors = np.abs(surfaces / surfaces.std(axis=1, keepdims=True))
     within_1, within_196 = ((errors < limit).mean(axis=1) for limit in (1.0, 1.96))
-    # The shares of one scan scatter by 0.048 and 0.012, so the means of 6000 scatter by 0.0006 and 0.0002.
-    # The spread of 300 sets of 20, 0.0107, is known to one part in 24. Three times these errors are allowed,
-    # plus the rounding of 48 pixels a side.
+    # The two shares scatter by 0.048 and 0.012 between scans, so the means of 6000 scatter by 0.0006 and
+    # 0.0002. The spread 0.0107 between 300 sets of 20 is known to one part in 24. The limits allow three
+    # times these errors, plus the error due to only 48 pixels a side.
     assert within_1.mean() == pytest.approx(0.696, abs=0.004)
     assert within_196.mean() == pytest.approx(0.946, abs=0.002)
     assert within_1.reshape(300, 20).mean(axis=1).std() == pytest.approx(0.0107, rel=0.13)
 
 
 def test_the_surface_that_levelling_removes_from_a_print_is_as_large_as_stated():
-    """Least squares removes a surface from topography and roughness.
+    """Check the size of the surface that least squares removes from topography and roughness.
 
-    Afterwards only the topography is known.
+    It is estimated from the levelled heights and the topography alone.
     """
     layout = layout_of(3, (256, 256))
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
@@ -161,14 +161,14 @@ def test_the_surface_that_levelling_removes_from_a_print_is_as_large_as_stated()
         stated.append(1e6 * warp_error(height - surface, layout, 2.0, "affine").surface_variance(True))
         taken.append(1e6 * surface.var())
     # The surface of the topography has a variance of 76 nm², and noise of 20 nm correlated over 16 pixels
-    # adds 30 nm². Single scans are off by 30 nm², the mean of 12 by 9 nm²; three times that is allowed. A
-    # jackknife of 16 blocks may also be off by a third. Without the error of the fit, 35 nm² would be
-    # missing.
+    # adds 30 nm². The error is 30 nm² for single scans and 9 nm² for the mean of 12; three times that is
+    # allowed. A jackknife of 16 blocks may also be wrong by a third. Without the error of the fit, the result
+    # would be 35 nm² too small.
     assert np.mean(stated) - np.mean(taken) == pytest.approx(0, abs=30)
 
 
 def test_a_height_that_depends_on_the_surroundings_is_not_taken_for_tilt_or_bow():
-    """The print is higher where much is printed within 2 µm. It has no tilt and no bow."""
+    """Check a print without tilt or bow that is higher where more is printed within 2 µm."""
     layout = layout_of(3, (256, 256))
     topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
     white = 0.005 * np.random.default_rng(0).standard_normal((256, 256))
@@ -192,12 +192,12 @@ def test_an_error_surface_counts_only_if_it_is_significant_or_the_scan_was_level
 
     assert budget(0.0, False) == 0
     assert 0 < budget(0.0, True) < 2
-    # A slope of 0.05 µm over half the field has an rms of 0.05 / √3.
+    # A tilt of 0.05 µm over half the field has an rms of 0.05 µm / √3.
     assert budget(0.05, False) == pytest.approx(1e3 * 0.05 / 3**0.5, rel=0.05)
 
 
 def test_errors_of_virtual_prints_are_as_large_as_stated(tmp_path):
-    """The error is the stored height minus the true rough surface, minus its mean over the scan."""
+    """Compare σ with the error: the stored height minus the true rough surface, minus the mean of this."""
     card = simulate(tmp_path / "fab", count=3, size_px=192, seed=20271, knobs=["scan-line-stripes=8"])
     build_dataset(card, tmp_path / "prints.zarr", workers=1)
     ratios = []
@@ -206,8 +206,8 @@ def test_errors_of_virtual_prints_are_as_large_as_stated(tmp_path):
         error_um = (scan.height_um - surface_um)[scan.valid].astype(np.float64)
         ratios.append((error_um - error_um.mean()) / scan.height_sigma_um[scan.valid])
     pooled = np.concatenate(ratios)
-    # Most of σ is line noise of 8 nm. Its square is known to 13 % from 3 x 200 rows, estimated as above. Few
-    # features determine the warp of a field of 19 µm. Together the ratio may be off by 15 %.
+    # Most of σ is line noise of 8 nm. Its square is known to 13 % from 3 x 200 rows, estimated as above. The
+    # warp of a field of 19 µm is determined by few features. Together, this may change the ratio by 15 %.
     assert np.sqrt((pooled**2).mean()) == pytest.approx(1, abs=0.15)
     assert (np.abs(pooled) < 1).mean() == pytest.approx(0.683, abs=0.08)
     assert (np.abs(pooled) < 1.96).mean() == pytest.approx(0.95, abs=0.05)

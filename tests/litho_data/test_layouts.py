@@ -1,4 +1,4 @@
-"""Test layouts: the equation of the paper, calibration patterns, statistics of sets, distance from a set."""
+"""Test layouts: the equation of the paper, calibration patterns, and the statistics of sets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class TestRandomLayout:
         power = np.abs(np.fft.fft2(field)) ** 2
         fy, fx = np.meshgrid(*[np.fft.fftfreq(64, 0.1)] * 2, indexing="ij")
         stopped = (abs(fy) > 0.5) | (abs(fx) > 0.5)
-        # Rounding leaves (1e-16)² of the power.
+        # Due to rounding, (1e-16)² of the power remains.
         assert power[stopped].max() < 1e-25 * power[~stopped].max()
 
     def test_the_seed_determines_the_layout(self):
@@ -110,9 +110,8 @@ class TestRandomLayout:
         }
         assert level_distance(made["floor"], published) <= largest
         assert level_distance(made["round"], published) > largest
-        # The maximum of the field lies inside the cut with a probability of (512/540)² = 0.90. By the
-        # binomial law, 11 or more of 16 layouts contain it in 99.6 % of all sets. It is never more than one
-        # pixel.
+        # The maximum of the field is a single pixel. It lies inside the cut with a probability of
+        # (512/540)² = 0.90. By the binomial law, 11 or more of 16 layouts contain it in 99.6 % of all sets.
         highest = [int((level == 12).sum()) for level in published]
         assert set(highest) <= {0, 1}
         assert sum(highest) >= 11
@@ -126,8 +125,8 @@ class TestRandomLayout:
             power = np.abs(np.fft.fft2((level - level.mean()) * np.outer(*[np.hanning(512)] * 2))) ** 2
             frequency = np.abs(np.fft.fftfreq(512, 0.1))
             along_x = power.sum(axis=0)[frequency < 1]
-            # The leakage of the Hann window reaches 2 bins of 0.02 per µm beyond the edge. The quantisation
-            # noise is spread over all frequencies; its variance is 1/12 of a squared level against 2.5.
+            # The Hann window leaks power to 2 bins of 0.02 per µm beyond the edge. The quantisation noise
+            # is spread over all frequencies. Its variance is 1/12 of a squared level; that of the layout 2.5.
             edge = frequency[frequency < 1]
             inside = along_x[edge < cutoff_per_um + 0.04].sum() / along_x.sum()
             below = along_x[edge < cutoff_per_um - 0.06].sum() / along_x.sum()
@@ -136,7 +135,7 @@ class TestRandomLayout:
 
 
 def level_distance(layouts: list[np.ndarray], others: list[np.ndarray]) -> float:
-    """Return the total-variation distance between the shares of the levels."""
+    """Return the total-variation distance between the level distributions of two sets of layouts."""
     shares = [np.bincount(np.ravel(each), minlength=13) / np.size(each) for each in (layouts, others)]
     return 0.5 * float(np.abs(shares[0] - shares[1]).sum())
 
@@ -152,7 +151,7 @@ class TestPatterns:
         frame = random_layout((100, 200), seed=3)
         layout = framed_ladder(frame, highest=12, tread_px=20)
         inner = layout[20:-20, 40:-40]
-        # 120 px hold six steps of 20 px, so six evenly spaced levels from 0 to 12.
+        # 120 px have room for six steps of 20 px, so the ladder has six levels, evenly spaced from 0 to 12.
         assert inner[0].tolist() == np.repeat([0, 2, 5, 7, 10, 12], 20).tolist()
         assert (inner == inner[0]).all()
         outside = np.ones(frame.shape, bool)
@@ -174,11 +173,11 @@ class TestPatterns:
 
     def test_siemens_star_repeats_after_a_spoke(self):
         star = siemens_star((201, 201), spokes=4, high=1)
-        # Four wedges: a quarter turn maps the star onto itself, an eighth turn swaps wedge and gap.
+        # The star has four wedges, so a rotation by 90° maps it onto itself.
         np.testing.assert_array_equal(star, np.rot90(star))
         y, x = np.indices(star.shape) - 100
         inside = np.hypot(y, x) <= 96
-        # The edges are uncertain by about one pixel along 8 radii of 96 pixels.
+        # The area is uncertain by about one pixel along the 8 edges, which are 96 pixels long.
         assert star[inside].mean() == pytest.approx(0.5, abs=8 * 96 / inside.sum())
 
     def test_pits_are_inverted_pillars(self):
@@ -199,7 +198,7 @@ class TestStatistics:
         board = checkerboard((64, 64), cell_px=8, high=12)
         found = layout_statistics([board], levels=13, pitch_um=0.1)
         assert (found.level_share[0], found.level_share[12]) == (0.5, 0.5)
-        # 7 edges in 63 neighbours along each axis.
+        # Along each axis, 7 of the 63 pairs of neighbours have an edge between them.
         assert found.jump_share[12] == pytest.approx(7 / 63)
 
     def test_power_lies_at_the_frequency_of_a_wave(self):
@@ -211,7 +210,7 @@ class TestStatistics:
             for f, share in zip(found.frequency_per_um, found.power_share, strict=True)
             if abs(f - 0.625) < 0.15
         ]
-        # Rounding to whole levels adds 1/12 to a variance of 18, 0.5 %.
+        # Rounding to whole levels adds 1/12 to a variance of 18, which is 0.5 %.
         assert sum(near) > 0.985
 
     def test_statistics_written_to_a_file_are_read_back_unchanged(self, tmp_path):

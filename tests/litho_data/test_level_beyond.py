@@ -1,4 +1,4 @@
-"""Test the levelling that Gwyddion does not have: robust, layout-aware, mask-and-relevel, scars."""
+"""Test levelling methods that Gwyddion does not have: robust, layout-aware, mask-and-relevel, scars."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ NOISE_UM = 0.01
 
 
 def slopes(surface: np.ndarray) -> tuple[float, float]:
-    """Return the mean slope (x, y) per pixel."""
+    """Return the mean slope of a surface per pixel, along x and y."""
     return float(np.diff(surface, axis=1).mean()), float(np.diff(surface, axis=0).mean())
 
 
 def tilted_substrate(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return noise on a tilt of (0.002, -0.001) µm per pixel, and the tilt."""
+    """Return a noisy surface with a tilt of (0.002, -0.001) µm per pixel, and the tilt alone."""
     ny, nx = SHAPE
     tilt = 0.002 * np.arange(nx)[None, :] - 0.001 * np.arange(ny)[:, None]
     return tilt + NOISE_UM * np.random.default_rng(seed).normal(size=SHAPE), tilt
@@ -42,8 +42,9 @@ def slope_error(removed: np.ndarray, tilt: np.ndarray) -> float:
     return float(np.abs(np.subtract(slopes(removed), slopes(tilt))).max())
 
 
-# The standard error of a least-squares slope over n pixels spread evenly along N is sigma sqrt(12 / n) / N.
-# Four of them are allowed, doubled for masked pixels and the lower efficiency of robust fits.
+# The standard error of a least-squares slope from n pixels spread evenly over a length N is
+# sigma sqrt(12 / n) / N. The tests allow four standard errors, doubled because masked pixels and robust fits
+# are less efficient.
 SLOPE_TOLERANCE = 2 * 4 * NOISE_UM * np.sqrt(12 / (SHAPE[0] * SHAPE[1])) / SHAPE[0]
 
 
@@ -55,14 +56,14 @@ def test_robust_plane_ignores_a_printed_block() -> None:
     # The main surface is set to zero, within the error of a mean over half the pixels.
     bare = levelled.height[:, :80]
     assert abs(np.median(bare)) < 5 * NOISE_UM / np.sqrt(bare.size)
-    # Least squares follows the block.
+    # Least squares is biased by the block.
     assert slope_error(levelled.removed, tilt) < 0.5 * slope_error(level_plane(z).removed, tilt)
 
 
 def test_robust_agrees_with_least_squares_on_gaussian_noise() -> None:
     z, tilt = tilted_substrate(1)
     robust, plain = level_robust(z).removed, level_polynomial(z, total_degree=1).removed
-    # Both fits are unbiased with nearly the same variance, so they differ by a fraction of the standard
+    # Both fits are unbiased and have nearly the same variance, so they differ by less than a standard
     # error.
     assert slope_error(robust, plain) < SLOPE_TOLERANCE / 4
     assert slope_error(robust, tilt) < SLOPE_TOLERANCE
@@ -72,7 +73,7 @@ def test_robust_on_an_exact_plane_with_outliers_is_exact() -> None:
     _, tilt = tilted_substrate(0)
     z = tilt.copy()
     z[10:40, 10:40] += 3.0
-    # Only rounding is left once Tukey's weights of the block are zero.
+    # Once Tukey's weights are zero in the block, only rounding errors remain.
     np.testing.assert_allclose(level_robust(z).removed, tilt, rtol=0, atol=1e-9)
 
 
@@ -83,7 +84,7 @@ def test_mask_and_relevel_finds_features_and_slope() -> None:
     z[features] += 0.2
     levelled, mask = mask_and_relevel(z, grow_px=1)
     assert mask[features].all()
-    # 0.27 % of the noise lies beyond three sigmas, and each marked pixel grows to five.
+    # Three sigmas exclude 0.27 % of the noise, and growing turns each marked pixel into five.
     assert mask[~ndimage.binary_dilation(features)].mean() < 2 * 5 * 0.0027
     assert slope_error(levelled.removed, tilt) < SLOPE_TOLERANCE
 
@@ -110,7 +111,7 @@ def test_features_are_marked_on_the_asked_side(side: str) -> None:
 
 
 def printed(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a layout whose level rises to the right on average, and its blurred print, µm."""
+    """Return a layout whose levels rise to the right on average, and its blurred print in µm."""
     rng = np.random.default_rng(seed)
     level = ndimage.gaussian_filter(rng.normal(size=SHAPE), 4)
     level = 6 + 3 * level / level.std() + np.linspace(-3, 3, SHAPE[1])[None, :]
@@ -123,10 +124,10 @@ def test_layout_aware_levelling_leaves_the_structure_its_own_slope() -> None:
     noise, tilt = tilted_substrate(6)
     z = noise + structure
     aware = level_layout_aware(z, layout_level=level, blur_px=2.0)
-    # Like the print, the response is piecewise linear in the blurred level, so only noise is left. Fitting it
-    # together with the tilt costs less than half of the precision.
+    # The fitted response is piecewise linear in the blurred level, like the print, so only noise remains.
+    # Fitting it together with the tilt costs less than half of the precision.
     assert slope_error(aware.removed, tilt) < SLOPE_TOLERANCE
-    # A plane fit takes the slope of the structure, 0.6 µm across the field, for tilt.
+    # A plane fit mistakes the slope of the structure, 0.6 µm across the field, for a tilt.
     assert slope_error(level_plane(z).removed, tilt) > 100 * slope_error(aware.removed, tilt)
     # The mean height does not change.
     assert aware.height.mean() == pytest.approx(z.mean(), abs=1e-12)
@@ -150,7 +151,7 @@ def test_layout_aware_levelling_with_gaps_and_mask() -> None:
     z[dirt] += 5.0
     level[:10] = np.nan
     aware = level_layout_aware(z, layout_level=level, blur_px=2.0, mask=dirt)
-    # Next to the unknown rows the blurred layout differs from the print. These few rows add some nm.
+    # The blurred layout differs from the print next to the unknown rows. These few rows add some nm.
     assert slope_error(aware.removed, tilt) < 2 * SLOPE_TOLERANCE
     assert np.isfinite(aware.removed).all()
 
@@ -167,7 +168,7 @@ def test_a_layout_that_is_a_ramp_cannot_be_told_from_tilt() -> None:
 
 def test_layout_in_scan_frame_follows_the_transform() -> None:
     layout = np.arange(6 * 4, dtype=np.uint8).reshape(6, 4)
-    # The scan pixels have half the size. They are shifted by one layout pixel to the right and two down.
+    # The scan pixels are half as large, and are shifted by one layout pixel to the right and two down.
     shift = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     level = layout_in_scan_frame(layout, shift, (8, 8), (0.05, 0.05), 0.1)
     expected = np.full((8, 8), np.nan)
@@ -177,17 +178,17 @@ def test_layout_in_scan_frame_follows_the_transform() -> None:
 
 @pytest.mark.measured
 def test_a_tilt_added_to_a_measured_print_is_recovered(measured_prints: Path) -> None:
-    """A tilt added to a measured print is separated from it, whatever the response of the print is."""
+    """Check that a tilt that is added to a measured print is found again exactly."""
     scan = read_scan(measured_prints / "afm_ug" / "FOV61.txt", unit="m", size_um=(54, 54))
     layout = read_layout(measured_prints / "mask_ug" / "FOV61.tif")
-    # The registration assumes the nominal pitch and a centred margin of 14 px. It is good to a few pixels,
-    # enough for a blurred response.
+    # This registration assumes the nominal pitch and a margin of 14 px on all sides. It is good to a few
+    # pixels, which is enough for a blurred response.
     shift = np.array([[1.0, 0.0, -1.4], [0.0, 1.0, -1.4], [0.0, 0.0, 1.0]])
     level = layout_in_scan_frame(layout, shift, scan.shape, scan.require_pitch(), 0.1)
     before = level_layout_aware(scan.height_um, layout_level=level).removed
     tilt = 0.001 * np.arange(540)[None, :] - 0.0005 * np.arange(540)[:, None]
     after = level_layout_aware(scan.height_um + tilt, layout_level=level).removed
-    # The fit is linear in the heights: the planted tilt comes back exactly, but for rounding.
+    # The fit is linear in the heights, so it returns the added tilt exactly, except for rounding.
     np.testing.assert_allclose(after - before, tilt - tilt[np.isfinite(level)].mean(), rtol=0, atol=1e-9)
 
 
@@ -212,8 +213,8 @@ def test_scars_are_found_and_filled() -> None:
     np.testing.assert_array_equal(mark_scars(spoiled, sign="positive"), single)
     filled = remove_scars(spoiled, scars=found)
     np.testing.assert_array_equal(filled.removed[~found], 0.0)
-    # Across three rows the surface bends by less than 0.2 (3/120)² 2² / 2. The noise at both sides adds to
-    # this.
+    # Over three rows, the curvature of the surface changes heights by less than 0.2 (3/120)² 2² / 2. The
+    # noise on both sides adds to this.
     np.testing.assert_allclose(filled.height[scars], smooth[scars], rtol=0, atol=0.0025)
 
 
@@ -228,7 +229,7 @@ def test_scars_shorter_or_wider_than_asked_stay() -> None:
 
 
 def test_filling_is_harmonic() -> None:
-    """A linear surface solves Laplace's equation, so it is restored whatever the marked pixels held."""
+    """Check that a linear surface, which solves Laplace's equation, is restored in the marked pixels."""
     z = 0.1 * np.arange(30)[:, None] + 0.2 * np.arange(40)[None, :]
     marks = np.zeros(z.shape, dtype=bool)
     marks[5:12, 6:30] = marks[20, 20] = True

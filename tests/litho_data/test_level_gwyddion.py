@@ -1,4 +1,4 @@
-"""Levelling agrees with fields that Gwyddion 2.62 levelled. Intended deviations are tested too."""
+"""Compare levelling with results of Gwyddion 2.62, from which a few methods deviate on purpose."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ROW_METHODS = {
     "modus": "modus",
     "facettilt": "facet-tilt",
 }
-# Further results of Gwyddion 2.62, every 27th pixel in both axes: method, masking of synA, parameters.
+# The methods and parameters of further results of Gwyddion 2.62, with every 27th pixel along both axes.
 SAMPLED = {
     **{name: {} for name in ("facettilt", "modus", "match")},
     "tmean20": {"trim": 0.2},
@@ -48,7 +48,7 @@ SAMPLED = {
 
 
 def _vectors() -> list[dict[str, Any]]:
-    """Return all entries of the index, or none where the reference fields are absent."""
+    """Return all entries of the index of reference fields, or none if these fields are not installed."""
     index = Path(os.environ.get("LITHO_ORACLE_DIR", "")) / "gwyddion" / "index.json"
     return json.loads(index.read_text()) if index.is_file() else []
 
@@ -77,7 +77,7 @@ def _inputs(oracles: Path, entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarra
 
 
 def _field(oracles: Path, name: str) -> tuple[np.ndarray, np.ndarray, tuple]:
-    """Return heights in µm, mask and pitch (y, x) in µm."""
+    """Return the heights in µm, the mask and the pitch (y, x) in µm of a reference field."""
     field = np.load(oracles / "gwyddion" / name)
     ny, nx = field["z"].shape
     pitch_um = (float(field["yreal"]) * 1e6 / ny, float(field["xreal"]) * 1e6 / nx)
@@ -88,15 +88,15 @@ def _field(oracles: Path, name: str) -> tuple[np.ndarray, np.ndarray, tuple]:
 def test_vector(oracles: Path, entry: dict[str, Any]) -> None:
     height_um, mask, pitch_um, expected_um = _inputs(oracles, entry)
     levelled = _level(entry, height_um, mask, pitch_um)
-    # Another order of summation rounds differently. Normal equations of a polynomial lose two more digits.
+    # Sums in another order round differently. The normal equations of polynomials lose two more digits.
     polynomial = entry["method"].startswith(("polylevel", "rows_poly"))
     tolerance = (1e-10 if polynomial else 1e-12) * np.ptp(height_um)
     np.testing.assert_allclose(levelled.height + levelled.removed, height_um, rtol=0, atol=1e-15)
     if "note" not in entry:
         np.testing.assert_allclose(levelled.height, expected_um, rtol=0, atol=tolerance)
         return
-    # Gwyddion's mask test selects no pixel here, so it returns its input. Our code includes the pixels of the
-    # mask. Excluding the inverted mask therefore gives the same result, and rows do move.
+    # Here Gwyddion's test of the mask selects no pixel, so Gwyddion returns its input. Our code uses the
+    # pixels of the mask, so it moves rows, and excluding the inverted mask gives the same result.
     np.testing.assert_allclose(expected_um, height_um, rtol=0, atol=tolerance)
     mirrored = _level(entry | {"masking": "exclude"}, height_um, ~mask, pitch_um)
     np.testing.assert_array_equal(levelled.height, mirrored.height)
@@ -108,7 +108,7 @@ def test_vector(oracles: Path, entry: dict[str, Any]) -> None:
 def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> None:
     height_um, mask, pitch_um = _field(oracles, "synA__input.npz")
     if (name, masking) == ("tmeandiff20", "include"):
-        pytest.skip("Gwyddion's difference methods find no pixel of an inclusion mask: see test_vector")
+        pytest.skip("Gwyddion's difference methods use no pixel of an inclusion mask; see test_vector")
     _compare_samples(oracles, f"synA__rows_{name}_{masking}", name, height_um, pitch_um, mask, masking)
 
 
@@ -118,7 +118,7 @@ def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> No
 def test_sampled_rows_of_a_measured_scan(
     oracles: Path, measured_prints: Path, tmp_path: Path, name: str, factor: str
 ) -> None:
-    """Level the file in metres, and the same digits written in micrometres."""
+    """Compare levelling of a measured scan read in metres, and of the same digits read in micrometres."""
     path = measured_prints / "afm_ug" / "FOV11.txt"
     if factor == "e6":
         scan = read_scan(path, unit="m", size_um=(54, 54))

@@ -1,4 +1,4 @@
-"""Laws of levelling: closed forms, idempotence, transposition, units, masks, missing pixels."""
+"""Test laws of levelling: closed forms, repetition, transposition, units, masks and missing pixels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHAPES = st.tuples(st.integers(8, 24), st.integers(8, 24))
 SLOPES = st.floats(-0.1, 0.1, allow_subnormal=False)
 SEEDS = st.integers(0, 2**32 - 1)
 ROW_METHODS = get_args(RowMethod)
-# Cumulative sums and least squares over a few hundred pixels are exact to this share of the range.
+# Cumulative sums and least squares over a few hundred pixels are exact to this fraction of the range.
 ROUNDING = 1e-11
 
 WHOLE_SURFACE = {
@@ -58,7 +58,7 @@ def ramp(shape: tuple[int, int], constant: float, slope_x: float, slope_y: float
 
 
 def rough(shape: tuple[int, int], seed: int) -> np.ndarray:
-    """Return a smooth surface with noise, about 1 µm high."""
+    """Return a noisy smooth surface that is about 1 µm high."""
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     a = rng.normal(size=6)
@@ -73,7 +73,7 @@ def test_a_plane_is_removed_in_closed_form(
 ) -> None:
     z = ramp(shape, constant, slope_x, slope_y)
     atol = ROUNDING * max(np.abs(z).max(), 1e-30)
-    # The pivot (nx/2, ny/2) lies half a pixel off the middle pixel, so the mean moves by (bx + by) / 2.
+    # The pivot (nx/2, ny/2) lies half a pixel from the centre, so the mean changes by (bx + by) / 2.
     pivot = constant + slope_x * shape[1] / 2 + slope_y * shape[0] / 2
     levelled = level_plane(z)
     np.testing.assert_allclose(levelled.height, pivot, rtol=0, atol=atol)
@@ -85,7 +85,7 @@ def test_a_plane_is_removed_in_closed_form(
 @pytest.mark.parametrize(("slope_x", "slope_y"), [(0.02, -0.03), (0.0, 0.1), (0.0, 0.0)])
 def test_the_facet_of_a_plane_is_the_plane(slope_x: float, slope_y: float) -> None:
     z = ramp((20, 30), 0.3, slope_x * PITCH_UM[1], slope_y * PITCH_UM[0])
-    # The iteration stops at a step below sqrt(1e-9) in slope, here over 30 pixels of 0.1 µm.
+    # The iteration stops when the slope changes by less than sqrt(1e-9). The field is 3 µm wide.
     assert np.ptp(level_facet(z, pitch_um=PITCH_UM).height) < 1e-4 * 3
 
 
@@ -100,7 +100,7 @@ def test_facet_levelling_follows_terraces_and_ignores_their_steps() -> None:
     terraces = 0.1 * np.repeat(np.arange(6), 10)[None, :] + np.zeros((40, 1))
     tilted = terraces + ramp(terraces.shape, 0.0, 0.02 * PITCH_UM[1], -0.05 * PITCH_UM[0])
     once = level_facet(tilted, pitch_um=PITCH_UM)
-    # Slopes are found to sqrt(1e-9). A least-squares plane would take the staircase for a slope.
+    # Slopes are exact to sqrt(1e-9). A least-squares plane would mistake the staircase for a slope.
     atol = np.sqrt(1e-9) * (60 * PITCH_UM[1] + 40 * PITCH_UM[0])
     np.testing.assert_allclose(once.height - once.height[0, 0], terraces, rtol=0, atol=atol)
     np.testing.assert_allclose(
@@ -120,7 +120,7 @@ def test_a_polynomial_is_removed_whatever_its_coefficients(seed: int, degrees: t
     mask = rng.random(z.shape) < 0.3
     for masking in ("ignore", "exclude", "include"):
         levelled = level_polynomial(z, x_degree=degrees[0], y_degree=degrees[1], mask=mask, masking=masking)
-        # The fit through 30 % of the pixels has a condition number of up to 1e4, which multiplies rounding.
+        # The fit to 30 % of the pixels has a condition number of up to 1e4, which multiplies rounding errors.
         np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=1e-10 * max(1, np.abs(z).max()))
 
 
@@ -128,7 +128,7 @@ TWICE = [
     (name, masking)
     for name in ALL
     for masking in ("ignore", "exclude", "include")
-    # Facet levelling converges only on surfaces with facets. Under a mask the weights of matching do not add
+    # Facet levelling converges only on surfaces with facets. With a mask, the weights of matching do not add
     # up to one.
     if "facet" not in name and (name != "rows-matching" or masking == "ignore")
 ]
@@ -144,8 +144,8 @@ def test_levelling_a_second_time_changes_nothing(name: str, masking: str) -> Non
     if name == "rows-polynomial":
         # This method adds back a mean that ignores the mask, so the mean height changes each time.
         difference -= difference.mean()
-    # The robust fits stop at 1e-7 of a noise sigma of 0.1 µm. Marks near the threshold may change by
-    # rounding.
+    # The robust fits stop at 1e-7 of the noise sigma of 0.1 µm. Rounding may change the marks of pixels near
+    # the threshold.
     atol = {"robust": 1e-7, "mask-and-relevel": 1e-2}.get(name, ROUNDING)
     np.testing.assert_allclose(difference, 0.0, rtol=0, atol=atol)
 
@@ -194,9 +194,9 @@ def test_vertical_alignment_is_horizontal_alignment_of_the_transpose(method: str
 def test_levelling_commutes_with_a_change_of_unit_and_datum(
     name: str, seed: int, scale: float, offset: float
 ) -> None:
-    """level(a z + b) = a level(z) + what the operation does to a constant."""
+    """Check that level(a z + b) = a level(z) + c, where c is b or 0 depending on the operation."""
     z = rough((16, 20), seed)
-    # Every row keeps some pixels: rows without any follow Gwyddion's rule, which depends on the datum.
+    # Every row keeps some pixels. A row without any would follow Gwyddion's rule, which depends on the datum.
     mask = np.random.default_rng(seed).random(z.shape) < 0.25
     operate = ALL[name]
     expected = scale * operate(z, mask=mask).height
@@ -219,7 +219,7 @@ def test_adding_a_plane_changes_at_most_a_constant(name: str) -> None:
 @pytest.mark.parametrize("name", list(ALL))
 @pytest.mark.parametrize("masking", ["exclude", "include"])
 def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
-    """Pixels that are left out may have any value. Only polynomials per row include them in a mean."""
+    """Check that the values of excluded pixels do not matter, except for a mean added to polynomial rows."""
     z = rough((20, 30), 7)
     rng = np.random.default_rng(8)
     left_out = rng.random(z.shape) < 0.2
@@ -233,7 +233,7 @@ def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
     if name == "rows-polynomial":
         difference -= difference.mean()
     if name == "rows-matching":
-        # As in Gwyddion, the curvature beside a masked pixel scales the weights too.
+        # As in Gwyddion, the curvature beside a masked pixel also affects the weights.
         assert np.abs(difference).max() < 1e-3
     else:
         np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
@@ -253,10 +253,7 @@ def test_matching_ignores_an_inclusion_mask_in_the_last_column_only() -> None:
 
 
 def test_the_modus_of_a_row_does_not_depend_on_the_unit_of_the_file() -> None:
-    """Values of five digits have many equally short windows.
-
-    The unit of the file must not affect the choice.
-    """
+    """Check that the unit does not decide between the many equally short windows of five-digit values."""
     digits = np.random.default_rng(3).integers(10000, 99999, (40, 300))
     from_metres = np.array([[float(f"{n}e-11") for n in row] for row in digits]) * 1e6
     from_um = np.array([[float(f"{n}e-5") for n in row] for row in digits])
@@ -267,7 +264,7 @@ def test_the_modus_of_a_row_does_not_depend_on_the_unit_of_the_file() -> None:
 
 @pytest.mark.parametrize("slope", [0.02, -0.3])
 def test_facet_tilt_levels_rows_whose_facets_are_flat(slope: float) -> None:
-    """Most slopes of terraces on a tilted row are the tilt, which is removed. The steps stay."""
+    """Check that the tilt of rows with terraces is removed, and that their steps remain."""
     terraces = np.repeat(np.cumsum(np.random.default_rng(2).choice([-1.0, 1.0], (6, 12)), axis=1), 25, axis=1)
     row = (np.arange(300) - 149.5) * slope * PITCH_UM[1]
     levelled = align_rows(terraces + row, method="facet-tilt", pitch_um=PITCH_UM)
@@ -293,7 +290,7 @@ def test_missing_pixels_are_left_out_and_stay_missing(name: str) -> None:
 
 @pytest.mark.parametrize("method", [name for name in ROW_METHODS if name not in ("facet-tilt", "modus")])
 def test_row_offsets_are_recovered(method: str) -> None:
-    """Offsets of single rows are removed, whatever each method keeps of the surface."""
+    """Check that every method removes the offsets of single rows."""
     rng = np.random.default_rng(11)
     offsets = rng.normal(size=40)
     offsets -= np.polynomial.Polynomial.fit(np.arange(40), offsets, 1)(np.arange(40))
@@ -356,9 +353,9 @@ def test_what_cannot_be_levelled_is_refused(operate, message: str) -> None:
 @pytest.mark.parametrize("method", ["median", "median-of-differences", "trimmed-mean", "matching"])
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_row_alignment_warns_where_a_block_moves_lines(method: str, direction: str) -> None:
-    """A block covers 55 % of some lines.
+    """Check the warning for lines of which a block covers 55 %.
 
-    Row alignment shifts these lines, but 45 % of their pixels are right.
+    Row alignment shifts these lines, although 45 % of their pixels are right.
     """
     rng = np.random.default_rng(0)
     offsets = 0.05 * rng.standard_normal((128, 1))
@@ -369,6 +366,6 @@ def test_row_alignment_warns_where_a_block_moves_lines(method: str, direction: s
         recipe.apply(z if direction == "horizontal" else z.T)
     z[30:90, 20:90] += 0.8
     with pytest.warns(
-        LevellingWarning, match=r"0\.[4-9]\d* µm where \d\d% of the pixels of a line did not move"
+        LevellingWarning, match=r"0\.[4-9]\d* µm, although \d\d% of a line's pixels had no offset"
     ):
         recipe.apply(z if direction == "horizontal" else z.T)

@@ -1,4 +1,4 @@
-"""A recipe does exactly what it states, and nothing else is accepted."""
+"""Check that a recipe does exactly what it states, and that anything else is refused."""
 
 from __future__ import annotations
 
@@ -138,9 +138,9 @@ def test_a_missing_recipe_and_a_missing_layout_are_refused(tmp_path: Path) -> No
 
 
 def test_the_page_states_which_operations_were_tested_against_gwyddion() -> None:
-    """The first column names all operations.
+    """Check the tables of operations on the page.
 
-    Those that follow Gwyddion are also in one of two cells below.
+    The first column names all operations. Those that follow Gwyddion are also in one of two cells below.
     """
     page = (Path(__file__).parents[2] / "docs" / "levelling.md").read_text(encoding="utf-8")
     lines = [line for line in page.splitlines() if line.startswith("|")]

@@ -1,4 +1,4 @@
-"""Files are paired by id. Unpaired files are listed, and paths that leave the folder are refused."""
+"""Check that files are paired by id, unpaired files listed, and paths out of the folder refused."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
 
 
 def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_path: Path) -> None:
-    """A scan without an order would otherwise be taken to stand at some place in the order of writing."""
+    """Check that a scan without an order is not given an arbitrary place in the order of writing."""
     card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
     (tmp_path / "scans.csv").write_text("id,order\nP12,4\n", encoding="utf-8")
     listing = list_fields(card)
     assert [(one.id, one.order) for one in listing.fields] == [("P12", 4)]
     assert listing.refused == {"P11": "not in scans.csv, which sets the order"}
-    # If the table has no orders, no scan has an order, and all are kept, sorted by id.
+    # If the table states no order for any scan, all scans are kept and sorted by id.
     (tmp_path / "scans.csv").write_text("id,dose\nP12,1.5\n", encoding="utf-8")
     assert [(one.id, one.order) for one in list_fields(card).fields] == [("P11", 0), ("P12", 1)]
 

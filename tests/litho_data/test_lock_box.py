@@ -1,4 +1,4 @@
-"""The lock box holds a sixth of the scans, from different prints, and is the same in every call."""
+"""Check that the lock box holds a sixth of the scans, from different prints, and never changes."""
 
 from __future__ import annotations
 

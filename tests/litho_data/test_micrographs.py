@@ -1,4 +1,4 @@
-"""Edges in electron micrographs are found to a fraction of a pixel despite rims, charging and dirt."""
+"""Check that edges in micrographs are found to a fraction of a pixel despite rims, charging and dirt."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _from_centre(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _micrograph(distance_px: np.ndarray, charging: float = 0.2) -> np.ndarray:
-    """Return the micrograph of a film: a flank one pixel wide, a bright rim, charging along x, and noise."""
+    """Return a micrograph of a film with flanks one pixel wide, a bright rim, charging along x, and noise."""
     film = 1 / (1 + np.exp(-distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(distance_px, 0) / 12))
     grey *= 1 + charging * np.linspace(-1, 1, distance_px.shape[1])
@@ -56,8 +56,8 @@ def test_rim_and_charging_do_not_move_an_edge() -> None:
     found = find_edges(_micrograph(distance)).distance_px
     near = np.abs(distance) < 4
     off = (found - distance)[near]
-    # Noise of 3 on a flank of 110 in 2 px, smoothed, moves an edge by 0.03 px. A rim of 1.6 times the film
-    # moves it by 0.3 px.
+    # Smoothed noise of 3 displaces an edge by 0.03 px, as the flank rises by 110 in 2 px. A rim 1.6 times as
+    # bright as the film displaces it by 0.3 px.
     assert off.std() < 0.06
     assert abs(off.mean()) < 0.3
 
@@ -66,8 +66,8 @@ def test_coverage_keeps_the_area_of_a_disc_at_any_pitch() -> None:
     distance = _from_centre((201, 201))
     for every in (1, 2, 4):
         share = coverage(distance[::every, ::every], every)
-        # A pixel that the edge crosses at an angle is wrong by at most an eighth. The sign varies around the
-        # disc.
+        # The coverage of a pixel that the edge crosses at an angle is wrong by at most an eighth, with
+        # varying sign around the disc.
         assert share.sum() * every**2 == pytest.approx(np.pi * RADIUS_PX**2, rel=2e-3)
 
 
@@ -79,7 +79,7 @@ def test_film_far_from_the_layout_is_dirt_and_a_lost_island_belongs_to_the_print
     seen[10:24, 10:24] = 0
     seen[50:56, 15:21] = 1
     dirt = foreign(seen, layout, 5)
-    # The place is farther than 5 px from all edges, and so are its surroundings.
+    # These pixels and their surroundings are farther than 5 px from all edges of the layout.
     assert dirt[52, 16:20].all()
     assert dirt[45:61, 17].all()
     assert not dirt[44, 17]
@@ -104,11 +104,11 @@ def test_a_picture_without_edges_is_refused() -> None:
     ("change", "says"),
     [
         ("size_um = [0.48, 0.56]|", "size_um"),
-        ('size_um = [0.48, 0.56]|size_um = [0.48, 0.56]\nunit = "nm"', "a micrograph has none"),
+        ('size_um = [0.48, 0.56]|size_um = [0.48, 0.56]\nunit = "nm"', "a micrograph has no heights"),
         ("[write]|[process]\ntip = 0.1\n[write]", "no levelling, tip"),
         ("levels = 17|levels = 16", "levels = 17"),
         ('"sem"\n|"tem"\n', "instrument"),
-        ('"sem"\nsize_um = [0.48, 0.56]|"confocal"\n[process]\ntip = 0.1', "no tip: a confocal"),
+        ('"sem"\nsize_um = [0.48, 0.56]|"confocal"\n[process]\ntip = 0.1', "no tip, because a confocal"),
     ],
 )
 def test_a_card_that_contradicts_its_instrument_is_refused(change: str, says: str) -> None:
@@ -118,7 +118,7 @@ def test_a_card_that_contradicts_its_instrument_is_refused(change: str, says: st
 
 @pytest.fixture(scope="module")
 def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build a film: a layout of 1 nm pixels, a print with rounded corners, a micrograph of 2 nm pixels."""
+    """Build a film from a layout with 1 nm pixels and a micrograph with 2 nm pixels and rounded corners."""
     folder = tmp_path_factory.mktemp("films")
     (folder / "card.toml").write_text(CARD, encoding="utf-8")
     for name in ("layout", "sem"):
@@ -141,7 +141,7 @@ def test_a_film_is_built_into_a_store_that_says_what_its_heights_are(films: Path
     inner = scan.height_um[scan.valid]
     assert inner.min() >= 0
     assert inner.max() == pytest.approx(0.16)
-    # After registration the film lies on its layout, except for a rim of a few pixels.
+    # After registration the film agrees with its layout, except for a rim of a few pixels.
     wrong = (scan.height_um > 0.08) != (scan.layout_um > 0.08)
     assert wrong[scan.valid].mean() < 0.05
     assert np.isfinite(scan.height_sigma_um[scan.valid]).all()

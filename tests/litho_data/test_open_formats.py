@@ -1,4 +1,4 @@
-"""Other tools read stores and releases: mlcroissant, rocrate, ome-zarr-models, compliance-checker."""
+"""Check that other tools (mlcroissant, rocrate, compliance-checker and others) read stores and releases."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def release(campaign: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_croissant_is_valid_and_reads_the_table(release: Path, campaign: Path) -> None:
-    """mlcroissant downloads nothing. The files lie beside the description, and it checks their hashes."""
+    """Check the description with mlcroissant, which verifies the hashes of the files beside it."""
     dataset = mlcroissant.Dataset(jsonld=release / "croissant.json")
     assert not dataset.metadata.ctx.issues.errors
     quality = open_store(campaign / "prints.zarr").quality
@@ -52,7 +52,7 @@ def test_rocrate_reads_the_crate(release: Path) -> None:
 
 
 def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
-    """Tools of OME-Zarr follow ``labels``. The model of the format checks axes, scales and arrays."""
+    """Check the images as OME-Zarr tools find them, by ``labels``, and validate axes, scales and arrays."""
     root = open_store(campaign / "prints.zarr").root
     groups = [root[letter] for letter in root.attrs["labels"]]
     names = [name for group in groups for name in group.attrs["labels"]]
@@ -65,9 +65,9 @@ def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
 
 
 def cf_complaints(store: Path, netcdf: Path) -> set[str]:
-    """Return what compliance-checker finds in a NetCDF copy.
+    """Return the complaints of compliance-checker about a NetCDF copy of the store.
 
-    The copy stores words as characters, and its coordinates have no missing values.
+    The copy stores words as characters, and its coordinates have no fill value.
     """
     prints = xarray.open_zarr(store)
     words = [name for name in prints.coords if prints[name].dtype.kind not in "biuf"]
@@ -82,7 +82,7 @@ def cf_complaints(store: Path, netcdf: Path) -> set[str]:
 
 
 def test_units_and_coordinates_follow_the_cf_conventions(campaign: Path, tmp_path: Path) -> None:
-    """Complaints about latitudes are ignored: the checker takes every Y axis for one, whatever its unit."""
+    """Check a copy, ignoring complaints about latitude, which the checker expects of any Y axis."""
     found = cf_complaints(campaign / "prints.zarr", tmp_path / "prints.nc")
     assert not {one for one in found if not one.startswith(("§4.1 Latitude", "§4.2 Longitude"))}
 

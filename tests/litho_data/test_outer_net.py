@@ -1,4 +1,4 @@
-"""A limit of the machine or a bad input ends in one line that names a remedy, with exit code 2."""
+"""Check that bad input or a limit of the machine ends a command with one helpful line and exit code 2."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from litho_data.level.recipe import Recipe
 
 
 class CannotAllocate(RuntimeError):
-    """An error of memory, named as in PyTorch."""
+    """Imitate the error that PyTorch raises when it cannot allocate memory."""
 
 
 def os_error(code: int) -> OSError:
@@ -152,7 +152,7 @@ def test_a_value_that_no_file_can_hold_is_one_line(what: str, tmp_path: Path) ->
             read(file)
         assert "\n" not in str(said.value)
     file.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="bytes that are no text"):
+    with pytest.raises(InputError, match="bytes that are not text"):
         read(file)
 
 

@@ -1,4 +1,4 @@
-"""A command that writes a whole result never overwrites anything else."""
+"""Check that a command overwrites nothing but an older result of the same kind."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
     write(campaign, out)
     assert {path.name for path in out.iterdir()} == names
 
-    # Measured scans lie beside their layouts, notes beside a release. One foreign file protects the folder.
+    # A folder that contains any foreign file, such as a measured scan or a note, is not replaced.
     (out / "scans").mkdir()
     (out / "scans" / "P11.txt").write_text("weeks of measuring")
     with pytest.raises(InputError, match="which holds scans"):
@@ -76,7 +76,7 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
         ({"prints": 4, "sizes": [1, 2], "cache": None}, ""),
         ({"prints": 4}, "settings, sizes, wanted"),
         (None, "settings, prints, wanted"),
-        ({"prints": 3, "sizes": [1, 2]}, "prints = 3, but now 4 is asked for"),
+        ({"prints": 3, "sizes": [1, 2]}, "prints = 3, but now 4 is requested"),
         ({"prints": 4, "sizes": [1, 3]}, "sizes, wanted"),
         ({"prints": 4, "sizes": [1, 2], "cache": 1}, "cache = 1, but now None"),
     ):

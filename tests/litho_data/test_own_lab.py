@@ -1,4 +1,4 @@
-"""The first dataset of a new lab is right if the page is followed. Every wrong number is named first."""
+"""Check the first dataset of a new lab: correct if the page is followed, and otherwise with a warning."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from tests.litho_data.campaigns import write_campaign
 from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, RIM_PX, errors_nm, write_lab
 
 BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
-# The median of |6 nm jitter of the lines| + noise is 4.8 nm. A limit of 8 nm leaves room for errors of
-# levelling.
+# The line jitter of 6 nm and the noise give a mean absolute error of 4.8 nm. A limit of 8 nm leaves room for
+# levelling errors.
 MOST_NM = 8.0
 FEW = ("A1", "A2", "B1", "B2")
 
@@ -45,9 +45,9 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     card = lab(tmp_path)
     found = suggest_recipe(card, tmp_path / "levelling")
     assert found.recipe == "plane and bow"
-    # The part of the heights that the layout does not explain is a small part of a level.
+    # The heights that the layout does not explain are small compared with a level.
     assert max(found.left_nm["plane and bow"].values()) < 1e3 * LEVEL_HEIGHT_UM / 2
-    # Row alignment would take the print for offsets of lines.
+    # Row alignment would mistake parts of the print for line offsets.
     assert set(found.warned) >= {"lines, then plane and bow", "plane and bow, then lines"}
     assert (tmp_path / "levelling" / "report.html").is_file()
     assert load_card(found.card).process.level == "card.recipe.toml"
@@ -60,11 +60,11 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert max(errors.values()) < MOST_NM, errors
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
     assert f"check {MIRRORED}: a mirror image" in build.stderr
-    # Level 0 of these prints lies two levels above the substrate.
+    # Level 0 of these prints is two levels higher than the substrate.
     assert "check all scans: their outermost pixels deviate" in build.stderr
     scan = store.scan("B3")
     assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
-    # Models see the substrate around the field, and the measured heights stay where the scan has them.
+    # The stored field includes a rim of substrate, for which the scan provides measured heights.
     rim = np.ones(scan.shape, bool)
     rim[RIM_PX:-RIM_PX, RIM_PX:-RIM_PX] = False
     assert not scan.mask_level[rim].any()
@@ -99,13 +99,17 @@ def align_rows(card: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "change", "said"),
     [
-        ({"pitch_um": "0.14"}, None, r"all scans: the scans are -6\.\d % off.*0\.14 fits as 0\.1(49|5)"),
+        (
+            {"pitch_um": "0.14"},
+            None,
+            r"all scans: the scale of the scans is -6\.\d % off.*0\.14 should be 0\.1(49|5)",
+        ),
         (
             {"level_height_um": "0.8"},
             None,
             r"all scans: the prints rise by 0\.1\d* µm.*level_height_um = 0\.8",
         ),
-        ({}, other_unit, r"height per level .* times that of the others: is its unit"),
+        ({}, other_unit, r"height per level is .* times that of the others: is its unit"),
         ({}, other_layout, r"A1: it shows the layout of B1.*B1: skipped: registration failed"),
         ({}, align_rows, r"lines were shifted by up to .*part of the print may be removed"),
     ],
@@ -127,7 +131,7 @@ def test_a_wrong_card_is_named_in_the_first_box_and_in_the_terminal(
 
 def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
     card = lab(tmp_path, FEW[:2], level_height_um="80", more=BOW)
-    with pytest.raises(InputError, match=r"level_height_um, got 80 µm, where the prints rise by 0\.\d+ µm"):
+    with pytest.raises(InputError, match=r"level_height_um, got 80 µm, but the prints rise by 0\.\d+ µm"):
         build_dataset(card, card.parent / "prints.zarr")
     assert not list(card.parent.glob("*.zarr"))
 
@@ -155,8 +159,8 @@ def test_the_residual_of_the_layout_is_noise_tilt_and_lost_print() -> None:
 
     print_um = LEVEL_HEIGHT_UM * ndimage.gaussian_filter(level, 1.5)
     noise = 0.004 * rng.standard_normal(level.shape)
-    # The residual of white noise is its standard deviation, known to 1 % from 7000 pixels. The fit uses six
-    # numbers.
+    # The residual of white noise is its standard deviation, which 7000 pixels give to 1 %. The fit has only
+    # six parameters.
     assert left_by_layout(print_um + noise, level) == pytest.approx(0.004, rel=0.05)
     tilt = 0.1 * np.linspace(-1, 1, 128)
     assert left_by_layout(print_um + noise + tilt, level) > 0.04

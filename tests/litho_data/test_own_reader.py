@@ -1,4 +1,4 @@
-"""A reader from a file outside the package is asked first and can be named in cards and commands."""
+"""Check that a user's own reader is tried first and can be named in cards and commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of
 
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Load `examples/own_reader.py` and add its reader for one test."""
+    """Load `examples/own_reader.py`, whose reader is registered for the duration of one test."""
     path = Path(__file__).parents[2] / "examples" / "own_reader.py"
     spec = importlib.util.spec_from_file_location("own_reader", path)
     assert spec is not None

@@ -1,4 +1,4 @@
-"""Data survive the authors' pair format, to half a grey value."""
+"""Check that data survive an export to the authors' pair format, to half a grey value."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
     for scan in open_store(campaign / "prints.zarr").scans():
         other = back.scan(scan.id)
         np.testing.assert_array_equal(other.mask_level, scan.mask_level)
-        # The error is half of one of 255 steps plus half of the last digit, 0.1 nm, of the note.
+        # The error is at most half of one of 255 steps, plus half of the last digit (0.1 nm) of the note.
         half_step_um = (np.nanmax(scan.height_um) + raised.get(scan.id, 0)) / 255 / 2
         difference = other.height_um - scan.height_um - raised.get(scan.id, 0)
         assert np.abs(difference).max() <= half_step_um + 0.5e-4 + 1e-6
-        assert np.abs(difference.mean()) < 0.1 * half_step_um + 0.5e-4  # rounded, not cut off
+        assert np.abs(difference.mean()) < 0.1 * half_step_um + 0.5e-4  # rounded, not truncated
     assert verify(tmp_path / "back.zarr").findings == ()
 
 
@@ -43,7 +43,7 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
 def test_an_import_begun_with_other_options_is_not_continued(
     other: dict[str, Any], campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A continued import with other options would mix fields of two pitches in one store."""
+    """Check this because a continued import would mix fields with two pitches in one store."""
     export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
     add, added = PartialStore.add, []
 
@@ -71,7 +71,7 @@ def test_gaps_are_filled_with_a_note(own_campaign: Path, tmp_path: Path) -> None
     gaps = int(np.isnan(open_store(own_campaign / "prints.zarr").scan("P12").height_um).sum())
     notes = export_pairs(own_campaign / "prints.zarr", tmp_path / "pairs")
     assert [note.split(",")[0] for note in notes if "became" in note] == [
-        f"P12: {gaps} pixels without measurement became 0"
+        f"P12: {gaps} unmeasured pixels became 0"
     ]
 
 
@@ -118,7 +118,7 @@ def test_the_authors_pairs_become_whole_fields(measured_prints: Path, tmp_path: 
     assert (result.n_scans, result.skipped) == (24, {})
     assert set(store.scan(store.ids[0]).print_id) == {"1"}
     for scan_id in ("FOV11", "FOV72"):
-        # The quadrants of mask/ are bit-exact parts of the whole layouts in mask_ug/.
+        # The quadrants in mask/ are exact parts of the whole layouts in mask_ug/.
         np.testing.assert_array_equal(
             store.scan(scan_id).mask_level, tifffile.imread(measured_prints / f"mask_ug/{scan_id}.tif")
         )

@@ -1,4 +1,4 @@
-"""Figures and tables for a paper: widths, fonts, escaping. Nothing is written unless requested."""
+"""Check copies of figures and tables for a paper: their widths, fonts and escaped characters."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_figures_are_as_wide_as_columns_with_their_fonts_in_them(tmp_path):
         pdf = (tmp_path / f"figure-{number}.pdf").read_bytes()
         width = float(re.search(rb"/MediaBox \[ 0 0 ([\d.]+)", pdf)[1])
         assert width == pytest.approx(inches * POINTS_PER_INCH, abs=0.01)
-        # A TrueType font is embedded as a file. Type 3, which publishers refuse, has no such file.
+        # A TrueType font is embedded as a file. Publishers refuse Type 3 fonts, which have no such file.
         assert b"/FontFile2" in pdf
         assert b"/Type3" not in pdf
 

@@ -1,4 +1,4 @@
-"""A command estimates its remaining time within a factor of two, whatever processes do the work."""
+"""Check that the estimated remaining time is right within a factor of two, with any number of processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.commands import progress as module
 from litho_data.commands.app import new_app, run_app
 from litho_data.commands.progress import progress, say, say_estimate
 
-# Number of items, items at once, seconds of each item, and seconds that workers take to start.
+# The number of items, the number processed at once, the seconds per item, and the start-up time of workers.
 WORK = {
     "one by one": (40, 1, 4.0, 0.0),
     "short ones": (20_000, 1, 0.01, 0.0),
@@ -23,7 +23,7 @@ WORK = {
 
 
 class Clock:
-    """A clock that advances only when work advances it."""
+    """Provide a clock that only the simulated work advances."""
 
     def __init__(self) -> None:
         self.now_s = 100.0

@@ -1,4 +1,4 @@
-"""The public functions, called one by one, give the result that ``build_dataset`` stores."""
+"""Check that calling the public functions one by one gives the result that ``build_dataset`` stores."""
 
 from __future__ import annotations
 
@@ -25,6 +25,6 @@ def test_public_functions_give_the_scan_of_the_dataset(campaign: Path) -> None:
     )
     assert not removed_um.any()
     np.testing.assert_array_equal(valid, stored.valid)
-    # The store keeps raw heights as float32, 1e-7 of a micrometre.
+    # The store keeps raw heights as float32, with rounding errors of 1e-7 µm.
     np.testing.assert_allclose(found.scan_to_layout, stored.scan_to_layout, atol=1e-4)
     np.testing.assert_allclose(height_um[valid], stored.height_um[valid], atol=1e-5)

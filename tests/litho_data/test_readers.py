@@ -1,4 +1,4 @@
-"""Every reader returns the same asymmetric map with correct orientation, scale, pitch and unit."""
+"""Check that every reader returns the same asymmetric map with correct orientation, scale, pitch and unit."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_imagej_tiff_states_its_pitch(tmp_path: Path) -> None:
     resolution = (1 / PITCH_UM[1], 1 / PITCH_UM[0])
     values = HEIGHT_UM.astype(np.float32)
     tifffile.imwrite(path, values, imagej=True, resolution=resolution, metadata={"unit": "um"})
-    # Rationals in TIFF carry 32 bits each.
+    # A rational number in TIFF has a 32-bit numerator and denominator.
     assert read_scan(path, unit="um").pitch_um == pytest.approx(PITCH_UM, rel=1e-6)
 
 
@@ -115,7 +115,7 @@ def test_jpk_takes_the_default_slot(tmp_path: Path) -> None:
     afm_files.write_jpk(path, counts)
     scan = read_scan(path)
     assert scan.format == "vendor"
-    # 0.25 nm per count and 5 nm offset, as the default slot says; the first slot would give 3 nm and 7 nm.
+    # The default slot states 0.25 nm per count and an offset of 5 nm; the first slot states 3 nm and 7 nm.
     np.testing.assert_allclose(scan.height_um, 0.005 + 0.25e-3 * counts, rtol=1e-12)
     assert scan.pitch_um == pytest.approx(PITCH_UM, rel=1e-12)
     assert scan.channel == "Height (measured)"
@@ -167,7 +167,10 @@ def test_channels_of_one_name_are_numbered(tmp_path: Path) -> None:
         ({"unit": "um", "channel": "Phase"}, "channel, got 'Phase', wanted one of 'height'"),
         ({"unit": "um", "fast_axis": "z"}, "fast axis"),
         ({"unit": "um", "format": "xls"}, "scan format"),
-        ({"unit": "km"}, "heights in µm, by unit 'km', got .*, wanted a number from -100000 to 100000 µm"),
+        (
+            {"unit": "km"},
+            "heights in µm, converted from unit 'km', got .*, wanted a number from -100000 to 100000 µm",
+        ),
         ({"full_scale_um": 1.0}, "full scale"),
     ],
 )
@@ -185,10 +188,10 @@ def test_arguments_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
         read_scan(path, unit="nm")
     with pytest.raises(InputError, match="size_um"):
         read_scan(path, size_um=(SIZE_UM[0], SIZE_UM[1] * 1.01))
-    with pytest.raises(InputError, match="'Phase' is no height"):
+    with pytest.raises(InputError, match="'Phase' does not contain heights"):
         read_scan(path, channel="Phase")
     assert read_scan(path, unit="m", size_um=SIZE_UM).pitch_um == pytest.approx(PITCH_UM)
-    # Given as defaults for many files, the arguments yield to what the file states.
+    # If the arguments are only defaults for many files, what the file states takes precedence.
     scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=True)
     assert (scan.unit, scan.pitch_um) == ("m", pytest.approx(PITCH_UM))
     assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "2.5 × 1.6 µm"]
@@ -242,14 +245,14 @@ def test_fields_written_by_gwyddion(oracles: Path, suffix: str) -> None:
     field = GwyContainer.fromfile(str(oracles / "formats" / "synB.gwy"))["/0/data"]
     expected_um = np.asarray(field["data"]).reshape(field["yres"], field["xres"]) * 1e6
     scan = read_scan(oracles / "formats" / f"synB.{suffix}")
-    # float32 rounds by at most 2^-24 of the value.
+    # Rounding to float32 changes a value by at most 2^-24 of it.
     np.testing.assert_allclose(scan.height_um, expected_um, rtol=2**-24, atol=0)
     assert scan.shape == (301, 200)
     assert scan.channel == "Topography"
     assert scan.pitch_um == pytest.approx((3.6 / 301, 0.01), rel=1e-12)
     if suffix == "gwy":
         assert scan.mask is not None
-        # The mask is not empty, and the heights under it equal those of the formats without a mask.
+        # The mask is not empty, and the heights under it are those of the formats without a mask.
         assert 0 < scan.mask.sum() < scan.mask.size
         np.testing.assert_array_equal(scan.height_um[scan.mask], expected_um[scan.mask])
 
@@ -272,7 +275,7 @@ def test_all_measured_scans_and_layouts(measured_prints: Path) -> None:
         scan = read_scan(path, unit="m", size_um=(54, 54))
         assert scan.shape == (540, 540)
         assert np.isfinite(scan.height_um).all()
-        # All files but one were shifted to a minimum of zero.
+        # All scans except one have a minimum of zero.
         assert scan.height_um.min() == pytest.approx(0.021049 if path.stem == "FOV42" else 0.0, abs=1e-9)
     for path in sorted((measured_prints / "mask_ug").glob("*.tif")):
         assert read_layout(path).shape == (512, 512)

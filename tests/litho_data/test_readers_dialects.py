@@ -1,4 +1,4 @@
-"""Read texts and arrays as other programs and people write them: a right map, or one line of reason."""
+"""Read texts and arrays of other programs and people: either the map is right, or one line says why not."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ HEIGHT_UM[:3, :3] = 0.9
 
 
 def rows(scale: float = 1.0, separator: str = "\t", decimal: str = ".", digits: int = 4) -> list[str]:
-    """Return the heights as lines of text, in µm times ``scale``."""
+    """Return the heights in µm, times ``scale``, as lines of text."""
     lines = ([f"{value * scale:.{digits}f}" for value in row] for row in HEIGHT_UM)
     return [separator.join(line).replace(".", decimal) for line in lines]
 
 
 def points(line: str, scale: float = 1.0) -> list[str]:
-    """Return one line of text per pixel."""
+    """Return a list of points, one line of text per pixel."""
     places = zip(Y.ravel(), X.ravel(), HEIGHT_UM.ravel() * scale, strict=True)
     return [line.format(x=x * PITCH_UM, y=y * PITCH_UM, z=z, i=x, j=y) for y, x, z in places]
 
 
-# Each text with the arguments that its reader needs. Arguments in brackets state the size of a pixel.
+# Each text with the arguments that its reader needs. A name in brackets means that the text states the pitch.
 RIGHT: dict[str, tuple[list[str], dict]] = {
     "[decimal commas in a header]": (
         ["Width: 6,4 µm", "Height: 4,8 µm", "Value units: µm", *rows(decimal=",")],
@@ -62,7 +62,7 @@ def test_a_text_that_is_read(tmp_path: Path, what: str) -> None:
     lines, arguments = RIGHT[what]
     (tmp_path / "scan").write_text("\n".join(lines) + "\n", encoding="utf-8")
     scan = read_scan(tmp_path / "scan", **arguments)
-    # The tolerance is the last of four digits.
+    # The texts contain all digits of the heights.
     np.testing.assert_allclose(scan.height_um, HEIGHT_UM, atol=1e-9)
     assert (scan.pitch_um is not None) == what.startswith("[")
     assert scan.pitch_um is None or scan.pitch_um == pytest.approx((PITCH_UM, PITCH_UM))

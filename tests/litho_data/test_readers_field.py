@@ -1,4 +1,4 @@
-"""Read what instruments and their users deliver: packed files, odd text, real vendor files."""
+"""Read files as instruments and users deliver them: packed files, unusual text, real vendor files."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def test_ome_tiff_states_its_pitch(tmp_path: Path, unit: str) -> None:
     path = tmp_path / "scan.ome.tif"
     factor = 1 if unit == "µm" else 1000
     metadata = {"axes": "YX", "PhysicalSizeX": 0.2 * factor, "PhysicalSizeY": 0.5 * factor}
-    if unit != "µm":  # the default unit of the standard need not be stated
+    if unit != "µm":  # the standard's default unit need not be stated
         metadata |= {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": unit}
     tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), ome=True, metadata=metadata)
     assert read_scan(path, unit="um").pitch_um == pytest.approx((0.5, 0.2), rel=1e-12)
 
 
 def test_a_nanoscope_channel_without_calibration_does_not_hide_the_heights(tmp_path: Path) -> None:
-    """The scale of this channel has no calibration in metres. The heights must still be read."""
+    """Check that the file can still be read if one of its channels has no calibration in metres."""
     path = tmp_path / "scan.spm"
     afm_files.write_spm(path, np.ones(SHAPE, int), hard_v=1.0, sensitivity_nm_per_v=1.0)
     raw = path.read_bytes()
@@ -72,7 +72,7 @@ def test_a_nanoscope_channel_without_calibration_does_not_hide_the_heights(tmp_p
 
 
 def write_jpk_series(path: Path) -> None:
-    """Write JPK's HDF5: x fastest, y upwards, one column of counts per frame, and a thumbnail."""
+    """Write JPK's HDF5 with x fastest, y upwards, a column of counts for each frame, and a thumbnail."""
     ny, nx = SHAPE
     with h5py.File(path, "w") as file:
         file.attrs["file-format-info"] = np.bytes_("JPK SCAN")
@@ -139,19 +139,19 @@ def test_a_parser_that_crashes_or_never_ends_is_one_line(
         (_crash, "crashed"),
         (_greedy, "memory"),
     ):
-        # On a busy machine the start may take minutes. Only the parser that sleeps has to run into the limit.
+        # On a busy machine the start may take minutes. Only the sleeping parser has to exceed the limit.
         waiting = 2 if parser is _asleep else 500
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", waiting)
         with pytest.raises(InputError, match=message):
             parse(partial(parser, path), path, "toy", ("json",))
         monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", 500)
-        # A parser is ready for the next file.
+        # The next file can still be read.
         found = parse(partial(_whole, path), path, "toy", ("json",))
         assert parse(found[0].load, path, "toy", ("json",))[0, 0, 0] == 7
     assert time.process_time() - start < 2
 
 
-# Content of each real file: the height among its channels, (ny, nx), unit, size (y, x) in µm.
+# For each real file: the number of height channels, (ny, nx), the unit, and the size (y, x) in µm.
 INTACT = {
     "10x10-one_channel_without_name.ibw": (1, (10, 10), None, None),
     "al3d-1.al3d": (1, (296, 200), "m", (296 * 0.438027, 200 * 0.438027)),
@@ -199,7 +199,7 @@ def test_real_files_of_vendors(oracles: Path) -> None:
         assert first.size_um == (pytest.approx(size_um, rel=2e-6) if size_um else None)
         values, _ = first.load()
         assert values.shape == shape
-        # The Digital Surf file marks nine tenths of its pixels as not measured.
+        # The Digital Surf file marks nine tenths of its pixels as unmeasured.
         assert np.isfinite(values).mean() > 0.1
     for name, message in REFUSED.items():
         with pytest.raises(InputError, match=message):
@@ -208,12 +208,12 @@ def test_real_files_of_vendors(oracles: Path) -> None:
 
 @pytest.mark.oracle
 def test_real_files_agree_with_another_reader(oracles: Path) -> None:
-    """Compare every 8th pixel with AFMReader 0.0.7. Its WSxM maps are turned back first.
+    """Compare every 8th pixel with AFMReader 0.0.7, whose WSxM maps are first rotated by 180°.
 
-    WSxM writes its rows with x downwards and y upwards. An example at
-    https://spmimages.ftmc.uam.es/file-specifications shows one image as a matrix and as points. The first
-    number of the matrix is the point with the largest x and the smallest y. That is the lower right pixel,
-    which AFMReader shows in the upper left.
+    An example at https://spmimages.ftmc.uam.es/file-specifications shows one WSxM image as a matrix and as
+    points. The first number of the matrix is the point with the largest x and the smallest y, so WSxM writes
+    x decreasing and y increasing. This point is the lower right pixel, but AFMReader puts it at the upper
+    left.
     """
     reference = np.load(oracles / "vendor" / "reference.npz")
     for name, channel, key, turned in (
@@ -230,7 +230,7 @@ def test_real_files_agree_with_another_reader(oracles: Path) -> None:
 
 @pytest.mark.parametrize("format", ["gsf", "npy", "npz", "gwy", "h5"])
 def test_a_declared_size_without_the_pixels_is_one_line(tmp_path: Path, format: str) -> None:
-    """The header declares 16000 × 16000 pixels, 1 GB, but the file does not hold them."""
+    """Check files whose header declares 16000 × 16000 pixels (1 GB) that the file does not contain."""
     path, side = tmp_path / f"scan.{format}", 16_000
     header = io.BytesIO()
     shape = {"descr": "<f4", "fortran_order": False, "shape": (side, side)}

@@ -1,4 +1,4 @@
-"""Random and damaged bytes end in one clear error from every reader: no crash, no hang, no noise."""
+"""Check that every reader answers random or damaged bytes with one clear error, without crash or hang."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STARTS = (
 
 @pytest.fixture(autouse=True)
 def _alarm() -> Iterator[None]:
-    """Fail the test if a reader hangs, so that the test run goes on."""
+    """Fail the test if a reader hangs, so that the other tests can run."""
 
     def stop(*_: object) -> None:
         raise AssertionError(f"a reader took longer than {LONGEST_S} s")
@@ -104,7 +104,7 @@ def whole_files(folder: Path) -> dict[str, bytes]:
 
 
 def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
-    """For flipped bytes and cut ends, a reader returns a map or raises an InputError, nothing else."""
+    """Check that readers of changed or truncated files return a map or raise an InputError, nothing else."""
     rng = np.random.default_rng(0)
     (tmp_path / "whole").mkdir()
     for name, content in whole_files(tmp_path / "whole").items():
@@ -119,7 +119,7 @@ def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
 
 
 def test_no_header_claims_more_pixels_than_its_file_can_hold(tmp_path: Path) -> None:
-    """With this signature, small numbers are read as sizes. The file holds almost no pixels."""
+    """Check a file with almost no pixels, in which small numbers after the signature are read as sizes."""
     path = tmp_path / "zeta"
     largest = []
     for seed in range(60):
@@ -127,7 +127,7 @@ def test_no_header_claims_more_pixels_than_its_file_can_hold(tmp_path: Path) -> 
         path.write_bytes(b"Zeta-Instruments" + numbers.tobytes())
         with suppress(InputError):
             largest += [channel.shape[0] * channel.shape[1] for channel in list_channels(path)]
-    # Deflate packs at most 1032 bytes into one byte.
+    # Deflate compresses at most 1032 bytes into one byte.
     assert all(pixels <= 1032 * 2016 for pixels in largest)
 
 
@@ -158,7 +158,7 @@ _LONG = 200_000
     ],
 )
 def test_no_line_makes_a_regular_expression_slow(tmp_path: Path, text: str) -> None:
-    """If two neighbouring repetitions can match the same characters, each line takes minutes or hours."""
+    """Check long lines, which take hours if two adjacent repetitions can match the same characters."""
     path = tmp_path / "scan.txt"
     path.write_text(text)
     started = time.process_time()

@@ -1,4 +1,4 @@
-"""Read layouts as levels, as grey pictures, and as the design package exports them."""
+"""Read layouts stored as levels, as grey pictures, or as exported by the design package."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def test_grey_values_that_are_no_steps_are_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.full((4, 4), 30, np.uint8))
     with pytest.raises(InputError, match=r"steps of 21\.25 per level"):
         read_layout(path, grey_per_level=21.25)
-    # Without a step the values are kept as read. The build compares them with its number of levels.
+    # Without a step, the values are kept as read, and the build compares them with the number of levels.
     assert read_layout(path, levels=13).max() == 30
 
 
 def test_exported_files_are_read_by_their_sidecar(tmp_path: Path) -> None:
     picture = tmp_path / "layout.png"
     cv2.imwrite(str(picture), LEVEL.astype(np.uint16) * 5461)
-    # The second schema has the greys of a measured curve. The first has a constant step.
+    # The second version of the sidecar lists greys, as of a measured curve. The first states a constant step.
     greys = [5461 * level for level in range(13)]
     for says in ({"greys": greys}, {"levels": 13, "grey_per_level": 5461}):
         np.testing.assert_array_equal(read_layout(with_sidecar(picture, **says)), LEVEL)

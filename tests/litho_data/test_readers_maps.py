@@ -1,4 +1,4 @@
-"""A map is read correctly or refused: 200 files that vary format, unit, axes, missing pixels and channels."""
+"""Check that 200 maps of many formats, units, axes, marks and channels are read correctly or refused."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FILES = 200
 
 
 def made(path: Path, seed: int) -> MapFile:
-    """Write the map file of one seed and return its description.
+    """Write the map file for a seed and return its description.
 
     Some maps have missing pixels, marked by a number, by a word or not at all.
     """
@@ -66,9 +66,9 @@ def test_no_file_is_read_wrongly_without_a_word(tmp_path: Path) -> None:
         one = made(path, seed)
         what = f"{seed} {WRITERS[seed % len(WRITERS)].__name__} {one.unit} {one.mark} {one.arguments}"
         try:
-            # The reader first gets nothing but the file, as a new user would try it.
+            # First try the reader with the file only, as a new user would.
             if differs(read_scan(path), one) or one.asks:
-                wrong.append(f"{what}: read as it is, wrongly")
+                wrong.append(f"{what}: read wrongly without arguments")
         except InputError as error:
             if not one.asks:
                 wrong.append(f"{what}: {error}")
@@ -77,13 +77,13 @@ def test_no_file_is_read_wrongly_without_a_word(tmp_path: Path) -> None:
             if differs(scan, one) or (one.says_size and scan.pitch_um is None):
                 wrong.append(f"{what}: {scan!r}, {scan.pitch_um}")
         except InputError as error:
-            wrong.append(f"{what}: with what it asks for {error}")
+            wrong.append(f"{what}: refused with the required arguments: {error}")
     assert not wrong, f"{len(wrong)} of {FILES}:\n" + "\n".join(wrong)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_comparison_finds_a_turned_map_and_a_wrong_unit(tmp_path: Path, seed: int) -> None:
-    """Check that the comparison finds a turned map and a map in a wrong unit."""
+    """Check that the comparison notices a flipped map and a map in the wrong unit."""
     one = made(tmp_path / "scan", seed)
     scan = read_scan(tmp_path / "scan", **one.arguments)
     assert not differs(scan, one)
@@ -91,7 +91,7 @@ def test_the_comparison_finds_a_turned_map_and_a_wrong_unit(tmp_path: Path, seed
     assert differs(scan, one)
 
 
-# First words of the rows of the page's table, each with its writer here or the other tests of real files.
+# The first words of each row of the page's table, with its writer here or with another test of real files.
 TRIED = {
     "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "TIFF": tiff, "GSF": gsf,
     "NPY": numpy_archive, "NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,

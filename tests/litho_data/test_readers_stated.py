@@ -1,4 +1,4 @@
-"""What a file states is applied, or the file is refused by name. One bad part does not affect the others."""
+"""Check that a statement of a file is applied, or named in the refusal, without harm to its other parts."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_unit_that_is_no_length_makes_no_height(tmp_path: Path) -> None:
 
 
 def test_a_picture_beside_an_unknown_private_tag_is_no_map(tmp_path: Path) -> None:
-    """Instrument makers keep a preview in the page like this, and the heights elsewhere."""
+    """Check such a TIFF because instrument makers store a preview in its page, and the heights elsewhere."""
     path = tmp_path / "scan.tif"
     tag = (55555, "B", 4 * HEIGHT_UM.size, HEIGHT_UM.astype("<f4").tobytes(), False)
     tifffile.imwrite(path, np.ones(SHAPE, np.uint8), extratags=[tag], metadata=None)
@@ -110,7 +110,7 @@ def test_a_field_without_its_size_is_still_read(tmp_path: Path) -> None:
         (ROWS.replace("0.0310", ""), "line 4, got an empty cell.*missing = ", {"missing": [""]}),
         (
             ROWS.replace("0.0310", "-9999"),
-            r"missing = \[-9999\]; if not: missing = \[\]",
+            r"missing = \[-9999\]; if not, set missing = \[\]",
             {"missing": [-9999]},
         ),
         (ROWS.replace("0.0310", "3.4028e+38"), r"missing = \[3.4028e\+38\]", {"missing": [3.4028235e38]}),
@@ -250,7 +250,7 @@ def test_one_extreme_value_in_many_pixels_is_reported(tmp_path: Path) -> None:
 
 
 def test_bytes_without_a_known_start_are_unknown_and_not_damaged(tmp_path: Path) -> None:
-    """NanoFocus' NMS begins like an Igor wave of version 2 and is not called a damaged wave."""
+    """Check that NMS of NanoFocus, which begins like an Igor wave 2, is not called a damaged wave."""
     path = tmp_path / "scan.nms"
     path.write_bytes(b"\2\0\0\0\1\0\0\0\0\0\xff\xff" + bytes(4000))
     refused(path, "unknown content", unit=None)
@@ -263,7 +263,7 @@ def test_a_digital_surf_file_of_another_kind_is_named(tmp_path: Path, kind: int)
     raw = bytearray(path.read_bytes())
     raw[18] = kind
     path.write_bytes(raw)
-    if kind == 1:  # this message takes more than one line
+    if kind == 1:  # kind 1 is a surface, which is read
         assert read_scan(path).shape == SHAPE
     else:
         refused(path, f"kind of studiable, got {kind}", unit=None)
@@ -291,9 +291,9 @@ def test_axes_at_uneven_steps_are_refused(tmp_path: Path) -> None:
 def test_coordinates_without_a_unit_are_taken_as_micrometres_or_need_a_size(
     tmp_path: Path, unit: str, step: float, pitch_um: float | None
 ) -> None:
-    """The coordinates are in µm or in the unit of the heights.
+    """Check coordinates that may be in µm or in the unit of the heights.
 
-    If both give a scan, the size has to be given.
+    If both give a plausible scan, the pitch is left open, so that the size has to be given.
     """
     path = tmp_path / "scan.txt"
     values = 0.05 * np.random.default_rng(0).random((9, 12))

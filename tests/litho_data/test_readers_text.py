@@ -1,4 +1,4 @@
-"""Read text matrices in all spellings that occur. Every kind of damage is named with its line."""
+"""Read text matrices in all notations that occur, and check that damage is named with its line."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def read(folder: Path, content: str | bytes, **arguments: object):
 )
 def test_spellings(tmp_path: Path, content: str | bytes) -> None:
     scan = read(tmp_path, content, format="auto")
-    # The conversion to binary and the factor 1e6 round once each.
+    # The conversion to binary and the factor 1e6 each round once.
     np.testing.assert_allclose(scan.height_um, EXPECTED_UM, rtol=4e-16)
     assert scan.pitch_um is None
 
@@ -134,7 +134,7 @@ def test_a_measured_scan_cut_at_any_byte(tmp_path: Path, measured_prints: Path) 
     raw = (measured_prints / "afm_ug" / "FOV11.txt").read_bytes()
     rng = np.random.default_rng(0)
     for cut in rng.integers(len(raw) // 2, len(raw) - 16, size=12):
-        # A cut between two lines leaves a smaller but well-formed matrix, which no reader can detect.
+        # A cut between two lines leaves a smaller valid matrix, so no reader can detect it.
         if raw[cut - 1 : cut] not in (b"\n", b"\r"):
             with pytest.raises(InputError, match="line"):
                 read(tmp_path, raw[:cut])

@@ -1,4 +1,4 @@
-"""Registration: phantoms of known warp, the ladder, ambiguity, fallbacks, frames."""
+"""Test registration: phantoms of known warp, the ladder of models, ambiguity, fallbacks, frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def register(scan: np.ndarray, layout: np.ndarray, **options) -> Registration:
     )
 
 
-# rotation up to 3 degrees, scales up to 8 % apart from one and from each other, blobs fine and coarse.
+# These are rotations up to 3°, scales that differ by up to 8 % from one and each other, and blob sizes.
 WARPS = [
     (3.0, (1.08, 1.0), 5.0),
     (-3.0, (0.92, 1.03), 5.0),
@@ -51,9 +51,9 @@ def test_known_warp_is_recovered_at_snr_5_in_any_orientation_and_polarity(index)
     truth = true_scan_to_layout(warp, orientation, SCAN_SHAPE)
     assert (found.quality.dihedral, found.quality.polarity) == (orientation, polarity)
     assert found.quality.passed, found.quality.reason
-    # This is the required accuracy. White noise at SNR 5 alone would allow about 0.02 px at a corner.
+    # This is the required accuracy. The limit due to white noise at SNR 5 is about 0.02 px at a corner.
     assert warp_error_px(found.scan_to_layout, truth, SHAPE) < 0.3
-    # The stated uncertainty must hold: no corner is off by more than six standard deviations.
+    # The stated uncertainty must be right: no corner is wrong by more than six standard deviations.
     assert warp_error_px(found.scan_to_layout, truth, SHAPE) < 6 * found.quality.corner_sd_px + 0.02
 
 
@@ -89,7 +89,7 @@ def test_homography_model_recovers_a_perspective_that_an_affine_cannot():
         model: warp_error_px(register(scan, layout, model=model).scan_to_layout, truth, SHAPE)
         for model in ("affine", "homography")
     }
-    # 1e-4 / px moves a corner 240 px from the middle by 1e-4 * 240**2 = 5.8 px.
+    # A perspective of 1e-4 / px displaces a corner 240 px from the centre by 1e-4 * 240**2 = 5.8 px.
     assert errors["homography"] < 0.3 < 1.0 < errors["affine"]
 
 

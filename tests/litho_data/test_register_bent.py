@@ -1,4 +1,4 @@
-"""A bend of the scanner is recovered, stored and replayed, and a straight scan is not bent."""
+"""Check that a scanner bend is found, stored and replayed, and that none is found in a straight scan."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ from tests.litho_data.test_register_quality import GOOD
 
 SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
 AMOUNT_UM = np.array([[0.66, -0.45, 0.54], [-0.6, 0.72, 0.39]])
-# The limit is that of a straight scan. White noise at SNR 5 alone moves a corner by about 0.02 px under an
-# affine warp. Twelve parameters are (26 / 7)**0.5 times less certain: the squares of the basis functions, of
-# unit mean square, add up to 1 + 3 + 3 there for an affine, and the quadratic ones add 5 + 9 + 5.
+# The limit is the same as for a straight scan. At SNR 5, white noise alone displaces a corner by about
+# 0.02 px if the warp is affine, and (26 / 7)**0.5 times as far if it has twelve parameters: there the squares
+# of the basis functions, of unit mean square, add up to 1 + 3 + 3 for an affine warp. The quadratic ones add
+# 5 + 9 + 5.
 CORNER_PX = 0.3
 PITCHES = {"scan_pitch_um": (PITCH_UM, PITCH_UM), "layout_pitch_um": PITCH_UM}
 
@@ -45,20 +46,20 @@ def bend_of(factor: float = 1.0, shape: tuple[int, int] = SCAN_SHAPE) -> Bend:
 
 
 def true_map() -> np.ndarray:
-    """Return the true map from the straightened scan to the layout, µm."""
+    """Return the true matrix from the straightened scan to the layout, in µm."""
     frame = index_to_um((PITCH_UM, PITCH_UM))
     warp = warp_about_centre(SHAPE, rotation_deg=0.8, scale=(1.01, 0.99), margin_px=(39.0, 35.0))
     return frame @ np.linalg.inv(warp) @ np.linalg.inv(frame)
 
 
 def places_um(shape: tuple[int, int]) -> np.ndarray:
-    """Return (x, y) of all pixel centres of a scan, row by row."""
+    """Return the positions (x, y) in µm of all pixel centres of a scan, row by row."""
     y, x = (PITCH_UM * (one.ravel() + 0.5) for one in np.indices(shape))
     return np.stack([x, y], axis=1)
 
 
 def bent_scan(layout: np.ndarray, bend: Bend, snr: float = 5.0) -> np.ndarray:
-    """Return the blurred print at the true place of each pixel of a bent scan, plus white noise."""
+    """Return a bent scan: the blurred print at the true place of each pixel, plus white noise."""
     print_um = LEVEL_HEIGHT_UM * gaussian_filter(layout.astype(float), PRINT_BLUR_PX, mode="constant")
     x, y = apply_transform(true_map(), bend.straighten(places_um(SCAN_SHAPE))).T / PITCH_UM - 0.5
     scan = map_coordinates(print_um, (y, x), order=5, mode="constant").reshape(SCAN_SHAPE)
@@ -94,10 +95,10 @@ def test_a_known_bend_is_recovered_in_any_orientation(orientation, factor, model
     seen = ((truth_um > 0) & (truth_um < PITCH_UM * np.array(SHAPE[::-1]))).all(axis=1)
     error_px = np.hypot(*(layout_places_um(found, turned_um) - truth_um)[seen].T) / PITCH_UM
     assert error_px.max() < CORNER_PX
-    # The stated uncertainty holds: no corner is off by more than six standard deviations.
+    # The stated uncertainty must be right: no corner is wrong by more than six standard deviations.
     assert error_px.max() < 6 * found.quality.corner_sd_px + 0.02
-    # The largest displacement is at the corner of the frame. It exceeds that on the layout by up to (430 /
-    # 352)².
+    # The largest displacement is at the corner of the scan. It is up to (430 / 352)² times as large as that
+    # on the layout.
     assert found.bend_um.largest == pytest.approx(bend.largest, abs=CORNER_PX * PITCH_UM * (430 / 352) ** 2)
     assert f"scan bent by up to {found.bend_um.largest:.2f} µm" in found.quality.warning
 
@@ -105,11 +106,11 @@ def test_a_known_bend_is_recovered_in_any_orientation(orientation, factor, model
 def test_a_straight_warp_of_a_bent_scan_exceeds_its_limits():
     layout = random_layout(SHAPE, seed=2)
     scan = bent_scan(layout, bend_of())
-    # A stiffer model that was chosen does not bend, and shows the residual of an affine warp.
+    # If the user chooses a stiffer model, no bend is fitted, and the residual remains.
     stiff = register(scan, layout, model="similarity")
     assert stiff.bend_um is None
     assert "target registration error" in stiff.quality.reason
-    # A scan passes below 1.5 px. The shift of a block is known to a tenth of a pixel at SNR 5.
+    # A scan passes if the error is below 1.5 px. At SNR 5, block shifts are known to 0.1 px.
     assert register(scan, layout).quality.tre_median_px < 0.3 < 1.5 < stiff.quality.tre_median_px
 
 
@@ -121,8 +122,7 @@ def test_a_straight_scan_is_not_bent():
 
 
 def test_a_bend_within_the_limits_of_a_straight_warp_is_not_fitted():
-    # The bend is at most 0.15 µm, 1.5 px, at a corner, and smaller elsewhere. An affine warp is within its
-    # limits.
+    # The bend is at most 0.15 µm, or 1.5 px, at a corner, and smaller elsewhere, so an affine warp passes.
     layout = random_layout(SHAPE, seed=3)
     found = register(bent_scan(layout, bend_of(0.1)), layout)
     assert bend_of(0.1).largest < 0.16
@@ -151,7 +151,7 @@ def test_no_bend_makes_a_wrong_scan_pass(case):
 
 
 def test_a_bend_that_may_fold_the_scan_is_refused():
-    # d(shift)/dx is 2 a u / half: at u = 1 it reaches 1 for a = half / 2.
+    # d(shift)/dx is 2 a u / half, so at u = 1 it reaches 1 for a = half / 2.
     half_um = bend_of().half[0]
     for share, passed in ((0.99, True), (1.01, False)):
         bend = Bend(np.array([[share * half_um / 2, 0, 0], [0, 0, 0]]), bend_of().middle, bend_of().half)
@@ -165,18 +165,18 @@ def test_undo_is_the_inverse_of_straighten_up_to_the_fold():
     assert 0.5 < bend.slope < 1
     points = bend.middle + bend.half * unit
     back = np.stack(bend.undo(*bend.straighten(points).T), axis=1)
-    # The iteration ends with a step below 1e-9 half widths, 2e-8 µm. Each step is at most 0.9 of the last.
+    # The iteration ends at a step below 1e-9 half widths, or 2e-8 µm. Each step is at most 0.9 of the last.
     np.testing.assert_allclose(back, points, atol=2e-7)
 
 
 def test_a_bend_is_centred_converts_to_pixels_and_is_fitted_from_points():
     bend = bend_of()
-    # The terms are orthogonal to 1, u, v over the frame, so a dense average contains no affine part.
+    # The terms are orthogonal to 1, u and v over the frame, so a dense average contains no affine part.
     u, v = np.meshgrid(*[(np.arange(400) + 0.5) / 200 - 1] * 2)
     shift = np.array(bend.shift(bend.middle[0] + bend.half[0] * u, bend.middle[1] + bend.half[1] * v))
     for basis in (np.ones_like(u), u, v):
-        # The midpoint rule of 400 cells misses the mean of u² by 1 / (3 · 400²) = 2.1e-6; the amounts per u²
-        # and v² add up to 1.2 µm at most.
+        # The midpoint rule with 400 cells is wrong by 1 / (3 · 400²) = 2.1e-6 for the mean of u². The
+        # coefficients of u² and v² add up to at most 1.2 µm.
         np.testing.assert_allclose((shift * basis).mean(axis=(1, 2)), 0, atol=2.6e-6)
     points = places_um((40, 50)) * 8
     in_pixels = bend.in_pixels((PITCH_UM, PITCH_UM)).straighten(points / PITCH_UM - 0.5)
@@ -195,13 +195,13 @@ def test_points_on_a_line_do_not_determine_a_bend():
 
 
 def test_resampling_reads_the_scan_at_the_bent_place():
-    # A cubic spline reproduces a ramp, so the registered height shows which place of the scan was read.
+    # A cubic spline reproduces a ramp, so the resampled height shows which place of the scan was read.
     y_um, x_um = (one.reshape(SCAN_SHAPE) for one in places_um(SCAN_SHAPE).T[::-1])
     bend, origin_um = bend_of(), true_map()
     taken = [resample_to_layout(ramp, origin_um, SHAPE, **PITCHES, bend_um=bend)[0] for ramp in (x_um, y_um)]
     landed_um = apply_transform(origin_um, bend.straighten(np.stack([one.ravel() for one in taken], axis=1)))
     inner = np.pad(np.ones((SHAPE[0] - 40, SHAPE[1] - 40), bool), 20).ravel()
-    # float32 of 40 µm is good to 4e-6 µm.
+    # A float32 of 40 µm is exact to 4e-6 µm.
     np.testing.assert_allclose(landed_um[inner], places_um(SHAPE)[inner], atol=1e-5)
 
 
@@ -240,7 +240,7 @@ def test_a_bent_campaign_is_built_verified_and_replayed_from_its_raw_files(tmp_p
         seen = ((true_px > 0) & (true_px < 255)).all(axis=1)
         error_px = np.hypot(*(found_um / 0.1 - 0.5 - true_px)[seen].T)
         assert error_px.max() < 6 * row["corner_sd_px"] + 0.02
-        # A scan passes below 1.5 px at the worst corner. The mean over the field is a third of that.
+        # A scan passes below 1.5 px at the worst corner. The rms over the field is below a third of that.
         assert np.sqrt((error_px**2).mean()) < 0.5
         assert row["tre_median_px"] < 1.0
     step = {one.op: one for _, one in read_steps(store)[store.ids[0]]}

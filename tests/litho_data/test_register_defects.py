@@ -1,4 +1,4 @@
-"""Defects of prints are located and named, and creep of scan lines is corrected."""
+"""Check that defects of prints are located and reported, and that creep of scan lines is corrected."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def test_a_defect_does_not_pull_the_warp_and_is_mapped(name: str) -> None:
     spoiled = DEFECTS[name](clean, np.random.default_rng(9))
     found = register(spoiled, layout)
     assert found.quality.passed, found.quality.reason
-    # This is the required accuracy. A plain fit is off by 0.5 to 1.2 px.
+    # This is the required accuracy. A fit that ignores defects is wrong by 0.5 to 1.2 px.
     assert rms_error_px(found, warp) < 0.1
     assert found.defects is not None
     assert "does not show the print" in found.quality.warning
-    # The map holds the added defect, except where it differs from the print by less than the misfit.
+    # The map contains the added defect, except where it changes the print by less than the misfit.
     truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
     frame = index_to_um((PITCH_UM, PITCH_UM))
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
@@ -69,7 +69,7 @@ def test_creep_along_the_slow_axis_is_corrected(creep_um: float, slow: int) -> N
     assert found.quality.passed, found.quality.reason
     assert found.quality.model == "creep"
     assert "creep along the slow axis" in found.quality.warning
-    # This is the required accuracy. A straight warp leaves 0.8 px per µm of creep.
+    # This is the required accuracy. A straight warp would be wrong by 0.8 px per µm of creep.
     assert rms_error_px(found, warp, seen) < 0.15
     assert found.quality.tre_median_px < 0.1
 
@@ -83,7 +83,7 @@ def test_a_curve_along_the_fast_axis_is_reported_and_not_corrected() -> None:
 
 
 def test_creep_is_determined_by_points_and_undone() -> None:
-    """The polynomial of degree 6 goes through its points, and its inverse maps them back."""
+    """Check that a fit returns the polynomial of degree 6, and that its inverse maps points back."""
     rng = np.random.default_rng(4)
     middle, half = np.array([20.0, 15.0]), np.array([20.0, 15.0])
     bend = Bend(0.05 * rng.standard_normal((2, 11)), middle, half)
@@ -109,7 +109,7 @@ def test_a_defect_is_stored_and_not_valid(tmp_path: Path) -> None:
     store = open_store(tmp_path / "prints.zarr")
     defect, scan = store.scan_frame("P11", "defect"), store.scan("P11")
     assert defect.shape == scan.valid.shape == shape
-    # The corner begins a margin outside the field. The border of 8 px is not compared.
+    # The missing corner of the scan includes its margin. The border of 8 px is not compared.
     assert defect[12:55, 12:55].mean() > 0.95
     assert not (scan.valid & defect).any()
     assert np.isnan(scan.height_um[defect]).all()

@@ -1,4 +1,4 @@
-"""Registration of the measured prints against the authors' own registered quadrants."""
+"""Compare the registration of the measured prints with the authors' own registered quadrants."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PITCH_UM = (0.1, 0.1)
 
 @pytest.fixture(scope="module", params=[4, pytest.param(1, marks=pytest.mark.long)], ids=["fourth", "all"])
 def registered(measured_prints, request):
-    """Every fourth scan, or all: id -> (registered height µm, layout, quality, authors' height µm)."""
+    """Return (height µm, layout, quality, authors' height µm) by id for every fourth scan, or for all."""
     full_scale_m = json.loads((measured_prints / "src_max_dict.txt").read_text())
     results = {}
     paths = sorted((measured_prints / "afm_ug").glob("*.txt"))
@@ -49,14 +49,13 @@ def test_no_scan_correlates_less_than_the_authors_own(registered):
     for name, (height_um, layout, quality, authors_um) in registered.items():
         ours = correlation(height_um, layout.astype(float))
         theirs = correlation(authors_um, layout.astype(float))
-        assert ours >= theirs - 0.005, f"{name}: {ours:.4f} against {theirs:.4f}"
+        assert ours >= theirs - 0.005, f"{name}: {ours:.4f}, but {theirs:.4f} by the authors"
         assert quality.ncc_after == pytest.approx(ours, abs=1e-6)
 
 
 def test_the_median_correlation_reaches_the_reference_figure(registered):
-    # 0.960 is the reference for a layout and a height that are smoothed alike. Against the sharp steps of the
-    # layout the authors' own quadrants reach 0.951. That bound depends on the sharpness of a print, not on
-    # its registration.
+    # The reference is 0.960 if layout and height are smoothed alike. With the unsmoothed layout, the authors'
+    # own quadrants reach 0.951, which is limited by the sharpness of a print, not by its registration.
     alike = [correlation(h, gaussian_filter(m.astype(float), 1)) for h, m, _, _ in registered.values()]
     sharp = [quality.ncc_after for _, _, quality, _ in registered.values()]
     authors = [correlation(a, m.astype(float)) for _, m, _, a in registered.values()]
@@ -69,12 +68,12 @@ def test_held_out_blocks_lie_within_a_pixel(registered):
         assert quality.tre_windows >= 40
         assert quality.tre_median_px < 1.0, name
         if name[3] in "67":
-            # In these rows of prints the structure is fine enough to place nearly every block.
+            # The structure of these prints is fine enough to locate nearly every block.
             assert quality.tre_p95_px < 1.5, name
 
 
 def correlation(height_um: np.ndarray, layout: np.ndarray) -> float:
-    """Return the Pearson correlation, 8 px from the border, of the layout and the smoothed height.
+    """Return the Pearson correlation of layout and smoothed height, without a border of 8 px.
 
     The height is smoothed with sigma = 1 px by normalised convolution.
     """

@@ -1,4 +1,4 @@
-"""Test a fast part of the registration against its plain definition."""
+"""Compare a fast algorithm of the registration with its plain definition."""
 
 from __future__ import annotations
 

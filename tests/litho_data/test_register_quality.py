@@ -1,4 +1,4 @@
-"""Test when a registration passes, and up to which width a blur is matched."""
+"""Test when a registration passes, and how wide a blur can be matched."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_good_fit_passes_without_a_warning():
         ({"tre_median_px": 1.0}, 2.0, True, False),
         ({"tre_median_px": 1.4}, 2.0, True, True),
         ({"tre_median_px": 1.6}, 2.0, False, True),
-        # Up to 8 px the blur changes nothing; twice as wide a blur doubles both limits.
+        # A blur of up to 8 px does not change the limits; a blur of 16 px doubles both.
         ({"tre_median_px": 1.6}, 8.0, False, True),
         ({"tre_median_px": 2.9}, 16.0, True, True),
         ({"tre_median_px": 3.1}, 16.0, False, True),
@@ -41,7 +41,7 @@ def test_a_good_fit_passes_without_a_warning():
         ({"corner_sd_px": 2.9}, 16.0, True, False),
         ({"corner_sd_px": 3.1}, 16.0, False, False),
         ({"corner_sd_px": float("nan")}, 16.0, False, False),
-        # No blur makes up for a fit that does not correlate.
+        # A fit with a low correlation fails, however wide the blur.
         ({"ecc": 0.6}, 16.0, False, False),
     ],
 )

@@ -1,4 +1,4 @@
-"""Resampling equals the analytic field and marks gaps and edges as invalid."""
+"""Check that resampling agrees with an analytic field, and marks gaps and edges as invalid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SCAN_PITCH_UM, LAYOUT_PITCH_UM = (0.1, 0.09), 0.1
 
 
 def field_um(x_um: np.ndarray, y_um: np.ndarray) -> np.ndarray:
-    """Return a band-limited field with periods of 2 µm and 1.6 µm, 18 pixels and 16."""
+    """Return a field with periods of 2 µm along x (18 pixels) and 1.6 µm along y (16 pixels)."""
     return 0.4 * np.sin(2 * np.pi * x_um / 2.0 + 0.3) * np.cos(2 * np.pi * y_um / 1.6) + 0.01 * x_um
 
 
@@ -47,13 +47,13 @@ def test_a_band_limited_field_comes_out_as_its_formula(flip):
     on_scan = apply_transform(np.linalg.inv(transform), np.stack([x.ravel(), y.ravel()], axis=1))
     expected = field_um(*on_scan.T).reshape(LAYOUT_SHAPE)
     assert height.dtype == np.float32
-    # The boundary condition of the spline decays by 0.268 per pixel. Six pixels are left out.
+    # The effect of the spline's boundary decays by 0.268 per pixel. A border of six pixels is excluded.
     inner = np.zeros(LAYOUT_SHAPE, bool)
     near = 6 * np.array(SCAN_PITCH_UM[::-1])
     size = np.array([SCAN_SHAPE[1] * SCAN_PITCH_UM[1], SCAN_SHAPE[0] * SCAN_PITCH_UM[0]])
     inner.ravel()[:] = ((on_scan > near) & (on_scan < size - near)).all(axis=1)
     assert (inner & valid).sum() > 0.5 * inner.size
-    # Relative error of a cubic spline at k = 2π/16 per pixel is about k⁴/ 180 / 4 ≈ 1e-4 of 0.4 µm.
+    # At k = 2π/16 per pixel, the relative error of a cubic spline is about k⁴/ 180 / 4 ≈ 1e-4.
     np.testing.assert_allclose(height[inner & valid], expected[inner & valid], atol=1e-4)
 
 
@@ -63,7 +63,7 @@ def test_the_identity_on_the_same_grid_changes_nothing():
         height, np.eye(3), (40, 50), scan_pitch_um=(0.1, 0.1), layout_pitch_um=0.1
     )
     assert valid.all()
-    np.testing.assert_allclose(out, height, atol=1e-6)  # float32 rounding of values of order one
+    np.testing.assert_allclose(out, height, atol=1e-6)  # float32 rounding at values of order one
 
 
 def test_two_transforms_compose_in_micrometres():
@@ -82,7 +82,7 @@ def test_two_transforms_compose_in_micrometres():
     )
     both = np.isfinite(once) & np.isfinite(twice)
     both[:20], both[-20:], both[:, :20], both[:, -20:] = False, False, False, False
-    # Two interpolations are off by 1e-4 µm each.
+    # Each interpolation has an error of 1e-4 µm.
     np.testing.assert_allclose(once[both], twice[both], atol=3e-4)
 
 
@@ -110,8 +110,8 @@ def test_a_gap_invalidates_the_pixels_of_its_kernel_and_no_others():
     expected = field_um(x - 0.025, y - 0.025)
     far = valid.copy()
     far[:6], far[-6:], far[:, :6], far[:, -6:] = False, False, False, False
-    # A straight continuation is wrong by at most k² · 0.4 µm = 0.06 µm one pixel into the gap (k = 2π/16).
-    # The cardinal spline passes on about 3 % of it two pixels away.
+    # One pixel into the gap, a linear extrapolation is wrong by at most k² · 0.4 µm = 0.06 µm (k = 2π/16).
+    # The cardinal spline carries about 3 % of this error two pixels away.
     assert np.abs(height - expected)[far].max() < 2e-3
     far[52:, 62:] = False
     far[22:39, 32:49] = False
@@ -124,7 +124,7 @@ def test_resampled_white_noise_has_the_recorded_share_of_its_variance():
     out, valid = resample_to_layout(
         noise, rotation, (600, 600), scan_pitch_um=(0.1, 0.1), layout_pitch_um=0.1
     )
-    # 3e5 pixels, neighbours slightly correlated: the variance is known to about 0.4 %.
+    # From 3e5 pixels with slightly correlated neighbours, the variance is known to about 0.4 %.
     assert out[valid].var() == pytest.approx(noise_variance_factor((0.1, 0.1), 0.1), rel=0.015)
 
 
@@ -135,7 +135,7 @@ def test_a_finely_sampled_scan_is_averaged_not_aliased():
     )
     # A Gaussian of the box's variance, sigma² = 63 / 12, averages over 4 π sigma² = 66 pixels.
     assert noise_variance_factor((0.0125, 0.0125), 0.1) == pytest.approx(1 / 66, rel=0.01)
-    # 22500 pixels, neighbours (8 scan pixels apart, sigma 2.3) correlated by 5 %: known to about 1 %.
+    # From 22500 pixels, whose neighbours correlate by 5 %, the variance is known to about 1 %.
     assert out[valid].var() == pytest.approx(1 / 66, rel=0.04)
 
 
@@ -152,7 +152,7 @@ def test_a_gap_continues_the_plane_of_what_is_measured_beside_it(turns, wide):
     plane = np.rot90(0.02 * y - 0.05 * x, turns)
     height = plane.copy()
     height[:-wide] = np.nan
-    # The measured strip is reflected about its border, as far as it is wide.
+    # The measured strip is reflected about its border, so it continues over its own width.
     filled = slice(-2 * wide + 1, -wide)
     np.testing.assert_allclose(fill_gaps(height)[filled], plane[filled], atol=1e-12)
 

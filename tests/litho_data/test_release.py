@@ -1,4 +1,4 @@
-"""A released store is the same store."""
+"""Check that the released files contain the same store."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
         raw = entities[one["@id"]]
         assert raw["identifier"] == f"sha256:{file_sha256(campaign / raw['name'])}"
     assert action["startTime"] < action["endTime"]
-    # RO-Crate 1.1 requires these entries for every root dataset.
+    # RO-Crate 1.1 requires these entries of every root dataset.
     assert {"name", "description", "datePublished"} <= set(root)
 
 

@@ -1,4 +1,4 @@
-"""A build names mixed-up layouts, files and doses, and gives no warning for a correct set."""
+"""Check that a build names mixed-up layouts, files and doses, and does not warn about a correct set."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHAPE = (112, 112)
 
 
 def built(card: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the warnings of scans in the store and the reasons of refused ones, by id."""
+    """Build a store, and return by id the warnings about its scans and the reasons for refused scans."""
     result = build_dataset(card, card.parent / "prints.zarr")
     quality = open_store(card.parent / "prints.zarr").quality
     warnings = dict(zip(quality["scan"], quality["warning"], strict=True))
@@ -38,7 +38,7 @@ DOSES = {0.8: 0.85, 0.9: 0.93, 1.0: 1.0, 1.1: 1.06}
 
 
 def doses(layouts: int, seed: int) -> dict[str, dict[str, Any]]:
-    """Return scans P<dose><layout> of every layout at every dose, with heights proportional to the gain."""
+    """Return scans P<dose><layout> of every layout at every dose, with heights proportional to a gain."""
     prints = {}
     for block, (dose, gain) in enumerate(DOSES.items(), start=1):
         for field in range(1, layouts + 1):
@@ -78,8 +78,8 @@ def swap(folder: Path, one: str, other: str) -> None:
 def test_the_outermost_pixels_show_whether_a_field_stands_alone(mode: str, rim: int, alone: bool) -> None:
     prints = doses(3, 0)
     for one in prints.values():
-        # Beyond the layout its outermost levels continue, or the substrate begins. A rim in the scan shows
-        # which.
+        # Beyond the layout, either its outermost levels continue or the substrate begins. If the stored field
+        # has a rim, it includes this edge.
         level = np.pad(one["mask_level"].astype(float), 20, mode="edge" if mode == "nearest" else "constant")
         height_um = (
             0.1 * gaussian_filter(level, 2.5)[20 - rim : rim - 20 or None, 20 - rim : rim - 20 or None]
@@ -115,17 +115,17 @@ def test_doses_in_the_wrong_order_throughout_are_named(left_out: tuple[float, ..
     for one, dose in zip(prints.values(), reversed(right), strict=True):
         one["dose"] = dose
     said = doubts_of(prints)
-    # The middle dose of three is right.
+    # If three doses are reversed, the middle one is right.
     assert set(said) == {name for name, one in prints.items() if len(right) == 4 or one["dose"] != 1.0}
     assert said[min(prints)] == said[max(prints)]
 
 
 @pytest.mark.parametrize(("exposure", "expected"), [(0.5, 2), (6.0, 0)])
 def test_in_a_saturated_print_more_dose_may_lower_its_slope(exposure: float, expected: int) -> None:
-    """Heights are 1 - exp(-dose · level). The curve of each shows whether the order of doses can be wrong.
+    """Check heights of 1 - exp(-exposure · dose · level), of which high exposures saturate.
 
-    At half of the exposure the slope grows with the dose. At six times the exposure the slope falls with the
-    dose, although the order is right.
+    At an exposure of 0.5, the slope grows with the dose. At 6, it falls with the dose, although the order of
+    the doses is right.
     """
     prints = doses(1, 0)
     for name, dose in zip(prints, DOSES, strict=True):
@@ -153,7 +153,7 @@ def test_scans_under_wrong_ids_are_named_with_the_right_one(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     card = write_campaign(tmp_path, count=4)
-    # One layout is printed twice, and its two ids do not compete.
+    # One layout is printed twice. Its two ids must not be reported as mixed up.
     for file in ("layouts/{}.tif", "scans/{}.txt"):
         shutil.copy(tmp_path / file.format("P11"), tmp_path / file.format("P22"))
     swap(tmp_path, "P11", "P21")
@@ -166,7 +166,7 @@ def test_scans_under_wrong_ids_are_named_with_the_right_one(
 
 
 def test_a_scan_of_a_similar_layout_is_named(tmp_path: Path) -> None:
-    """A second version of a layout registers equally well, but its details differ."""
+    """Check a scan of another version of a layout, which registers well but differs in details."""
     card = write_campaign(tmp_path, count=2)
     first = layout_of(0, SHAPE)
     change = gaussian_filter(np.random.default_rng(5).standard_normal(SHAPE), 3)

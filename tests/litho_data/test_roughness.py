@@ -1,4 +1,4 @@
-"""Test roughness against closed forms and surfaces of known spectrum."""
+"""Test roughness against closed forms and on surfaces with a known spectrum."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PITCH_UM = 0.1
 
 
 def gaussian_surface(shape: tuple[int, int], length_um: float, seed: int) -> np.ndarray:
-    """Return a periodic Gaussian surface, autocorrelation exp(−r²/T²), 10 nm rms on average, in µm."""
+    """Return a random periodic surface in µm with autocorrelation exp(−r²/T²) and a mean rms of 10 nm."""
     frequency = np.hypot(
         np.fft.fftfreq(shape[0], PITCH_UM)[:, None], np.fft.rfftfreq(shape[1], PITCH_UM)[None]
     )
-    # The transform of exp(−r²/T²) is proportional to exp(−π²T²f²). The filter of amplitudes is its root.
+    # The transform of exp(−r²/T²) is proportional to exp(−π²T²f²). Amplitudes are filtered by its root.
     transfer = np.exp(-((np.pi * length_um * frequency) ** 2) / 2)
     field = np.fft.irfft2(
         np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape)) * transfer, s=shape
@@ -43,8 +43,8 @@ class TestAmplitudes:
     def test_sine_has_its_closed_form_values(self):
         x = np.arange(400) / 400 * 2 * np.pi * 5
         found = amplitude_parameters(0.05 * np.sin(x)[None, :].repeat(3, 0))
-        # With 80 pixels per period the sums of sin² and sin⁴ are exact. The sampled mean|sin| is
-        # 2/80·cot(π/80).
+        # With 80 pixels per period, the sums of sin² and sin⁴ equal their integrals. The mean of the sampled
+        # |sin| is 2/80·cot(π/80).
         assert found.sq_nm == pytest.approx(50 / 2**0.5, rel=1e-12)
         assert found.sa_nm == pytest.approx(50 * 2 / 80 / np.tan(np.pi / 80), rel=1e-12)
         assert found.ssk == pytest.approx(0, abs=1e-12)
@@ -55,7 +55,7 @@ class TestAmplitudes:
         height = np.zeros(1000)
         height[:100] = 0.01
         found = amplitude_parameters(height)
-        # Bernoulli with p = 0.1: skewness (1 − 2p)/√(p(1 − p)), kurtosis 3 + (1 − 6p(1 − p))/(p(1 − p)).
+        # A Bernoulli variable has skewness (1 − 2p)/√(p(1 − p)) and kurtosis 3 + (1 − 6p(1 − p))/(p(1 − p)).
         assert found.ssk == pytest.approx(0.8 / 0.3, rel=1e-9)
         assert found.sku == pytest.approx(3 + (1 - 0.54) / 0.09, rel=1e-9)
 
@@ -88,14 +88,14 @@ class TestSpectra:
         spectrum = psd_along(height, PITCH_UM, "x", window=False)
         peak = np.argmax(spectrum.density)
         assert spectrum.frequency_per_um[peak] == pytest.approx(1.2)
-        # All power, amplitude²/2, lies in one bin of width 1/50 per µm.
+        # The whole power, amplitude²/2, lies in one bin of width 1/50 per µm.
         assert spectrum.density[peak] / 50 == pytest.approx(20**2 / 2, rel=1e-9)
 
     def test_white_noise_is_level_also_through_the_window(self):
         height = np.random.default_rng(3).standard_normal((400, 256)) * 0.002
         spectrum = psd_along(height, PITCH_UM, "x")
-        # The one-sided density of white noise is 2 σ² pitch = 0.8 nm²µm. The mean of 400 lines is known to 5
-        # % per bin, and that of 100 bins to 1 %.
+        # The one-sided density of white noise is 2 σ² pitch = 0.8 nm²µm. The mean of 400 lines gives each bin
+        # to 5 %, and the mean of 100 bins to 1 %.
         assert spectrum.density[10:110].mean() == pytest.approx(2 * 4 * PITCH_UM, rel=0.03)
 
     def test_nan_is_an_error(self):
@@ -108,21 +108,21 @@ class TestCorrelation:
         x = np.arange(400)
         correlation = autocorrelation(np.cos(2 * np.pi * x / 40)[None, :].repeat(8, 0))
         centre = correlation.shape[1] // 2
-        # The pairs span a whole number of periods only at every half period. There the value is exact: −1 at
-        # half a period.
+        # Only at multiples of half a period do the pairs span whole periods. There the value is exact, and at
+        # half a period it is −1.
         assert correlation[0, centre + 20] == pytest.approx(-1, abs=1e-9)
         assert correlation[0, centre + 40] == pytest.approx(1, abs=1e-9)
 
     def test_white_noise_counts_every_pixel(self):
         noise = np.random.default_rng(4).standard_normal((128, 128))
-        # ρ² of each other lag is about 1/pairs. Over a quarter of the field they add up to 64·65/… ≈ 0.3.
+        # At other lags, ρ² is about 1/pairs. Over a quarter of the field, these values add up to about 0.3.
         assert effective_samples(noise) > 0.6 * noise.size
 
     def test_uncertainty_of_sq_matches_its_scatter(self):
         surfaces = [gaussian_surface((128, 128), 0.8, seed) for seed in range(60)]
         scatter = np.std([amplitude_parameters(s).sq_nm for s in surfaces])
         stated = np.mean([sq_uncertainty_nm(s) for s in surfaces])
-        # An sd from 60 draws is known to 1/√120 = 9 %. The estimate of Σρ² adds about as much.
+        # The sd of 60 draws is known to 1/√120 = 9 %. The estimate of Σρ² adds a similar error.
         assert stated == pytest.approx(scatter, rel=0.35)
 
 
@@ -138,7 +138,7 @@ class TestStepHeight:
         x_um = (np.arange(300) + 0.5) * PITCH_UM
         smooth = 0.1 * (np.tanh((x_um - 10) / 0.3) - np.tanh((x_um - 20) / 0.3)) / 2
         found = groove_depth(smooth[None, :].repeat(3, 0), PITCH_UM, left_um=10, right_um=20)
-        # A third of 10 µm is 11 lengths of the tanh, where e^−22 of the step remains.
+        # A third of 10 µm is 11 times the length of the tanh, so e^−22 of the step remains there.
         assert found.height_nm == pytest.approx(100, abs=1e-6)
 
     def test_stairs_along_y_with_missing_pixels(self):
@@ -157,7 +157,7 @@ class TestStepHeight:
             noisy = np.where((x_um > 10) & (x_um < 20), 0.1, 0) + rng.standard_normal((30, 300)) * 0.005
             found = groove_depth(noisy, PITCH_UM, left_um=10, right_um=20)
             errors.append((found.height_nm - 100) / found.uncertainty_nm)
-        # Normal errors would give 1; uncertainties from 30 lines are t-like: 1.0…1.2.
+        # Normal errors would give 1. With an uncertainty from 30 lines, a t distribution gives 1.0 to 1.2.
         assert 0.85 < np.std(errors) < 1.3
 
     def test_bad_edges_are_an_error(self):
@@ -180,13 +180,13 @@ class TestLevellingBias:
         assert retained_variance((32, 40), PITCH_UM, white, degree=(1, 2)) == pytest.approx(
             1 - 6 / 1280, rel=1e-12
         )
-        # Rows alone use two terms for 40 pixels.
+        # A single row uses two terms for 40 pixels.
         assert retained_variance((1, 40), PITCH_UM, white, degree=(0, 1)) == pytest.approx(
             1 - 2 / 40, rel=1e-12
         )
 
     def test_row_mean_of_an_exponential_profile_has_a_closed_form(self):
-        # Variance of the mean over L of exp(−|x|/T): 2T/L − 2(T/L)²(1 − e^(−L/T)), the continuous limit.
+        # For exp(−|x|/T), the continuous mean over L has the variance 2T/L − 2(T/L)²(1 − e^(−L/T)).
         ratio = 0.05
         closed = 1 - 2 * ratio + 2 * ratio**2 * (1 - np.exp(-1 / ratio))
         found = retained_variance((1, 1000), 0.01, exponential_correlation(0.5), degree=0)
@@ -201,11 +201,11 @@ class TestLevellingBias:
         q, _ = np.linalg.qr(basis)
         kept = []
         for seed in range(200):
-            # The surfaces are cut from a larger periodic one, so that opposite edges are independent.
+            # Each surface is cropped from a larger periodic one, so that its opposite edges are independent.
             surface = gaussian_surface((128, 128), length_um, seed)[:64, :64].ravel() / 0.010
             kept.append(np.mean((surface - q @ (q.T @ surface)) ** 2))
         expected = retained_variance(shape, PITCH_UM, gaussian_correlation(length_um), degree=degree)
-        # 6.4²/(π·0.36/2) = 72 spots per surface: relative sd √(2/72/200) = 1.2 %.
+        # A surface has 6.4²/(π·0.36/2) = 72 independent spots, so the relative sd is √(2/72/200) = 1.2 %.
         assert np.mean(kept) == pytest.approx(expected, rel=0.04)
 
     def test_levelling_rows_removes_more_variance_than_levelling_the_field(self):

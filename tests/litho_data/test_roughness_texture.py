@@ -1,4 +1,4 @@
-"""The direction and the period of lines on a surface are found, and none are found where there are none."""
+"""Check that the direction and period of lines on a surface are found if, and only if, there are lines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PITCH_UM = 0.1
 
 
 def rough(seed: int, size_px: int = 192) -> np.ndarray:
-    """Return isotropic roughness with some white noise, as scans have it."""
+    """Return isotropic roughness with some white noise, as in scans."""
     random = np.random.default_rng(seed)
     white = random.normal(size=(2, size_px, size_px))
     return gaussian_filter(white[0], 2.0, mode="wrap") + 0.03 * white[1]
@@ -25,7 +25,7 @@ def test_the_direction_of_lines_is_found(angle_deg: float) -> None:
     across = -np.sin(np.radians(angle_deg)) * x + np.cos(np.radians(angle_deg)) * y
     line = gaussian_filter(np.random.default_rng(1).normal(size=400), 3.0)
     found = line_direction([np.interp(across + 200, np.arange(400), line)])
-    # Lines over 192 px resolve 1 / 192 rad = 0.3°.
+    # Lines that are 192 px long resolve angles of 1 / 192 rad = 0.3°.
     assert (found.angle_deg - angle_deg + 90) % 180 - 90 == pytest.approx(0.0, abs=0.3)
     assert found.strength > 0.9
     assert found.p < 0.01
@@ -48,13 +48,13 @@ def test_stated_probabilities_are_right() -> None:
         found = line_period([rough(seed, 128).mean(axis=1)], PITCH_UM)
         assert found is not None
         period.append(found.p)
-    # 5 % of 200 draws are 10 ± 3. Up to four standard deviations are allowed.
+    # By chance, 10 ± 3 of 200 draws are below 5 %. The limit allows four standard deviations.
     assert (direction < 0.05).sum() <= 22
     assert (np.array(period) < 0.05).sum() <= 22
 
 
 def test_a_period_is_found_with_its_amplitude_and_phase() -> None:
-    """A weak wave of 1.3 µm has the same phase in all surfaces, or an independent phase in each."""
+    """Check a weak wave of 1.3 µm with the same phase in all surfaces, or an independent phase in each."""
     random = np.random.default_rng(3)
     at = np.arange(256)
     noise = gaussian_filter(random.normal(size=(12, 256)), (0, 1.0)) * 0.01
@@ -68,14 +68,13 @@ def test_a_period_is_found_with_its_amplitude_and_phase() -> None:
     assert free is not None
     for found in (locked, free):
         assert found.p < 1e-4
-        # A bin of 25.6 µm is 1.3² / 25.6 = 0.07 µm wide here.
+        # At this period, the frequency bin of a 25.6 µm profile is 1.3² / 25.6 = 0.07 µm wide.
         assert found.period_um == pytest.approx(1.3, abs=0.03)
-        # The noise adds in quadrature to the amplitude at this frequency. It is less than a third of the
-        # amplitude.
+        # The noise at this frequency is less than a third of the amplitude, and adds in quadrature.
         assert found.amplitude_um == pytest.approx(0.004, rel=0.15)
     assert locked.coherence > 0.9
-    # The mean of twelve random phasors is 1 / √12 = 0.29 on average, and above 0.7 in exp(-12 · 0.49) = 0.3 %
-    # of draws.
+    # The mean of twelve random phasors has an rms of 1 / √12 = 0.29. It exceeds 0.7 in
+    # exp(-12 · 0.49) = 0.3 % of draws.
     assert free.coherence < 0.7
 
 

@@ -1,4 +1,4 @@
-"""A result records its run: the command, if there was one, and whether the code was changed."""
+"""Check that a result records its command, if any, and whether the code had uncommitted changes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_data.level.scan import LevelRecord
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Make a git repository with one committed file in each package and one beside the packages."""
+    """Make a git repository with one committed file in each package and one outside of them."""
     for name in ("litho_data", "litho_models", "litho_design", "docs"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "a.py").write_text("1\n")

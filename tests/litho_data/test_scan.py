@@ -1,4 +1,4 @@
-"""The contract of `Scan` and the unit parser."""
+"""Test the contract of `Scan` and the parser of units."""
 
 from __future__ import annotations
 

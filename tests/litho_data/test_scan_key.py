@@ -1,4 +1,4 @@
-"""A change of any field of a scan changes its key."""
+"""Check that a change of any field of a scan changes its key."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def whole_scan() -> PrintedScan:
 
 
 def otherwise(value: Any) -> list[Any]:
-    """Return other values of the same kind: the next value, the same value elsewhere, an empty value."""
+    """Return different values of the same type, for example the next number or a rotated array."""
     if isinstance(value, np.ndarray):
         one, moved = value.copy(), value[::-1, ::-1].copy()
         one.flat[-1] = ~one.flat[-1] if one.dtype == bool else np.asarray(one.flat[-1] + 1, one.dtype)
@@ -52,14 +52,14 @@ def otherwise(value: Any) -> list[Any]:
         return [float(np.nextafter(value, np.inf))]
     if isinstance(value, int):
         return [value + 1]
-    assert isinstance(value, str), f"say here what another {type(value).__name__} is"
+    assert isinstance(value, str), f"add another value of type {type(value).__name__} to otherwise()"
     return [value + "x"]
 
 
 def test_every_field_of_a_scan_is_in_its_key() -> None:
     scan = whole_scan()
     stated = {one.name: getattr(scan, one.name) for one in fields(PrintedScan)}
-    assert not [name for name, value in stated.items() if value is None], "say here what a new field may be"
+    assert not [name for name, value in stated.items() if value is None], "give new fields a value above"
     known = {scan_sha256(scan)}
     for name, value in stated.items():
         for other in otherwise(value):
@@ -80,7 +80,7 @@ def test_the_key_does_not_depend_on_the_memory_layout_of_an_array() -> None:
 
 @pytest.mark.parametrize("name", [one.name for one in fields(Job)])
 def test_every_field_of_own_layouts_affects_the_result_of_the_fab(name: str) -> None:
-    """Two layouts of one shape must have different keys."""
+    """Check that jobs that differ in one field are described differently."""
     rng = np.random.default_rng(1)
     job = Job(id="P11", level=rng.integers(0, LEVELS, SHAPE).astype(np.uint8))
     value = getattr(job, name)

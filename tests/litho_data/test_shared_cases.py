@@ -1,4 +1,4 @@
-"""Files that an earlier version misread give the right map, or a message with the reason."""
+"""Check that files that an earlier version misread give the right map, or a message with the reason."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHAPE, PITCH_UM = (24, 32), 0.2
 def cases(oracles: Path) -> Path:
     folder = oracles.parent / "cases"
     if not folder.is_dir():
-        pytest.skip(f"no {folder}")
+        pytest.skip(f"{folder} does not exist")
     return folder
 
 
@@ -44,7 +44,7 @@ def test_a_readable_case_gives_the_described_map(cases: Path, name: str) -> None
     scan = read_scan(cases / name, **arguments)
     height = scan.height_um - np.nanmin(scan.height_um)
     assert scan.shape == SHAPE
-    # The map has a mark in the upper left corner and steps of 0.01 µm from row to row. Wyko numbers are in
+    # The map has a raised upper left corner and steps of 0.01 µm from row to row. Wyko files state numbers in
     # nm.
     scale = 1e-3 if name == "wyko.asc" else 1.0
     assert height[:3, :3] == pytest.approx(0.9 * scale, rel=0.03)
@@ -77,7 +77,7 @@ def test_park_states_unit_and_size(cases: Path) -> None:
     assert (scan.height_um.min(), scan.height_um.max()) == (0, pytest.approx(1))
     assert scan.pitch_um == pytest.approx((0.1, 0.1))
     scan = read_scan(cases / "card_park" / "scans" / "P1F1.tiff")
-    # These are the heights that the store holds before levelling.
+    # These heights equal those in the store before levelling.
     assert (scan.height_um.min(), scan.height_um.max()) == pytest.approx((0.126, 1.054), abs=5e-4)
     assert [one.is_height for one in list_channels(cases / "scan.nhf")] == [True, False, True, False]
 

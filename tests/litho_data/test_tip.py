@@ -1,4 +1,4 @@
-"""Test the tip of the microscope: laws of morphology, known tips, and places that a tip did not touch."""
+"""Test tips of the microscope: laws of morphology, known tips, and places that a tip does not touch."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_paraboloid_applied_axis_by_axis_equals_the_whole_paraboloid() -> None
     known = np.where(measured, field, np.inf)
     eroded = scipy.ndimage.grey_erosion(known, structure=tip, mode="constant", cval=np.inf)
     assert np.allclose(found.surface[measured], eroded[measured], atol=1e-14)
-    # The owner of a pixel is the place from which its height comes.
+    # (found.row, found.column) is the place of the image that determines the height of a pixel.
     rows, columns = np.indices(field.shape)
     away = ((found.row - rows) * pitch[0]) ** 2 + ((found.column - columns) * pitch[1]) ** 2
     explained = field[found.row, found.column] + away / (2 * radius)
@@ -69,10 +69,10 @@ def test_a_paraboloid_applied_axis_by_axis_equals_the_whole_paraboloid() -> None
 
 def test_a_surface_that_the_tip_follows_comes_back_and_an_image_stays_an_image() -> None:
     rows, columns = np.indices((60, 60)) * 0.1
-    surface = 0.05 * np.sin(1.3 * rows) * np.cos(0.9 * columns)  # curvature below 0.13 / µm
+    surface = 0.05 * np.sin(1.3 * rows) * np.cos(0.9 * columns)  # its curvature is below 0.13 / µm
     image = _dilated(surface, PITCH, 2.0)
     found = reconstructed(image, PITCH, 2.0)
-    # Contacts lie between pixels, so the height is off by at most (pitch/2)² (1/2R) per axis, twice.
+    # Contacts lie between pixels, so two operations each change heights by at most (pitch/2)²/2R per axis.
     assert np.abs(found - surface)[10:-10, 10:-10].max() < 2 * 0.05**2 / (2 * 2.0) * 2
     assert np.allclose(_dilated(found, PITCH, 2.0), image, atol=1e-14)
 
@@ -93,10 +93,10 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
 
 @pytest.mark.parametrize("seed", [5002, 5004, 5010, 5011])
 def test_a_few_tops_that_are_sharper_than_the_others_are_not_taken_for_the_tip(seed: int) -> None:
-    """For rounded bumps of many radii r, an image shows R + r, and a few bumps set its sharp end."""
+    """Check rounded bumps of many radii r, in whose image tops have the radii R + r."""
     image, _ = print_under_tip("bumps", 0.15, 1.0, seed=seed)
     found = peak_radius(image + noise_of_snr(image.shape, 1.0, 50, seed), PITCH)
-    # As estimates these radii would be 15 to 52 % too large.
+    # If they were given as estimates, these radii would be 15 to 52 % too large.
     assert "parts of the scan" in found.reason
     assert found.radius_um is not None
     assert found.radius_um > 0.15
@@ -122,8 +122,8 @@ def test_the_radius_of_a_spherical_tip_is_found() -> None:
         surface, footprint=np.isfinite(sphere), structure=sphere, mode="constant", cval=-np.inf
     )[OVER // 2 :: OVER, OVER // 2 :: OVER]
     found = estimate_tip([Scan(image, PITCH)])
-    # Along a line up the flank the curvature of a sphere is 1/R (1 + slope²)^1.5. The flanks end at 0.3 µm,
-    # where the slope is 0.62 and the sphere 1.63 times as sharp. On the way there it is 1.23 times as sharp.
+    # The curvature of a sphere along a line up its flank is 1/R (1 + slope²)^1.5. The flanks end at 0.3 µm,
+    # where the slope is 0.62 and the curvature 1.63 times as high. On the way, it is 1.23 times as high.
     assert found.radius_um is not None
     assert radius_um / 1.63 < found.radius_um < 1.1 * radius_um
 
@@ -162,7 +162,7 @@ def test_an_estimate_is_refuted_by_a_sharper_scan() -> None:
     both = of_one_tip([said(0.5), wide, said(0.52)])
     assert both.radius_um == pytest.approx(0.51)
     assert not both.reason
-    # The third scan is 8 standard deviations blunter: it shows its surface, not this tip.
+    # The third scan is blunter by 8 standard deviations, so it shows its surface and not this tip.
     assert of_one_tip([said(0.5), said(0.52), said(0.7)]).radius_um == pytest.approx(0.51)
     assert of_one_tip([said(0.5), tight]) == tight
 
@@ -207,7 +207,7 @@ def test_untouched_pixels_are_uncertain_and_most_of_the_touched_certain(
 
 @pytest.mark.parametrize("kind", ["pillars", "spikes", "bumps"])
 def test_valleys_as_narrow_as_the_disc_are_uncertain_too(kind: str) -> None:
-    """With a sharp tip and much noise, the disc that fits a curvature is over half the reach of the tip."""
+    """Check a sharp tip with much noise, for which curvatures are fitted over more than half of its reach."""
     inner = (slice(15, -15),) * 2
     for seed in (5000, 5001, 5002):
         image, touched = print_under_tip(kind, 0.15, 1.0, seed=seed)
@@ -234,9 +234,8 @@ def test_the_lateral_resolution_follows_its_closed_form_and_surface_topography()
     base_um, bump_um, radius_um = 1.0, 0.5, 1.0
     away = (rows - 4.0) ** 2 + (columns - 5.0) ** 2
     image = np.maximum(base_um**2 - away, 0) / (2 * bump_um)
-    # At a distance d beyond its base the top of this cap has the curvature 2h/d², with h = b²/2ρ. It is half
-    # of 1/R at d = b √(2R/ρ). λ is twice that distance. Between pixels the curvature is interpolated
-    # linearly.
+    # Measured over a distance d beyond its base, this cap of height h = b²/2ρ has the curvature 2h/d². This
+    # is half of 1/R at d = b √(2R/ρ), and λ is 2d. Between pixels, the curvature is interpolated linearly.
     found = lateral_resolution_um(image, PITCH, radius_um)
     assert found == pytest.approx(2 * base_um * np.sqrt(2 * radius_um / bump_um), rel=0.01)
     theirs = Topography(image, (8.0, 12.0), unit="um", periodic=False)
@@ -280,7 +279,7 @@ def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path) ->
     assert row["tip_radius_um"] == scan.tip_radius_um == 0.1
     assert before.tip_radius_um is None
     assert row["tip_certain_fraction"] == pytest.approx(certain.mean())
-    # The scan lies 8 pixels around its layout, with almost no rotation or change of scale.
+    # The scan extends 8 pixels beyond its layout on all sides, almost without rotation or change of scale.
     on_layout = certain[8:-8, 8:-8]
     inner = (slice(3, -3),) * 2
     clear = scipy.ndimage.uniform_filter(on_layout.astype(float), 3)

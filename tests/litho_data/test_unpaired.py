@@ -1,4 +1,4 @@
-"""Scans without a layout and layouts without a scan are counted in the report of the build."""
+"""Check that the report of a build counts scans without a layout and layouts without a scan."""
 
 from __future__ import annotations
 

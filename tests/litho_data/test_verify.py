@@ -1,4 +1,4 @@
-"""Verify names any flipped byte, replay repeats all numbers, and history leads back to the raw files."""
+"""Check that verify names any changed byte, replay reproduces all arrays, and history leads to raw files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_data.store.access import array_of, values_of
 
 
 def flip(path: Path, position: float = 0.5) -> None:
-    """Change one bit of the byte at this fraction of the length of the file."""
+    """Flip one bit of a file, at this fraction of its length."""
     content = bytearray(path.read_bytes())
     content[int(position * len(content))] ^= 1
     path.write_bytes(content)
@@ -30,8 +30,8 @@ def test_an_untouched_store_has_no_findings(campaign: Path) -> None:
     result = verify(campaign / "prints.zarr")
     assert result.findings == ()
     assert result.notes == ()
-    # Each scan has layout, raw, levelled, removed, transform, height, valid, sigma, and six steps and two
-    # files.
+    # Each scan has the eight arrays layout, raw, levelled, removed, transform, height, valid and sigma, six
+    # steps, and two files.
     assert (result.n_arrays, result.n_steps, result.n_raw_files) == (24, 18, 6)
 
 
@@ -91,7 +91,7 @@ def test_a_flipped_byte_of_a_chunk_is_named(
 def test_a_changed_digit_of_metadata_is_named(own_campaign: Path, document: str) -> None:
     path = own_campaign / "prints.zarr" / document
     text = path.read_text()
-    # Change the first digit of a number: a shape, a version, a parameter.
+    # Change the first digit of a number, such as a shape, a version or a parameter.
     position = next(i for i, letter in enumerate(text) if letter.isdigit() and text[i - 1] in " [:")
     path.write_text(text[:position] + str((int(text[position]) + 1) % 10) + text[position + 1 :])
     assert named(own_campaign)

@@ -1,4 +1,4 @@
-"""Test the virtual fab: physics of plain printing, noise figures, files, truth, determinism."""
+"""Test the virtual fab: the physics of plain printing, noise, files, truth, and reproducibility."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ class TestPlainPrinting:
                 squared_distance = (y - row) ** 2 + (x - column) ** 2
                 intensity = np.exp(-squared_distance / (2 * printer.spot_sigma_um**2))
                 expected += intensity**2
-        # One squared spot integrates to π s², where s is the sd of the intensity. 12 slices are the full
-        # dose.
+        # The integral of one squared spot is π s², where s is the sd of the intensity. The full dose is 12
+        # slices.
         expected *= printer.pitch_um**2 / (np.pi * printer.spot_sigma_um**2) / 12
-        # The sampled Gaussian, sd 2 px, sums to its integral within 2 exp(−2π²·4). Light that wraps around
-        # the periodic frame is 9 µm from the spot, so only rounding is left.
+        # The sum of the sampled Gaussian (sd 2 px) equals its integral within 2 exp(−2π²·4). Light that wraps
+        # around the periodic frame is 9 µm from its spot, so only rounding errors remain.
         np.testing.assert_allclose(cut_layout(dose), expected, rtol=0, atol=1e-10)
 
     def test_wide_blocks_print_from_base_to_full_height(self):
@@ -102,8 +102,8 @@ class TestPlainPrinting:
                 ]
             )
         gain = np.mean(transfer, axis=0)
-        # Measured prints have 0.69, 0.64 and 0.45 in these bands, with a spread of 0.085 between fields. The
-        # plain fab may be off by one and a half spreads.
+        # In these bands, measured prints have gains of 0.69, 0.64 and 0.45, which spread by 0.085 between
+        # fields. The plain fab may differ by one and a half times that.
         np.testing.assert_allclose(gain, [0.69, 0.64, 0.45], atol=0.13)
 
     def test_print_depends_on_the_neighbourhood_only(self):
@@ -113,7 +113,7 @@ class TestPlainPrinting:
         near, far = (
             cut_layout(print_clean(Job("a", level), Printer(), NO_KNOBS)) for level in (job.level, other)
         )
-        # The distance is three sd of the widest kernel. Beyond it 0.1 % of a height of 0.6 µm remains.
+        # The distance is three sd of the widest kernel. Beyond that, 0.1 % of a height of 0.6 µm remains.
         assert np.abs(near - far)[:, :20].max() < 1e-3
         assert np.abs(near - far)[:, 85:].max() > 0.1
 
@@ -126,8 +126,8 @@ class TestDefaultNoise:
             ).height_um
             for use in ("flat", "substrate")
         )
-        # The figures are 15.96 nm and 1.25 nm. About 54²/(2 · 0.3 · 2.4) = 2000 pieces of line give an sd to
-        # 1.6 %.
+        # The paper states 15.96 nm and 1.25 nm. About 54²/(2 · 0.3 · 2.4) = 2000 independent pieces of line
+        # give the sd to 1.6 %.
         assert amplitude_parameters(flat).sq_nm == pytest.approx(15.96, rel=0.04)
         assert amplitude_parameters(bare).sq_nm == pytest.approx(1.25, rel=0.04)
 
@@ -135,8 +135,8 @@ class TestDefaultNoise:
         flat = scan_job(fab(noise=Noise(), seed=3), Job("a", np.full((512, 512), 6, np.uint8))).height_um
         correlation = autocorrelation(flat)
         along, across = correlation[0, correlation.shape[1] // 2 :], correlation[:, correlation.shape[1] // 2]
-        # The correlation stays above 1/e over 0.8 µm along the lines, and falls below it within 0.2 µm
-        # across.
+        # Along the lines, the correlation stays above 1/e over 0.8 µm. Across, it falls below 1/e within
+        # 0.2 µm.
         assert along[:9].min() > np.exp(-1) > across[:3].min()
 
     def test_steps_of_one_level_stay_readable(self):
@@ -148,14 +148,14 @@ class TestDefaultNoise:
         margin = (scan.height_um.shape[0] - 512) // 2
         height = scan.height_um[margin:-margin, margin:-margin]
         for step in stair_steps(height, 0.1, edges_um=(edges_px * 0.1).tolist()):
-            # The paper's criterion in numbers: a step is twice the roughness, which is known to a tenth.
+            # The criterion of the paper is that a step exceeds twice the roughness. It is known to a tenth.
             assert step.height_nm > 2 * 15.96
             assert step.height_nm > 10 * step.uncertainty_nm
 
     def test_datum_is_the_only_offset(self):
         scans = [scan_job(fab(noise=Noise(), seed=seed), random_job(64)) for seed in range(40)]
         datums_nm = [1e3 * np.mean(scan.height_um - scan.noiseless_um) for scan in scans]
-        # 40 draws give an sd to 1/√80 = 11 %. Roughness adds 1 nm.
+        # From 40 draws, the sd is known to 1/√80 = 11 %. Roughness adds 1 nm.
         assert np.std(datums_nm) == pytest.approx(30, rel=0.35)
 
     def test_noise_off_leaves_no_noise(self):
@@ -172,7 +172,7 @@ class TestDefaultNoise:
             1e3 * (white.ravel() - terms @ np.linalg.lstsq(terms, white.ravel(), rcond=None)[0]).std(),
             rel=1e-9,
         )
-        # For a Gaussian the mean absolute value is √(2/π) sd; there are 7200 pixels.
+        # The mean absolute value of a Gaussian is √(2/π) sd. There are 7200 pixels.
         assert floor["floor_full_mae_nm"] / floor["floor_full_rmse_nm"] == pytest.approx(
             (2 / np.pi) ** 0.5, rel=0.02
         )
@@ -185,7 +185,7 @@ class TestGeometry:
         margin = round(14 * 128 / 512)
         assert scan.height_um.shape == (128 + 2 * margin,) * 2
         seen = scan.height_um[margin:-margin, margin:-margin]
-        # At whole positions cubic interpolation is exact, up to rounding.
+        # At integer positions, cubic interpolation is exact up to rounding.
         np.testing.assert_allclose(seen, scan.clean_um, rtol=0, atol=1e-12)
         np.testing.assert_allclose(scan.frame.scan_to_layout[:2, 2], -margin * 0.1, atol=1e-12)
 
@@ -200,14 +200,14 @@ class TestGeometry:
         size = surface.shape[0]
         phase = [np.fft.fftfreq(size) * (at / 0.1 - 0.5 + GUARD_PX) for at in (y_um, x_um)]
         exact = (np.exp(2j * np.pi * phase[0]) @ spectrum @ np.exp(2j * np.pi * phase[1])).real / size**2
-        # Cubic splines at half a pixel are off by (2πf·pitch)⁴/384 of a wave, 1e-5 µm at 1 cycle/µm.
+        # At half a pixel, a cubic spline is wrong by (2πf·pitch)⁴/384 of a wave: 1e-5 µm at 1 cycle/µm.
         assert scan.height_um[row, column] == pytest.approx(exact, abs=5e-5)
 
     def test_warps_stay_within_the_microscopes_limits(self):
         for seed in range(20):
             frame = scan_job(fab(microscope=Microscope(), seed=seed), random_job(48)).frame
             scales = np.linalg.svd(frame.scan_to_layout[:2, :2], compute_uv=False)
-            # Scale 1.5 % and shear 0.5 % together: at most 2 %.
+            # A scale of 1.5 % and a shear of 0.5 % together change lengths by at most 2 %.
             assert np.abs(scales - 1).max() < 0.02
 
     def test_margin_shows_the_outermost_levels_continued(self):
@@ -225,7 +225,7 @@ class TestFiles:
         values[0, :3] = [0.0, 0.9999996, -9.99999]
         write_text_matrix(tmp_path / "a.txt", values)
         found = read_scan(tmp_path / "a.txt", unit="m", size_um=(2.0, 3.1)).height_um
-        # Half a unit of the fifth digit.
+        # The error is at most half a unit of the fifth digit.
         np.testing.assert_allclose(found, values, rtol=5.0001e-5)
         text = (tmp_path / "a.txt").read_bytes()
         assert text.startswith(b"0.0000e+000\t1.0000e-006\t-1.0000e-005\t")
@@ -303,12 +303,12 @@ class TestDeterminism:
             simulate(tmp_path / str(count), count=count, size_px=64)
             peaks.append(tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
-        # Six more scans as arrays would be 6 × 256² × 8 bytes = 3 MB; their truth records are a few kB.
+        # Six more scans as arrays would need 6 × 256² × 8 bytes = 3 MB. Their truth records need a few kB.
         assert peaks[1] - peaks[0] < 0.5e6
 
 
 class OnePoint:
-    """A generator that gives one point for white noise: its filtered squares add up to the noise variance."""
+    """Generate one point in place of white noise, so that filtered squares add up to the noise variance."""
 
     def standard_normal(self, shape):
         point = np.zeros(shape)
@@ -320,7 +320,7 @@ class OnePoint:
 def test_rough_lines_have_unit_variance_on_average_and_lie_along_x(shape):
     spread = line_roughness(shape, 0.1, OnePoint())
     assert np.square(spread).sum() == pytest.approx(1, rel=1e-9)
-    # Neighbours along a line are alike, those across it are not.
+    # Neighbours along a line are similar, but those across it are not.
     across, along = (float((spread * np.roll(spread, 1, axis)).sum()) for axis in (0, 1))
     assert along > 0.8 > across
 

@@ -1,4 +1,4 @@
-"""Test the laws that every knob of the virtual fab obeys, and the signatures of a few knobs."""
+"""Test the laws that every knob of the virtual fab obeys, and the specific results of some knobs."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_a_knob_does_not_change_the_random_draws_of_other_knobs(jobs):
     alone = [scan(jobs[0], one).height_um - scan(jobs[0]).height_um for one in (tilt, stripes)]
     for both in ((tilt, stripes), (stripes, tilt)):
         together = scan(jobs[0], *both).height_um - scan(jobs[0]).height_um
-        # The differences are rounding of sums of a few µm in double precision.
+        # The results differ by rounding in double precision, at sums of a few µm.
         np.testing.assert_allclose(together, alone[0] + alone[1], atol=1e-14)
 
 
@@ -189,8 +189,8 @@ class TestSignatures:
         assert (dilated - plain).min() > -1e-9
         # The apex touches the tops, so nothing changes at the maximum of the surface.
         top = np.unravel_index(plain[10:-10, 10:-10].argmax(), plain[10:-10, 10:-10].shape)
-        # The top lies between pixels, so it is off by up to slope²·R/2 of one curvature length, under 0.1 nm
-        # here.
+        # The true top lies between pixels, which changes the height by up to slope²·R/2 of one curvature
+        # length. Here this is below 0.1 nm.
         assert (dilated - plain)[10:-10, 10:-10][top] < 1e-4
 
     def test_tip_on_a_slope_and_on_a_dome_have_closed_forms(self):
@@ -198,8 +198,8 @@ class TestSignatures:
         y_um, x_um = (np.indices(frame.shape) - 50) * 0.1
         radius_um = 0.4
         board = KnobBoard([KnobSetting("tip-dilation", radius_um)], 0)
-        # A paraboloid on a slope s stays R s²/2 above it. On a dome of radius A it draws a dome of radius A +
-        # R.
+        # The apex of a paraboloid on a slope s is R s²/2 above the slope. The image of a dome of radius A is
+        # a dome of radius A + R.
         cases = (
             (0.1 * x_um - 0.2 * y_um, 0.1 * x_um - 0.2 * y_um + radius_um * (0.1**2 + 0.2**2) / 2),
             (-(x_um**2 + y_um**2) / 8, -(x_um**2 + y_um**2) / (2 * (4 + radius_um))),
@@ -207,8 +207,8 @@ class TestSignatures:
         for surface, expected in cases:
             job = Job("dome", np.zeros(frame.shape, np.uint8))
             found = scan_surface(surface, frame, Noise.off(), board, job, np.random.default_rng(0))
-            # Contacts are searched on a grid of 0.01 µm per axis, so heights are low by at most (0.005
-            # µm)²/2R, twice.
+            # Contacts are searched on a grid of 0.01 µm, so heights are too low by at most (0.005 µm)²/2R for
+            # each of the two axes.
             np.testing.assert_allclose(found[20:-20, 20:-20], expected[20:-20, 20:-20], atol=7e-5)
 
     def test_an_asymmetric_tip_has_another_radius_along_each_axis(self):
@@ -221,18 +221,18 @@ class TestSignatures:
             radii_um = []
             for slope in (0.2 * y_um, 0.2 * x_um):
                 found = scan_surface(slope, frame, Noise.off(), board, job, np.random.default_rng(0))
-                # On a slope s along one axis the tip stays R s²/2 above it, where R is the radius along that
-                # axis.
+                # On a slope s along one axis, the apex is R s²/2 above the slope, where R is the radius along
+                # that axis.
                 lifts = (found - slope)[30:-30, 30:-30]
                 radii_um.append(2 * float(lifts.mean()) / 0.2**2)
-            # Contact is searched on a grid of 0.01 µm: (0.005 µm)²/2R short, 0.01 µm of a radius of 0.1 µm.
+            # Contacts are on a grid of 0.01 µm, so a lift is (0.005 µm)²/2R too small: 0.01 µm at R = 0.1 µm.
             assert max(radii_um) == pytest.approx(0.6, abs=0.01)
             assert 0.1 - 0.01 <= min(radii_um) <= 0.2 + 0.01
             blunt.add(int(np.argmax(radii_um)))
         assert blunt == {0, 1}
 
     def test_an_uneven_printer_moves_its_lines_by_the_closed_form(self):
-        # Three bars of four pixels, at a quarter, half and three quarters of a field of 19.2 µm.
+        # Three bars, each four pixels wide, lie at a quarter, half and three quarters of a field of 19.2 µm.
         level = np.zeros((96, 192), np.uint8)
         for middle in (48, 96, 144):
             level[:, middle - 2 : middle + 2] = 8
@@ -246,14 +246,14 @@ class TestSignatures:
             was, now = (
                 float(x_um @ h[near] / h[near].sum()) for h in (even - even.min(), uneven - uneven.min())
             )
-            # The bow shortens a bar by 2 %. The window keeps 1.6 µm on either side of the bar.
+            # The nonlinearity shortens a bar by 2 %. The window extends 1.6 µm from the centre of the bar.
             assert now - was == pytest.approx(0.05 * was * (1 - was / 19.2), abs=0.02)
         across = np.ascontiguousarray(level[:, :96].T)
         plain, bent = (
             scan(Job("a", across), *knobs).clean_um
             for knobs in ((), (KnobSetting("galvo-nonlinearity", 0.05),))
         )
-        # Lines that run across the hatch are not moved.
+        # Bars along the hatch lines are not displaced.
         np.testing.assert_allclose(bent, plain, atol=1e-9)
 
     def test_feedback_lag_trails_along_the_fast_axis_only(self):
@@ -264,7 +264,7 @@ class TestSignatures:
         assert changed[:, 68:75].min() > 0.02
         assert changed[:, 33:37].max() < -0.01
         across = scan(Job("a", level.T.copy()), step).height_um - scan(Job("a", level.T.copy())).height_um
-        # Rows are flat there, so a feedback along the rows has no lag.
+        # The rows of this print are flat, so the feedback along the rows has no lag.
         assert np.abs(across).max() < 1e-9
 
     def test_write_order_memory_changes_what_is_written_later(self):
@@ -278,19 +278,19 @@ class TestSignatures:
     def test_stripes_are_constant_along_the_fast_axis(self, jobs):
         change = scan(jobs[0], KnobSetting("scan-line-stripes", 9.0)).height_um - scan(jobs[0]).height_um
         assert np.ptp(change, axis=1).max() < 1e-12
-        # 100 draws give their sd to 7 %.
+        # From 100 draws, the sd is known to 7 %.
         assert 1e3 * change[:, 0].std() == pytest.approx(9.0, rel=0.25)
 
     def test_quantisation_truncates_to_its_step(self, jobs):
         height_nm = 1e3 * scan(jobs[0], KnobSetting("quantisation", 4.0)).height_um
         np.testing.assert_allclose(height_nm / 4, np.round(height_nm / 4), atol=1e-9)
         lost_nm = 1e3 * scan(jobs[0]).height_um - height_nm
-        # Truncation lowers heights by half a step on average, by 0 to one step in each pixel.
+        # Truncation lowers each pixel by up to one step, and all pixels by half a step on average.
         assert lost_nm.min() > -1e-9
         assert lost_nm.mean() == pytest.approx(2.0, rel=0.05)
 
     def test_a_displaced_write_field_shifts_its_grating_and_no_other(self):
-        # The grating has 16 px in fields of 96 px. Each field of the print is displaced by the drawn amount.
+        # The grating has a period of 16 px, in fields of 96 px. Each field is displaced by the drawn amount.
         level = np.tile((6 + 4 * np.cos(2 * np.pi * np.arange(192) / 16)).round().astype(np.uint8), (96, 1))
         fab = Fab(
             Printer(stitch_field_um=9.6), Microscope.aligned(), Noise.off(),
@@ -301,8 +301,8 @@ class TestSignatures:
         offset_um = 0.2 * fab.knobs.scan_rng("stitching", 3).standard_normal((1, 2, 2))
         wave = np.exp(-2j * np.pi * np.arange(64) / 16)
         for number, left in enumerate((16, 112)):
-            # Only middle rows and four periods count, 1.6 µm from the seam, where the blur of 2 µm has little
-            # effect.
+            # Only middle rows and four periods are used. They are 1.6 µm from the seam, where the blur of
+            # 2 µm has little effect.
             before, after = (one[40:56, left : left + 64].mean(0) @ wave for one in (plain, moved))
             expected = -2 * np.pi * offset_um[0, number, 1] / 1.6
             assert np.angle(after / before) == pytest.approx(expected, abs=0.03)
@@ -314,9 +314,9 @@ class TestSignatures:
         exposure = np.ones((4, 12))
         offset_px = np.array([[[0.0, -1.0], [0.0, 0.0], [0.0, -1.5]]])
         written = write_in_fields(exposure, [[0], [0, 4, 8]], offset_px)
-        # A gap of one pixel, an overlap of one and a half, and the last field leaves as much of the frame.
+        # There is a gap of one pixel and an overlap of 1.5 pixels. The last 1.5 pixels are empty.
         assert written[2].tolist() == [1, 1, 1, 0, 1, 1, 1.5, 2, 1, 1, 0.5, 0]
-        # Beyond the frame one row of four is lost, else nothing.
+        # One row of four is displaced out of the frame and lost.
         assert write_in_fields(exposure, [[0], [0]], np.array([[[1.0, 0.0]]])).sum() == 36
 
     def test_vignetting_darkens_the_corners_of_the_write_field(self):

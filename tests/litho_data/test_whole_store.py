@@ -1,4 +1,4 @@
-"""An incomplete store is refused when it is opened, and ``verify`` gives an answer for any damage."""
+"""Check that an incomplete store cannot be opened, and that ``verify`` reports any damage."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def files_of(store: Path) -> list[Path]:
 
 
 def test_every_chunk_has_a_file_even_if_it_is_all_zeros(campaign: Path) -> None:
-    """Otherwise a lost chunk could not be told from one that was never written."""
+    """Check this because a lost chunk could otherwise not be told from one that was never written."""
     root = zarr.open_group(campaign / "prints.zarr", mode="r", use_consolidated=False)
     stored: Any = [(path, one) for path, one in root.members(max_depth=None) if isinstance(one, zarr.Array)]
     assert len(stored) > 50
@@ -75,7 +75,7 @@ def test_a_packed_store_that_has_lost_a_file_is_refused(own_campaign: Path, tmp_
 
 
 def put(store: Path, name: str, value: Any, place: Any = 1) -> None:
-    """Write a value into an array of a store; a float turns an array of integers into floats."""
+    """Write a value into an array of a store. A float value converts an array of integers to floats."""
     root = zarr.open_group(store, mode="a", use_consolidated=False)
     old = array_of(root, name)
     values: Any = old[...]
@@ -106,7 +106,7 @@ def put_attribute(store: Path, name: str, value: Any) -> None:
 
 
 Change = Callable[[Path], None]
-# Each damage with the words of the message that names it.
+# Each kind of damage, with words of the message that reports it.
 IMPOSSIBLE: dict[str, tuple[Change, str]] = {
     "a level above the highest": (lambda s: put(s, "mask_level", 13, (1, 5, 7)), "level .*P12.*got 13"),
     "nothing measured": (lambda s: put(s, "valid", False), "measured pixels of scan P12"),

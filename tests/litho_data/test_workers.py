@@ -1,6 +1,6 @@
-"""Each job runs once, on any worker, with few jobs at a time. An error is one line.
+"""Check that each job runs once on any worker, few jobs wait at a time, and an error is one line.
 
-Tests on a cluster: tests/laws/test_cluster.py.
+The tests on a cluster are in tests/laws/test_cluster.py.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_jobs_run_once_in_the_same_folder_for_the_same_command(
     assert sorted(job[0] for job, _ in done) == list(range(9))
     threads = before.get("OMP_NUM_THREADS", "1" if processes > 1 else None)
     for job, (whole, entry, facts) in done:
-        # The object is that of this process, although other processes have their own.
+        # The returned job refers to the object of this process, although other processes have their own copy.
         assert whole is job[1]
         assert entry == job[0]
         assert facts == ("litho-data build card.toml", str(tmp_path), threads)
@@ -77,12 +77,12 @@ def test_jobs_are_taken_only_as_results_are_and_by_workers_that_come_later() -> 
     with ThreadPoolExecutor(1) as executor:
         results = _windowed(lambda job: executor.submit(double, job), jobs(), lambda: present)
         next(results)
-        # Four jobs are running, and at most four more were submitted for those that finished meanwhile.
+        # Four jobs are in progress, and at most four more were submitted because others had finished.
         assert len(taken) <= 8
         present = 5
         next(results)
         next(results)
-        # Three results are taken. Ten jobs are running or finished.
+        # Three results were taken, and ten jobs are running or finished.
         assert len(taken) >= 13
         results.close()
 
@@ -98,7 +98,9 @@ def test_a_job_that_always_kills_its_worker_is_named_and_no_other(
 ) -> None:
     jobs = [(number, 3 if number == 7 else 0, tmp_path) for number in range(12)]
     done = run_jobs(die_at_first, jobs, Workers(2), name=lambda job: f"scan {job[0]}")
-    with pytest.raises(InputError, match=r"^the worker of scan 7, got died 3 times; run it again") as said:
+    with pytest.raises(
+        InputError, match=r"^the worker of scan 7 died 3 times; run the command again"
+    ) as said:
         list(done)
     assert "\n" not in str(said.value)
     assert capsys.readouterr().err.count("\n") == 2
@@ -107,7 +109,7 @@ def test_a_job_that_always_kills_its_worker_is_named_and_no_other(
 def test_a_worker_that_dies_while_jobs_wait_costs_a_line_and_no_job(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The worker is killed twice, in two jobs. One call completes all jobs, each once."""
+    """Check that one call completes each job once, although two of the jobs kill their worker."""
     jobs = [(number, 1 if number in (3, 20) else 0, tmp_path) for number in range(40)]
     done = list(run_jobs(die_at_first, jobs, Workers(2), name=lambda job: f"scan {job[0]}"))
     assert sorted(answer for _, answer in done) == list(range(40))
@@ -122,7 +124,7 @@ def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: 
     monkeypatch.setattr(module, "_CONNECT_S", 0.3)
     for wrong in (NOBODY, "nonsense://"):
         with pytest.raises(
-            InputError, match=r"^Dask scheduler, got none at \S+ .*wanted for example"
+            InputError, match=r"^Dask scheduler, got none at \S+ .*wanted the address of a running scheduler"
         ) as said:
             list(run_jobs(double, [1], Workers(dask=wrong)))
         assert "\n" not in str(said.value)
@@ -130,7 +132,7 @@ def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: 
 
 @pytest.mark.parametrize("words", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
 def test_another_program_at_the_address_is_one_line_without_a_traceback(words: bytes, tmp_path: Path) -> None:
-    """The command runs in a separate process, because Dask prints its surplus lines at exit."""
+    """Check this in a separate process, because Dask prints unwanted lines when the process exits."""
     pytest.importorskip("distributed")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -160,7 +162,7 @@ def test_another_program_at_the_address_is_one_line_without_a_traceback(words: b
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(
-        InputError, match=r"^dask, got not installed, wanted pip install 'litholoop\[cluster\]'$"
+        InputError, match=r"^dask is not installed; install it with pip install 'litholoop\[cluster\]'$"
     ):
         list(run_jobs(double, [1], Workers(dask=NOBODY)))
 

@@ -19,7 +19,7 @@ from litho_design.printers.printer import Printer
 
 
 class BlurPrinter(nn.Module):
-    """Return gain * (layout * Gaussian) + offset, with the interface of a frozen model."""
+    """Predict gain * (layout * Gaussian) + offset, with the interface of a frozen model."""
 
     def __init__(self, sigma_um=0.2, gain=0.62, offset_um=0.164, pitch_um=0.1, name="blur"):
         super().__init__()
@@ -49,9 +49,9 @@ def make_printer():
 
 @pytest.fixture(scope="session")
 def small_settings() -> HologramSettings:
-    """Return a hologram of 12.8 µm at 30 µm, 30 iterations from a random start far from the optimum.
+    """Return settings of a hologram of 12.8 µm at 30 µm, with 30 iterations from a random start.
 
-    Its yield is that of ten prints. A hundred prints would take longer than the search.
+    The start is far from the optimum. The yield uses ten prints, as a hundred would take too long.
     """
     default = hologram_settings("default")
     return default.model_copy(
@@ -68,7 +68,7 @@ def small_settings() -> HologramSettings:
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """Use one thread: repeats are bit-exact only with a fixed number of threads."""
+    """Use one thread, because results are bit-identical only for a fixed number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -77,14 +77,14 @@ def one_thread():
 
 @pytest.fixture
 def refused(monkeypatch, capsys):
-    """Return a function that runs ``litho-design`` on bad arguments and returns its one line of error."""
+    """Return a function that runs ``litho-design`` with bad arguments and returns its one-line error."""
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, arguments)])
         with pytest.raises(SystemExit) as stop:
             main()
         assert stop.value.code == 2
-        # On a busy machine a command reports after some seconds that it is at work.
+        # On a busy machine, a command reports after some seconds that it is at work.
         lines = [line for line in capsys.readouterr().err.splitlines() if "is at work" not in line]
         said = "\n".join(lines).strip()
         assert len(said.splitlines()) == 1

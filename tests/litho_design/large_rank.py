@@ -1,4 +1,4 @@
-"""The work of one of several processes in the tests of large elements, importable in each of them."""
+"""Provide the work of one of several processes for the tests of large elements."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def settings(iterations: int = ITERATIONS) -> HologramSettings:
 
 
 def printer() -> Printer:
-    """Return a printer whose blur reaches 8 px."""
+    """Return a printer whose blur has a reach of 8 px."""
     return Printer(BlurPrinter(), settings().layout, source="closed form")
 
 
 def work(folder: Path, ranks: Ranks) -> None:
-    """Write the field, gradient and layout of one process, for the parent to compare."""
+    """Write the field, gradient and layout of one process, so that the parent process can compare them."""
     torch.set_num_threads(1)
     bands = Bands(SIZE, BAND, ranks, cell_px=4)
     rows = bands.rows()
@@ -57,14 +57,14 @@ def work(folder: Path, ranks: Ranks) -> None:
 
 
 def banded(bands: Bands) -> BandedHologram:
-    """Return the task of this process's bands."""
+    """Return the hologram task for the bands of this process."""
     target = load_target("ring", SIZE)
     given = {"inputs": {"target": target.pixels}, "record": target.record}
     return BandedHologram(settings(), printer(), bands, **given)
 
 
 def design(folder: Path, bands: Bands) -> None:
-    """Design the hologram of this process's bands."""
+    """Design the hologram in the bands of this process."""
     run_design(banded(bands), folder, write_design_report, announce=False)
 
 

@@ -1,4 +1,4 @@
-"""The staircase formula against a Fourier transform of the staircase itself."""
+"""Compare the staircase formula with a Fourier transform of the staircase itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WAVELENGTH_UM = 0.6328
 @pytest.mark.parametrize("gain", [1.0, 1.039, 0.65])
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_formula_equals_the_fourier_coefficient_of_one_period(steps, gain, order):
-    # Fourier coefficient of a piecewise constant period: every step is integrated in closed form.
+    # The Fourier coefficient of a piecewise constant period is a sum of integrals in closed form.
     edge = np.arange(steps + 1) / steps
     wave = np.exp(2j * np.pi * gain * np.arange(steps) / steps)
     if order == 0:
@@ -38,8 +38,8 @@ def test_published_values():
 
 
 def test_orders_of_a_propagated_staircase():
-    # The grating has 12 steps of 0.8 µm under a beam of 15 µm. At 1500 µm the orders lie 99 µm apart and are
-    # 25 µm wide. A window of 90 µm around one order holds all but 1e-3 of its light and nothing of the next.
+    # The grating has 12 steps of 0.8 µm and is lit by a beam of 15 µm. At 1500 µm, the orders are 99 µm apart
+    # and 25 µm wide. A window of 90 µm around an order contains all but 1e-3 of its light and no other order.
     steps, step_px, pitch, gain, z, waist = 12, 4, 0.2, 0.65, 1500.0, 15.0
     period_um = steps * step_px * pitch
     grid = centred_grid((288, 288), pitch)
@@ -52,8 +52,8 @@ def test_orders_of_a_propagated_staircase():
         window = centred_grid((120, 120), 0.75, (0.0, landing))
         propagate = RSPropagator(grid, window, z, WAVELENGTH_UM, dtype=torch.complex128)
         share = float(propagate(beam).abs().square().sum()) * 0.75**2 / incident
-        # Each step has four samples. The flat step damps the contribution of a sample to the order by this
-        # factor.
+        # Each step has four samples. Averaging over the flat step reduces the contribution of a sample to the
+        # order by this factor.
         sample = np.sinc(order / (steps * step_px)) ** 2
         assert share * sample == pytest.approx(blaze_efficiency(steps, gain, order), abs=1e-3)
 
@@ -65,6 +65,6 @@ def test_the_advised_number_of_steps_completes_one_wave():
     stroke = measure_stroke(printed, wave_height, level_height_um=0.1)
     assert stroke.print_gain == pytest.approx(0.62)
     assert stroke.stroke_waves == pytest.approx(12 * 0.062 / wave_height)
-    # 19 steps of 0.062 µm are the first to reach 1.1547 µm.
+    # At least 19 steps of 0.062 µm are needed to reach 1.1547 µm.
     assert stroke.levels_for_one_wave == 19
     assert 13 * 0.62 * stroke.level_height_for_one_wave_um == pytest.approx(wave_height)

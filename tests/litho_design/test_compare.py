@@ -1,4 +1,4 @@
-"""The comparison: its statistics, its matrix, and what it refuses."""
+"""Test the comparison of designs: its statistics, its matrix, and what it refuses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_design.workflows.compare import compare
 
 def test_interval_is_students():
     values = np.array([1.0, 2.0, 4.0])
-    # mean 7/3, sd 1.5275, t(0.975, 2) = 4.3027, half width 4.3027 * 1.5275 / sqrt(3) = 3.7946
+    # With mean 7/3, sd 1.5275 and t(0.975, 2) = 4.3027, half the width is 4.3027 * 1.5275 / sqrt(3) = 3.7946.
     low, high = interval95(values)
     assert (low, high) == pytest.approx((7 / 3 - 3.7946, 7 / 3 + 3.7946), abs=1e-3)
     assert interval95(values[:1]) is None
@@ -35,7 +35,7 @@ def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
             assert entry.judged == pytest.approx(entry.designed, rel=1e-5)
             assert entry.rms_height_gap_um == pytest.approx(0, abs=1e-7)
     figures = {(s.arm, s.judge): s.judged_mean for s in result.summary if s.figure == "si_psnr_db"}
-    # A design that knows the blur must survive it better than one that does not.
+    # The blur must do less harm to a design that was made with it than to one that was not.
     assert figures["blur", "fab"] > figures["none", "fab"] + 1
     paired = {(p.judge, p.figure): p for p in result.paired}
     assert paired["fab", "si_psnr_db"].mean == pytest.approx(figures["blur", "fab"] - figures["none", "fab"])

@@ -1,4 +1,4 @@
-"""Corrections are scored by judges that took no part in them: the benchmark on printers in closed form."""
+"""Test the benchmark of corrections, which are scored by judges that were not used to make them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEEDS = (5, 6, 7)
 
 
 class Hidden(BlurPrinter):
-    """A printer that differs from its models: steep places lose height along x, and dense ones shrink."""
+    """Imitate a printer that its models lack: slopes along x lose height, and high places shrink."""
 
     def __init__(self, seed: int):
         draw = np.random.default_rng(seed)
@@ -33,7 +33,7 @@ class Hidden(BlurPrinter):
 
 
 def fitted(name: str, sigma_um: float, hidden: Hidden, layout) -> Printer:
-    """Return a blur whose gain and offset fit prints of smooth layouts, with its errors there on its card."""
+    """Return a blur model fitted to prints of smooth layouts, with its errors on them in its card."""
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(6, 1, 12, 12, generator=generator) * 1.2
     layouts = torch.nn.functional.interpolate(coarse, size=96, mode="bicubic").clamp(0, 1.2)
@@ -78,16 +78,16 @@ def test_a_correction_is_no_worse_than_none_by_a_judge_that_took_no_part(rows):
 
 def test_the_stated_width_contains_the_printed_heights(rows):
     assert sum(map(holds, rows)) >= 14
-    # The width is not trivially large: the relief has an rms height of 170 nm and more.
+    # The width is not trivially large, because the reliefs have an rms height of at least 170 nm.
     assert np.median([row["between_nm"][1] for row in rows]) < 100
-    # The models agree with each other. Without their errors, the width would contain hardly any print.
+    # The models agree with each other, so without their errors the width would contain hardly any print.
     smooth = [row for row in rows if row["relief"] in ("cap", "freeform", "staircase")]
     assert sum(abs(row["printed_nm"]["corrected"] / row["stated_nm"] - 1) < 0.1 for row in smooth) < 4
 
 
 def test_the_error_of_a_model_is_that_of_its_prints_and_grows_with_the_relief():
     own = {"error_nm": 8.0, "relief_nm": 100.0, "gain": 1.0}
-    # sqrt(pi / 2) * 8 nm on reliefs up to those of its own prints, and in proportion beyond.
+    # The error is sqrt(pi / 2) * 8 nm on reliefs up to those of its own prints, and proportional beyond.
     for relief_um, wanted in ((0.05, 0.01003), (0.1, 0.01003), (0.3, 0.03008)):
         assert own_error_um({"baseline": [own]}, relief_um) == pytest.approx(wanted, rel=1e-3)
     gains = [{**own, "gain": gain} for gain in (0.9, 1.1)]
@@ -103,8 +103,7 @@ def test_a_relief_is_corrected_for_the_expected_error_over_its_models():
     together = ReliefTask(settings, printers[0], inputs=inputs, ensemble=printers[1:])
     level = together.untouched()["uncorrected"].float()[None, None]
     alone = [float(ReliefTask(settings, one, inputs=inputs).objective(level)[0]) for one in printers]
-    # The squared errors of equally weighted models add up: the result is neither the worst model nor their
-    # mean.
+    # The result is the rms of the errors of equally weighted models, neither the largest error nor the mean.
     assert float(together.objective(level)[0]) == pytest.approx(
         math.sqrt(np.mean(np.square(alone))), rel=1e-5
     )
@@ -113,8 +112,8 @@ def test_a_relief_is_corrected_for_the_expected_error_over_its_models():
 def test_the_table_says_which_corrections_are_worse(rows):
     better = [{**row, "printed_nm": {**row["printed_nm"], "corrected": 1.0}} for row in rows]
     told = as_markdown({"rows": better, "size_px": 64})
-    assert f"Of {len(rows)} corrections 0 print more than 5 % worse" in told
+    assert f"Of {len(rows)} corrections, 0 print more than 5 % worse" in told
     better[0]["printed_nm"]["corrected"] = 999.0
     told = as_markdown({"rows": better, "size_px": 64})
-    assert "corrections 1 print more than 5 % worse" in told
+    assert "corrections, 1 print more than 5 % worse" in told
     assert "whichever is better (cap by hidden 5" in told

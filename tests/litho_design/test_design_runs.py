@@ -1,4 +1,4 @@
-"""Test whole design runs: frozen printer, resume, optimum of a toy, bad input."""
+"""Test whole design runs: an unchanged model, resuming, the optimum of a small problem, and bad input."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def target():
 
 @pytest.fixture
 def tiny_settings(small_settings):
-    """A quarter of the pixels, for tests that do not look at the image."""
+    """Return settings with a quarter of the pixels, for tests that do not depend on the image."""
     changes = {"layout": LayoutSettings(size_px=64), "optics": Optics(distance_um=12.0)}
     return small_settings.model_copy(update=changes)
 
@@ -57,13 +57,13 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     assert all(p.grad is None and not p.requires_grad for p in printer.parameters())
     assert design.polished_loss <= design.argmax_loss < 0.5 * design.start_loss
     levels = read_array(tmp_path, "layout_level.npy")
-    # 0.4 µm cells on a 0.1 µm grid: every 4 x 4 block holds one level.
+    # Cells of 0.4 µm on a grid of 0.1 µm are 4 x 4 blocks of one level.
     blocks = levels.reshape(32, 4, 32, 4)
     assert (blocks == blocks[:, :1, :, :1]).all()
     assert levels.max() <= 12
     own = score_design(tmp_path, tmp_path / "score", judges=[printer]).scores[0]
     assert not own.independent
-    # The same layout through the same model must give the stored expectation again.
+    # The same layout and model must give the stored expected height again.
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     assert own.rms_height_difference_um == pytest.approx(0, abs=1e-7)
 
@@ -116,7 +116,7 @@ def test_a_resumed_search_counts_the_time_of_the_interrupted_ones(tmp_path, monk
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             run()
-    # An objective takes one second, and a step needs one objective. Iteration 0 and the last one are
+    # Each objective takes one second, and each step needs one objective. Iteration 0 and the last one are
     # evaluated too. Checkpoints keep 11 s of the first run and 10 s of the second.
     assert run().earlier_seconds == 21
 
@@ -130,7 +130,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, tiny_settings, make_printer, 
         with pytest.raises(KeyboardInterrupt):
             design_hologram(tiny_target, make_printer(tiny_settings.layout), tmp_path, settings=tiny_settings)
     (tmp_path / "checkpoint.pt").write_text("half a file")
-    with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete it"):
+    with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete the file"):
         design_hologram(tiny_target, make_printer(tiny_settings.layout), tmp_path, settings=tiny_settings)
 
 
@@ -151,7 +151,7 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
             search()
     checkpoint.unlink()
     checkpoint.mkdir()
-    # The message names no file to delete.
+    # The message does not advise deleting a file.
     with pytest.raises(IsADirectoryError):
         search()
 
@@ -160,9 +160,9 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
 def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
     tmp_path, tiny_settings, make_printer, tiny_target, monkeypatch, where
 ):
-    """The run has fewer iterations than lie between two checkpoints.
+    """Check a run with fewer iterations than the interval of checkpoints.
 
-    It stops between the arrays and the record.
+    It is stopped after writing the arrays, before writing the record.
     """
     search = tiny_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
     settings = tiny_settings.model_copy(update={"search": search})
@@ -238,18 +238,18 @@ def test_a_killed_command_resumes_to_the_same_layout(tmp_path):
 def test_the_estimate_of_a_resumed_run_omits_finished_iterations():
     budget = Budget(seconds_per_iteration=2.0, seconds_per_evaluation=1.0, peak_memory_gib=0.5)
     search = SearchSettings(iterations=100, polish_rounds=5, evaluate_every=10)
-    # 40 iterations and 5 rounds of polish take 2 s each, 4 evaluations 1 s each.
+    # The 40 iterations and 5 rounds of polish take 2 s each, and the 4 evaluations 1 s each.
     assert "40 more iterations" in budget.sentence(search, done=60)
     assert "about 1.6 min" in budget.sentence(search, done=60)
     assert "100 iterations" in budget.sentence(search)
-    # The estimate includes the work after the search: 94 s and 146 s.
+    # The estimate includes the work after the search, so it is 94 s + 146 s.
     assert "about 4.0 min" in budget.sentence(search, 60, 146.0)
 
 
 def test_the_estimate_after_a_search_counts_each_draw_and_print(
     tiny_settings, make_printer, tiny_target, monkeypatch
 ):
-    """The clock advances by 2 s for each print and by 0.5 s for each draw of the yield."""
+    """Check the estimate with a clock that advances by 2 s per print and by 0.5 s per draw of the yield."""
     printer = make_printer(tiny_settings.layout)
     task = HologramTask(tiny_settings, printer, inputs={"target": tiny_target.pixels}, ensemble=[printer])
     now = [0.0]
@@ -267,7 +267,7 @@ def test_the_estimate_after_a_search_counts_each_draw_and_print(
     parameters = task.free_parameters()
     level = parameters.cells(parameters.best_levels())
     draws = tiny_settings.window.yield_draws
-    # Two layouts by two models, each printed and scored.
+    # Two layouts are printed and scored, each by two models.
     after_s = tasks_run._seconds_after(task, level)
     assert after_s == pytest.approx(2 * 2 * 2.0 + (draws + 2 * 2) * 0.5 + tasks_run._PAGE_S)
 
@@ -290,7 +290,7 @@ def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
 
 
 def test_the_search_finds_the_true_optimum_of_a_toy():
-    # With 2 x 2 cells of 2 x 2 px and 12 levels, all 20736 layouts are listed by superposition of the cells.
+    # With 2 x 2 cells of 2 x 2 px and 12 levels, all 20736 layouts can be computed by superposing cells.
     layout = LayoutSettings(size_px=4, pitch_um=0.3, cell_um=0.6, levels=12)
     optics = Optics(distance_um=5.0)
     grid = centred_grid((4, 4), 0.3)
@@ -317,12 +317,12 @@ def test_the_search_finds_the_true_optimum_of_a_toy():
         parameters.start_random(seed)
         state = search_layout(parameters, objective, settings)
         levels = state.best_levels
-        # The search alone, before any polish, from every start.
+        # The search alone, without polish, comes close from every start.
         assert 1 - state.best_loss >= 0.95 * best
         polished, losses = polish_levels(levels, cells, objective, level_count=12, rounds=10)
         assert losses == sorted(losses, reverse=True)
         index = int((combinations == polished.flatten()).all(1).nonzero())
-        # The listed value and the objective are computed in two ways and must agree.
+        # The value from the list and the objective are computed in different ways and must agree.
         assert float(efficiency[index]) == pytest.approx(1 - losses[-1], abs=1e-5)
 
 
@@ -346,7 +346,7 @@ def test_the_printer_none_prints_nominal_heights_and_a_guard_ring_isolates_the_e
     layout = small_settings.layout
     level = torch.randint(0, 13, (1, 1, 128, 128)).float()
     assert torch.equal(Printer(None, layout, source="none")(level), level * layout.level_height_um)
-    # The block is full. Its corner has substrate on two sides, so a quarter of the Gaussian remains.
+    # The block is uniform. Its corner has substrate on two sides, so a quarter of the Gaussian remains.
     block = torch.full((1, 1, 128, 128), 10.0)
     printed = make_printer(layout, sigma_um=0.2, gain=1.0, offset_um=0.0)(block)
     half = float(torch.erf(torch.tensor(0.05 / (0.2 * 2**0.5)))) / 2 + 0.5  # pixel centre is 0.05 µm inside
@@ -394,7 +394,7 @@ def test_a_place_that_holds_something_else_is_refused(tmp_path, tiny_settings, m
         design_hologram(tiny_target, printer, tmp_path / "file", settings=settings, announce=False)
     design_hologram(tiny_target, printer, tmp_path / "design", settings=settings, announce=False)
     report = (tmp_path / "design" / "report.html").read_bytes()
-    # Both write a report.html: the score would replace that of the design.
+    # Both write a report.html, so the score would replace the report of the design.
     with pytest.raises(InputError, match=r"which holds design\.json"):
         score_design(tmp_path / "design", tmp_path / "design", judges=[printer])
     assert (tmp_path / "design" / "report.html").read_bytes() == report

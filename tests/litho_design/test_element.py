@@ -1,4 +1,4 @@
-"""The printer as an optical element: its wave, its gradient, tiles, torchoptics, the examples."""
+"""Test the printer as an optical element: its wave, its gradient, tiles, torchoptics and examples."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def element(make_printer):
 
 
 def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
-    """Phase and amplitude follow the closed form for the layout that would be printed."""
+    """Check phase and amplitude against the closed form for the layout that would be printed."""
     levels = torch.from_numpy(element.levels())[None, None].float()
     height = make_printer(LAYOUT)(levels)[0, 0]
     assert torch.equal(element.height_um(), height)
     wave = torch.randn(3, 40, 40, dtype=torch.complex64)
     for um in (0.473, 0.6328):
         expected = wave * torch.exp(2j * math.pi * (refractive_index("ip-dip", um) - 1) * height / um)
-        # A few waves of phase in float32.
+        # The phase is a few waves, in float32.
         assert (element(wave, um) - expected).abs().max() < 1e-5 * wave.abs().max()
     dark = Element(
         element.printer, LAYOUT, seed=1, absorption_per_um=0.3, resin=lambda um: 1.5, surroundings=1.33
@@ -44,7 +44,7 @@ def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
     assert torch.allclose(dark(wave, 0.5).abs().square(), kept, rtol=1e-5)
     assert dark.optics(0.5).index_step == pytest.approx(0.17)
     known = torch.full((40, 40), 0.5 / 0.17)
-    # The height is one wave.
+    # This height is exactly one wave.
     assert dark.transmission(0.5, known).angle().abs().max() < 1e-5
 
 
@@ -56,7 +56,7 @@ def test_a_thick_element_is_that_of_the_designs(make_printer):
 
 
 def test_the_gradient_passes_straight_through_rounding_and_limits(element):
-    """Whole levels have the gradient of real levels at the same place, and none leaves the range."""
+    """Check that whole levels have the gradient of real levels at the same place, also at the limits."""
 
     def slope():
         (found,) = torch.autograd.grad(element.height_um().square().sum(), element.free.height)
@@ -76,7 +76,7 @@ def test_the_gradient_passes_straight_through_rounding_and_limits(element):
         above = element.height_um().square().sum()
         element.free.height[place] -= 2 * step
         below = element.height_um().square().sum()
-    # For a square the central difference is exact.
+    # For a square, the central difference is exact.
     assert float((above - below) / (2 * step)) == pytest.approx(float(middle), rel=1e-3)
     with torch.no_grad():
         element.free.height[0, 0], element.free.height[0, 1] = 99.0, -7.0
@@ -92,7 +92,7 @@ def test_tiles_print_the_same_with_the_same_gradient(element):
         (slope,) = torch.autograd.grad(height.square().sum(), element.free.height)
         return height.detach(), slope
 
-    # 40 px are split into tiles of 16, so the last ones are smaller. The blur reaches 8 px.
+    # The 40 px are split into tiles of 16, so the last tiles are smaller. The blur has a reach of 8 px.
     for one, other in zip(found(16), found(None), strict=True):
         assert torch.allclose(one, other, rtol=1e-5, atol=1e-6)
 
@@ -101,14 +101,14 @@ def test_an_element_starts_from_a_layout_or_a_phase(element):
     levels = np.random.default_rng(0).integers(0, 13, (20, 20)).repeat(2, 0).repeat(2, 1)
     element.start_from_levels(levels)
     assert np.array_equal(element.levels(), levels)
-    # The start is the printed level of a wide area whose phase is nearest. These levels are 0.62 x 0.1 µm
-    # apart.
+    # The start is the level that, printed in a wide area, has the nearest phase. The printed levels are
+    # 0.62 x 0.1 µm apart.
     element.start_from_phase(torch.full((40, 40), 1.0), 0.6328)
     assert len(np.unique(element.levels())) == 1
 
 
 def test_two_sources_of_a_resin_agree():
-    """Cauchy of 2017 and Sellmeier of 2019 differ by a constant 0.004 over the visible range."""
+    """Check that Cauchy (2017) and Sellmeier (2019) differ by a constant 0.004 in the visible range."""
     um = np.linspace(0.45, 1.0, 24)
     older, newer = (
         np.array([refractive_index(name, one) for one in um]) for name in ("ip-dip", "ip-dip-2019")
@@ -138,7 +138,7 @@ def test_a_field_in_metres_is_refused_where_micrometres_are_meant(element):
 
 @pytest.mark.parametrize("model", ["blur", "zoo:physics", "zoo:pbl"])
 def test_gradients_of_torch_func_are_those_of_autograd(model, make_printer):
-    """Test one and several layouts at once, also through models with their own gradients."""
+    """Test single layouts and batches, also for models that define their own gradients."""
     layout = LayoutSettings(size_px=24, cell_um=0.4)
     element = Element(make_printer(layout) if model == "blur" else model, layout, seed=1)
     wave = torch.ones(24, 24, dtype=torch.complex64)
@@ -150,7 +150,7 @@ def test_gradients_of_torch_func_are_those_of_autograd(model, make_printer):
     first, other = element.free.height.detach().clone(), element.free.height.detach().flip(0)
     wanted = [torch.autograd.grad(loss(one.requires_grad_()), one)[0] for one in (first, other)]
     first, other = first.detach(), other.detach()
-    # The same operations in another order: float32.
+    # The order of operations differs, so float32 rounding does too.
     assert torch.allclose(torch.func.grad(loss)(first), wanted[0], rtol=1e-4, atol=1e-8)
     both = torch.func.vmap(torch.func.grad(loss))(torch.stack([first, other]))
     assert torch.allclose(both, torch.stack(wanted), rtol=1e-4, atol=1e-8)
@@ -162,7 +162,7 @@ def test_batches_and_double_precision(element):
     assert single.shape == wave.shape
     exact = element.double()(wave, 0.6328)
     assert exact.dtype == torch.complex128
-    # A phase of some waves in float32 is known to 1e-6.
+    # A phase of a few waves in float32 is exact to 1e-6.
     assert (exact - single).abs().max() < 1e-5 * wave.abs().max()
     element.float()
 
@@ -215,7 +215,7 @@ def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch
     ],
 )
 def test_examples_train_through_the_printer(monkeypatch, capsys, name, options, better):
-    """The printer judges both: the element designed through it beats the one for a perfect printer."""
+    """Check that an element designed through the printer model beats one for a perfect printer."""
     if name == "structured_light_4f":
         pytest.importorskip("torchoptics")
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

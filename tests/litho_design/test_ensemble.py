@@ -1,4 +1,4 @@
-"""Test several models in one design: the formula of the penalty, its effect, and the check of tiles."""
+"""Test designs with several models: the formula of the penalty, its effect, and the check of tiles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from litho_design.workflows.design import design_hologram, design_lens
 
 def test_disagreement_is_the_rms_spread_without_the_datum():
     pattern = torch.tensor([[1.0, -1.0], [-1.0, 1.0]])
-    # Two models are at +-0.1 of a pattern of unit rms, one of them 5 µm higher. The spread is 0.1 everywhere.
+    # Two models give ±0.1 of a pattern of unit rms, one of them 5 µm higher. The spread is 0.1 everywhere.
     apart = torch.stack([0.1 * pattern, -0.1 * pattern + 5])
     assert float(disagreement_um(apart)) == pytest.approx(0.1, rel=1e-5)
 
@@ -38,7 +38,7 @@ def test_rings_are_weighted_by_their_area():
     spread = torch.nn.functional.pad(rings, (0, plane.cells[0] - 100))
     pixels = torch.stack([plane(profile)[inside] for profile in spread])
     weighted = disagreement_um(rings, bench.propagator.ring_area_um2.float())
-    # The rings consist of whole pixels. The outermost ones deviate by a per cent from their area.
+    # The rings consist of whole pixels, so the area of the outermost ones is wrong by one per cent.
     assert float(weighted) == pytest.approx(float(disagreement_um(pixels)), rel=0.01)
     assert abs(float(disagreement_um(rings)) / float(weighted) - 1) > 0.05
 
@@ -47,7 +47,7 @@ def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
     height = torch.rand(8, 8, requires_grad=True)
     spread = disagreement_um(torch.stack([height, height]))
     spread.backward()
-    # The square root has a floor of 1e-6 µm, a thousandth of an ångström.
+    # The square root has a floor of 1e-6 µm.
     assert float(spread.detach()) == pytest.approx(1e-6, rel=1e-3)
     assert torch.isfinite(height.grad).all()
 
@@ -82,7 +82,7 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         assert Design.read(tmp_path / f"{weight:g}") == design
         apart[weight] = waves(tmp_path / f"{weight:g}")
     assert apart[20.0] < 0.8 * apart[0.0]
-    # Compare the worst member, and the disagreement in waves.
+    # The loss is that of the worst member plus the weighted disagreement in waves.
     main, other = models()
     inputs = {"target": target.pixels}
     level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
@@ -122,7 +122,7 @@ def test_tiles_with_a_halo_print_the_same_as_the_whole(make_printer):
     check = make_printer(layout).tiling_check(level, tile_px=128)
     assert check is not None
     assert check.tiles == 2
-    # Heights of 1 µm in float32, summed over 17 taps in another order.
+    # Heights of 1 µm in float32 are summed over 17 taps in another order.
     assert check.max_nm < 1e-2
     assert make_printer(layout).tiling_check(level, tile_px=320) is None
     assert Printer(None, layout, source="none").tiling_check(level, tile_px=128) is None
@@ -138,16 +138,16 @@ def test_a_model_that_depends_on_the_whole_image_is_detected():
     layout = LayoutSettings(size_px=256)
     level = torch.full((1, 1, 256, 256), 6.0)
     level[..., 100:104, 250:] = 12.0
-    # A height of zero stays zero after division.
+    # A height of zero stays zero after normalisation.
     level[..., 40:60, :] = 0.0
-    # Tiles away from the high corner divide by half the height. They print 1 µm where the whole prints 0.5
-    # µm.
+    # Tiles that do not contain the high corner are divided by half the height. They print 1 µm where the
+    # whole layout prints 0.5 µm.
     check = Printer(Normalising(), layout, source="test").tiling_check(level, tile_px=64)
     assert check.max_nm == pytest.approx(500, rel=1e-5)
 
 
 def test_models_disagree_most_on_the_level_whose_heights_are_farthest_apart():
-    """Each height counts from level 0 of its own model."""
+    """Check the level with the largest disagreement; each model counts heights from its own level 0."""
     heights = {"one": [0.1, 0.3, 0.6, 0.7], "two": [0.5, 0.8, 1.4, 1.2]}
     width = Width(searched_with=1, figures={}, returned="", figure="", less=False, level_heights_um=heights)
     assert width.open_level == pytest.approx((2, 0.5, 0.9))

@@ -1,4 +1,4 @@
-"""Every format is read back level for level, at its size, the right way up."""
+"""Check that every format is read back level for level, with its size and orientation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from litho_design.workflows.design import design_hologram
 
 POWERS = tuple(range(50, 63))
 FORMATS = ["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
-# An "F" has no symmetry: any flip or rotation shows.
+# An "F" has no symmetry, so any flip or rotation is noticed.
 LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 
 
@@ -69,7 +69,7 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
 
 
 def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
-    """The model sees the heights of the sidecar, without the marks, and refuses another pitch."""
+    """Check that a model predicts an export from its sidecar, and refuses one with another pitch."""
     from litho_models.frozen.files import load_frozen
     from litho_models.frozen.on_store import predict_file
 
@@ -105,7 +105,7 @@ def test_tiff_is_upright_and_has_its_size_for_another_reader(tmp_path):
         assert file.pages[0].tags["ResolutionUnit"].value == tifffile.RESUNIT.CENTIMETER
     assert np.array_equal(pages[0], levels)
     np.testing.assert_allclose(pages[1], levels * 0.1, rtol=1e-6)
-    # 1e-9 m over the whole side.
+    # The tolerance is 1e-9 m over the whole side.
     for pixels, (count, centimetres) in zip((160, 200), per_cm, strict=True):
         assert pixels * 0.01 * centimetres / count == pytest.approx(pixels * 0.13e-6, abs=1e-9)
 
@@ -116,7 +116,7 @@ def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
     write_gds(tmp_path / "f.gds", LETTER * 2, 0.13, layers)
     library = gdstk.read_gds(tmp_path / "f.gds")
     (cell,) = library.top_level()
-    # The F reaches all four sides. In ``exclusive``, level 0 fills the rest.
+    # The F touches all four sides. With ``exclusive``, level 0 fills the rest.
     corners = np.array(cell.bounding_box()) * library.unit
     assert corners == pytest.approx(np.array([[0, 0], [4 * 0.13e-6, 5 * 0.13e-6]]), abs=1e-9)
     assert (library.unit, library.precision) == pytest.approx((1e-6, 1e-9), rel=1e-15)
@@ -160,7 +160,7 @@ def test_exports_in_other_formats_stay(tmp_path, design):
     assert all(np.array_equal(import_levels(file)[0], levels) for file in (first, second, again))
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["layout.png", "layout.png.json", "layout.stl", "layout.stl.json"]
-    # A print job must not mix two layouts: the sidecar of the other format names another layout.
+    # A print job must not mix two layouts, and the sidecar of the other format names another layout.
     sidecar = sidecar_path(second)
     sidecar.write_text(sidecar.read_text().replace(import_levels(first)[1].layout_sha256, "0" * 64))
     with pytest.raises(InputError, match=r"layout\.stl\.json, an export of another layout"):
@@ -180,12 +180,12 @@ def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
     levels = np.kron(LETTER * 3, np.ones((2, 2), np.uint8)) + np.arange(8, dtype=np.uint8) % 3
     write_stl(tmp_path / "f.stl", levels, 0.4, 0.1, 1.0)
     triangles = read_stl_triangles(tmp_path / "f.stl").astype(np.float64)
-    # Where two columns touch along an edge, one corner is displaced by 1/128 of a cell.
+    # Where two columns touch only along an edge, one corner is displaced by 1/128 of a cell.
     assert _volume(triangles) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=1e-4)
-    # 8 x 10 cells of 0.4 µm, to 1e-9 m.
+    # The solid has 8 x 10 cells of 0.4 µm, exact to 1e-9 m.
     assert triangles.reshape(-1, 3).min(0) == pytest.approx((0, 0, 0), abs=1e-3)
     assert triangles.reshape(-1, 3).max(0)[:2] == pytest.approx((3.2, 4.0), abs=1e-3)
-    # Row 0 is at the top: the bar of the F lies at high y.
+    # Row 0 is at the top, so the bar of the F is at high y.
     high = triangles[triangles[:, :, 2].min(1) > 1.25]
     assert high[..., 1].max() == pytest.approx(4.0)
     with pytest.raises(InputError, match="pedestal"):
@@ -196,8 +196,8 @@ def test_stl_has_few_triangles(tmp_path):
     def triangles(levels):
         return write_stl(tmp_path / "f.stl", np.array(levels, np.uint8), 0.4, 0.1, 1.0)
 
-    # There are two triangles for the top of each cell and for each wall, and one underneath along the rim.
-    # Another is needed where the side of a step meets the top of the step below it.
+    # Each cell has two triangles for its top and for each wall, and one underneath along the rim.
+    # Another triangle is needed where the side of a step meets the top of the step below.
     for steps in (1, 2, 7):
         tops, walls, rim = 5 * steps, 5 * (steps - 1), 2 * (5 + steps)
         assert triangles([range(steps)] * 5) == 2 * tops + 2 * walls + 3 * rim + 2 * (steps - 1)
@@ -206,7 +206,7 @@ def test_stl_has_few_triangles(tmp_path):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_stl_is_watertight_where_columns_touch_at_corners(tmp_path, seed):
-    """Two parsers that share no code with the writer read twenty random layouts."""
+    """Check random layouts with two parsers that share no code with the writer."""
     generator = np.random.default_rng(seed)
     levels = generator.integers(0, 2 + seed % 12, generator.integers(1, 14, 2)).astype(np.uint8)
     file = tmp_path / "random.stl"
@@ -229,12 +229,12 @@ def _require_closed(corners) -> None:
     # Every edge occurs once in each direction.
     assert np.array_equal(there, back)
     assert (np.diff(there) > 0).all()
-    # Euler's formula.
+    # This is Euler's formula.
     assert len(points) - len(there) // 2 + len(faces) == 2
 
 
 def _volume(triangles: np.ndarray) -> float:
-    """Return the volume by the divergence theorem."""
+    """Return the volume of a closed surface, by the divergence theorem."""
     return np.einsum("ij,ij->i", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
 
 
@@ -269,13 +269,13 @@ def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
 
 
 def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tmp_path):
-    """The test reads records by struct and follows references itself, with no code of gdstk or the writer."""
+    """Check a GDS file with a parser of its own, which follows references without gdstk or the writer."""
     tile = np.random.default_rng(0).integers(0, 4, (128, 128)).astype(np.uint8)
     levels = np.tile(tile, (3, 2))
     levels[300, 200] = 5
     assert write_gds(tmp_path / "f.gds", levels, 0.1, "exclusive") > 0
     cells = _gds_cells(tmp_path / "f.gds")
-    # There are three rows of two blocks. Five of the six are equal.
+    # There are three rows of two blocks. Five of the six blocks are equal.
     rows = [name for name, _ in cells["ELEMENT"]["references"]]
     assert [len(cells[name]["references"]) for name in ("LAYOUT", *rows)] == [1, 2, 2, 2]
     assert len({name for row in rows for name, _ in cells[row]["references"]}) == 2
@@ -286,7 +286,7 @@ def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tm
             (left, low), (right, high) = np.array(corners).min(0), np.array(corners).max(0)
             place = [round(edge / 100) for edge in (x0 + left, y0 + low, x0 + right, y0 + high)]
             block = seen[384 - place[3] : 384 - place[1], place[0] : place[2]]
-            assert (block == -1).all(), "nothing is drawn twice"
+            assert (block == -1).all(), "a place is drawn twice"
             block[...] = layer
         for other, (x, y) in cells[name]["references"]:
             draw(other, x0 + x, y0 + y)
@@ -296,14 +296,14 @@ def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tm
 
 
 def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, design, monkeypatch):
-    """Pillow and libtiff read the file that tifffile wrote."""
+    """Check with Pillow and libtiff a file that tifffile wrote."""
     monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
     levels = np.kron(LETTER * 7, np.ones((50, 50), np.uint8))
     write_tiff(tmp_path / "f.tif", levels, 0.13, 0.1)
     assert (tmp_path / "f.tif").read_bytes()[:4] == b"II" + struct.pack("<H", 43)
     with Image.open(tmp_path / "f.tif") as pages:
         assert np.array_equal(np.asarray(pages), levels)
-        # Pixels per centimetre, tag 282.
+        # Tag 282 holds the pixels per centimetre.
         assert float(pages.tag_v2[282]) == pytest.approx(1e4 / 0.13, rel=1e-6)
         pages.seek(1)
         assert np.asarray(pages) == pytest.approx(levels * 0.1)
@@ -312,7 +312,7 @@ def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, desi
 
 
 class _Tall:
-    """Random levels 512 px wide. Only the requested rows are ever in memory."""
+    """Provide random levels, 512 px wide, of which only the requested rows are in memory."""
 
     def __init__(self, height):
         self.shape = (height, 512)
@@ -343,13 +343,13 @@ def test_memory_of_an_export_does_not_grow_with_its_rows(tmp_path, kind, monkeyp
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert bands == 1 + 4 + 8
-    # The first export also loads modules. Growth comes from the names of 16 more blocks, below 1 kB each. All
-    # levels would add 0.26 MB, and their rectangles, 64 bytes for about sixteen pixels, 1 MB.
+    # The first export also loads modules. The growth is due to the names of 16 more blocks, below 1 kB each.
+    # Keeping all levels would add 0.26 MB, and all rectangles (64 bytes for about 16 pixels) 1 MB.
     assert peaks[2] - peaks[1] < 2e5
 
 
 def _gds_cells(file) -> dict[str, dict[str, list]]:
-    """Return boundaries (layer, corners) and references (name, place) per cell of a GDSII, database units."""
+    """Return boundaries (layer, corners) and references (name, place) of each GDSII cell, in file units."""
     data, at, cells = file.read_bytes(), 0, {}
     while at < len(data):
         length, kind = struct.unpack_from(">HB", data, at)
@@ -372,7 +372,7 @@ def _gds_cells(file) -> dict[str, dict[str, list]]:
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_mark_and_a_witness_stand_beside_the_element(tmp_path, design, kind, monkeypatch):
-    # Without a printer there is no reach. 6.4 µm hold an F of 0.8 µm strokes and a witness of 1.2 µm.
+    # Without a printer, the reach is zero. In 6.4 µm, an F with 0.8 µm strokes and a witness of 1.2 µm fit.
     monkeypatch.setattr(marks, "_STROKE_UM", 0.8)
     monkeypatch.setattr(marks, "_FLAT_UM", 1.2)
     file = export_design(design, kind, tmp_path, marks=True)
@@ -400,11 +400,11 @@ def test_marks_keep_a_distance_of_the_reach_of_the_printer():
     levels = np.zeros((512, 512), np.uint8)
     canvas, found = marks.with_marks(levels, layout, 5.9, [0.1, 0.8])
     box = {name: np.array(part) for name, part in found.parts().items()}
-    # 5.9 µm are 59 px, rounded to 60 on whole cells: the distance to the element, and from the F to the
-    # witness.
+    # The reach of 5.9 µm is 59 px, or 60 px in whole cells. This is the distance to the element, and from the
+    # F to the witness.
     assert box["ORIENTATION"][2] - 512 == box["WITNESS"][2] - 512 == 60
     assert box["WITNESS"][0] - box["ORIENTATION"][1] >= 60
-    # The middle 4 µm are further than the reach from every edge.
+    # The middle 4 µm are farther than the reach from every edge.
     assert box["WITNESS"][1] - box["WITNESS"][0] >= 2 * 59 + 40
     assert all((edge % 4 == 0).all() for edge in box.values())
     assert canvas.shape[1] == box["WITNESS"][3]
@@ -418,7 +418,7 @@ def test_rectangles_cover_once():
     for mask, top, bottom, left, right in rectangles(masks).tolist():
         cover[mask, top:bottom, left:right] += 1
     assert np.array_equal(cover, masks)
-    # The rectangles are two bars, the stem between them, and two rows of stem below, which are merged.
+    # The rectangles are two bars, the stem between them, and the two rows of stem below, which are merged.
     assert len(rectangles(masks[:1])) == 4
 
 
@@ -432,7 +432,7 @@ def test_rectangles_cover_once():
     ],
 )
 def test_gwl_writes_the_volume_of_the_layout_voxel_by_voxel(tmp_path, design, job, hatching_um):
-    """Another parser follows the stage and paints every line into voxels of one pixel and one slice."""
+    """Check a GWL file with a parser that follows the stage and paints lines into voxels."""
     asked = {"pedestal_um": 0.3, "hatching_um": hatching_um, "gwl": dict(job)}
     file = export_design(design, "gwl", tmp_path / "out", **asked)
     levels = np.load(design / "layout_level.npy")
@@ -465,8 +465,8 @@ def test_gwl_writes_the_volume_of_the_layout_voxel_by_voxel(tmp_path, design, jo
 
 def test_gwl_refuses_what_it_cannot_write_exactly(tmp_path, design):
     for said, more in (
-        ("slices of a level", {"slicing_um": 0.15}),
-        ("slices of the pedestal", {"pedestal_um": 0.25}),
+        ("slices per level", {"slicing_um": 0.15}),
+        ("slices in the pedestal", {"pedestal_um": 0.25}),
         ("hatching distances", {"hatching_um": 0.07}),
         ("laser power", {"gwl.power_percent": (50.0, 40.0)}),
         ("pedestal_um", {"pedestal_um": 0.0}),
@@ -478,7 +478,7 @@ def test_gwl_refuses_what_it_cannot_write_exactly(tmp_path, design):
 
 
 def test_dxf_has_a_closed_polyline_on_the_layer_of_its_grey(tmp_path):
-    """The test reads pairs of group codes itself: corners, layers, unit, and the sum of areas."""
+    """Check a DXF file with a parser of group codes: corners, layers, unit, and the sum of areas."""
     file = export_design(LETTER * 7, "dxf", tmp_path, pitch_um=0.13)
     words = file.read_text().split()
     pairs = list(zip(words[::2], words[1::2], strict=True))
@@ -498,7 +498,7 @@ def test_dxf_has_a_closed_polyline_on_the_layer_of_its_grey(tmp_path):
             assert len(x) == 4
     assert pairs.count(("70", "1")) == pairs.count(("0", "POLYLINE")) > 0
     assert area == pytest.approx(LETTER.sum() * 0.13**2, abs=1e-6)
-    # The F stands upright: its bar is the highest.
+    # The F is upright, so its bar is at the top.
     assert max(float(word) for code, word in pairs if code == "20") == pytest.approx(5 * 0.13)
 
 
@@ -524,12 +524,12 @@ def test_bare_levels_heights_and_elements_are_exported(tmp_path, kind):
 
 
 def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
-    """The curve is quadratic: height = (grey / 100)^2 / 4 + 0.5 µm."""
+    """Check a quadratic dose curve: height = (grey / 100)^2 / 4 + 0.5 µm."""
     grey = np.arange(0, 256, 5)
     rows = [f"{g},{(g / 100) ** 2 / 4 + 0.5:.9g}" for g in grey]
     (tmp_path / "curve.csv").write_text("grey,height_um\n" + "\n".join(rows))
     file = export_design(LETTER * 12, "bmp", tmp_path / "out", dose_curve=tmp_path / "curve.csv")
-    # 1.2 µm above the height of grey 0: 100 sqrt(4.8) = 219.1.
+    # The grey whose height is 1.2 µm above that of grey 0 is 100 sqrt(4.8) = 219.1.
     assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).max() == 219
     levels, sidecar = import_levels(file)
     assert np.array_equal(levels, LETTER * 12)
@@ -538,7 +538,7 @@ def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
     linear = import_levels(export_design(LETTER * 12, "png16", tmp_path / "png"))[1]
     assert linear.white_height_um == pytest.approx(65535 / (65535 // 12) * 0.1)
     (tmp_path / "curve.csv").write_text("grey,height_um\n0,0\n255,1.0\n")
-    with pytest.raises(InputError, match=r"dose curve, got 1 µm for levels up to 1\.2 µm"):
+    with pytest.raises(InputError, match=r"dose curve, got 1 µm of heights for 1\.2 µm of levels"):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "curve.csv")
     with pytest.raises(InputError, match="rising columns"):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "none.csv")
@@ -553,7 +553,7 @@ def test_distance_to_the_training_levels():
     assert not same.flagged
     middle = out_of_distribution(levels, layout, {"training_level_share": [0, 0.5, 0.5, 0]})
     assert middle is not None
-    # Half of the pixels sit on levels that training never showed.
+    # Half of the pixels have levels that do not occur in training.
     assert middle.level_distance == pytest.approx(0.5)
     assert middle.extreme_level_share == pytest.approx(0.5)
     assert out_of_distribution(levels, layout, {}) is None

@@ -1,4 +1,4 @@
-"""The virtual fab as a judge prints the layout exactly as a run of the fab does."""
+"""Check that the virtual fab as a judge prints a layout exactly as a run of the fab does."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ def printed_um(truth, level: np.ndarray) -> np.ndarray:
 
 
 def test_a_fab_judge_prints_what_the_fab_prints(tmp_path):
-    # With level 0 along its edge a layout continues into nothing, as the fab's own frame does.
+    # The layout has level 0 along its edge, so it continues into substrate like the fab's own frame.
     level = bordered_layout()
     board = KnobBoard([KnobSetting.parse(knob) for knob in KNOBS], 3)
     fab = Fab(FabPrinter(), Microscope.aligned(), Noise.off(), board, 3)
     expected = scan_job(fab, Job(id="A", level=level)).clean_um
-    # One rounding to float32 of heights below 2 µm: half of 2^-23 · 2.
+    # Heights below 2 µm are rounded once to float32, by half of 2^-23 · 2.
     assert np.abs(printed_um(truth_folder(tmp_path / "fab"), level) - expected).max() < 1.3e-7
 
 
 def test_an_element_stands_alone_on_the_substrate(tmp_path):
     full = np.full((64, 64), 12, np.uint8)
     height = printed_um(truth_folder(tmp_path / "fab", knobs=()), full)
-    # If the edge level continued outwards, the print would be flat.
+    # If the edge level were continued outwards, the print would be flat.
     assert height[32, 32] - height[0, 32] > 0.2
 
 
@@ -62,7 +62,7 @@ def test_roughness_is_the_default_noise_and_the_same_for_every_layout(tmp_path):
     flat, other = np.full((64, 64), 6, np.uint8), bordered_layout()
     difference = printed_um(rough, flat) - printed_um(smooth, flat)
     assert np.allclose(difference, printed_um(rough, other) - printed_um(smooth, other), atol=1e-6)
-    # The rms is 15.9 nm over an infinite field. 6.4 µm hold few independent patches of its slow part (µm).
+    # The rms over an infinite field is 15.9 nm. A field of 6.4 µm has few patches of its slow part.
     assert difference.std() == pytest.approx(0.0159, rel=0.35)
 
 

@@ -1,4 +1,4 @@
-"""Test the penalty on layouts unlike those of training, and the cost of staying like them."""
+"""Test the penalty on layouts that are unlike the training layouts, and its effect on a search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_tails_beyond_the_training_layouts_pull_inwards():
     card = {"training_level_share": np.eye(13)[5].tolist(), "training_step_share": [0.9, 0.1]}
     level = torch.full((1, 1, 16, 16), 11.0, requires_grad=True)
     found = outside(level, 13, card)
-    # All pixels lie six levels above the only level of training, without steps.
+    # All pixels are six levels above the only level of training, and there are no steps.
     assert float(found.detach()) == pytest.approx(6, rel=1e-5)
     found.backward()
     assert (level.grad > 0).all()
@@ -32,8 +32,8 @@ def test_tails_beyond_the_training_layouts_pull_inwards():
     assert float(found.detach()) == pytest.approx(3, rel=1e-5)
     found.backward()
     assert (level.grad < 0).all()
-    # All columns differ by steps of two, half of the pairs. The excess is 0.5 - 0.2 at one level and 0.5 at
-    # two.
+    # All columns differ by two levels, which is half of the pairs. The excess is 0.5 - 0.2 for steps of one
+    # level and 0.5 for steps of two.
     stripes = torch.tensor([5.0, 7.0]).repeat(8).expand(1, 1, 16, 16)
     only_steps = {"training_step_share": [0.9, 0.1]}
     assert float(outside(stripes, 13, only_steps)) == pytest.approx(0.8, rel=1e-5)
@@ -45,8 +45,8 @@ def test_unusual_levels_and_steps_are_reported():
     card = {"training_level_share": np.eye(13)[4:7].mean(0).tolist(), "training_step_share": [0.9, 0.1]}
     levels = np.tile(np.repeat([0, 5], 8), (16, 1)).astype(np.uint8)
     found = out_of_distribution(levels, LAYOUT, card)
-    # Half of the pixels are at level 5, in training a third, which is not twice as many. One step of 5 in 15
-    # lies along x.
+    # Half of the pixels are at level 5, which is less than twice the third in training. Along x, one of 15
+    # steps is 5 levels high.
     assert found.unusual == [
         "level 0: 50 % of the pixels, 0 % in the training layouts",
         "steps of 5 levels: 3.3 % of the neighbouring pixels, 0 % in the training layouts",

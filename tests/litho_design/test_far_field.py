@@ -1,4 +1,4 @@
-"""Test the far field, and light that is not an even plane wave, against closed forms."""
+"""Test the far field, and light other than a uniform plane wave, against closed forms."""
 
 from __future__ import annotations
 
@@ -23,19 +23,18 @@ FAR = Optics(distance_um=100.0, propagation="far-field")
 
 
 def test_orders_of_a_blaze_have_the_power_of_the_formula():
-    """Periods are whole pixels and the window holds whole diffraction orders, so each order is one pixel."""
+    """Check a blaze whose diffraction orders are single pixels of the image."""
     size, period, levels = 96, 8, 8
     grid = centred_grid((size, size), 0.2)
     height = (torch.arange(size) % period * (FAR.wave_height_um / levels)).repeat(size, 1)
-    # One pixel of the image is one step of the discrete transform: lambda f / (N pitch).
+    # A pixel of the image is a step of the discrete transform, lambda f / (N pitch).
     step_um = FAR.wavelength_um * FAR.distance_um / (size * 0.2)
     odd = centred_grid((size - 1, size - 1), step_um)
     wave = make_propagator(grid, odd, FAR)(element_field(height, grid, FAR))
     power = intensity_share(wave, odd)
     first = power[size // 2 - 1, size // 2 - 1 + size // period]
     assert float(first) == pytest.approx(blaze_efficiency(levels, 1.0), rel=1e-4)
-    # With eight steps per wave the other orders lie 8 orders away, so the rest of the light misses the
-    # window.
+    # With eight steps per wave, the next orders are 8 orders away, so the other light misses the window.
     assert float(power.sum() - first) < 1e-5
 
 
@@ -53,7 +52,7 @@ def test_the_adjoint_and_the_largest_angle():
 
 
 def test_a_gaussian_beam_and_a_near_point():
-    """A beam of radius w has a spot of radius lambda f / (pi w); light of a point d away focuses nowhere."""
+    """Check that a beam of radius w has a spot of radius lambda f / (pi w), and the phase of a near point."""
     size, beam_um = 128, 4.0
     grid = centred_grid((size, size), 0.2)
     optics = FAR.model_copy(update={"beam_um": beam_um})
@@ -64,13 +63,13 @@ def test_a_gaussian_beam_and_a_near_point():
     spot_um = optics.wavelength_um * optics.distance_um / (math.pi * beam_um)
     along = seen[50] / seen[50, 50]
     wanted = torch.exp(-2 * torch.from_numpy(window.x_um) ** 2 / spot_um**2)
-    # What lies beyond 12.8 µm of a beam of 4: exp(-(12.8 / 4)^2) = 4e-5 in amplitude.
+    # At 12.8 µm, where the field ends, a beam of 4 µm has an amplitude of exp(-(12.8 / 4)^2) = 4e-5.
     assert (along - wanted).abs().max() < 1e-3
     near = element_field(torch.zeros(size, size), grid, Optics(source_distance_um=50.0))
     x = torch.from_numpy(grid.x_um)
     phase = 2 * math.pi / 0.6328 * (torch.hypot(x, torch.tensor(float(grid.y_um[64]))) ** 2 / 100.0)
     turned = near[64] * torch.polar(torch.ones_like(phase), -phase)
-    # Paraxial: r^4 / (8 d^3) = 0.03 µm at 12.8 µm, 0.27 rad.
+    # The paraxial error is r^4 / (8 d^3) = 0.03 µm at 12.8 µm, or 0.27 rad.
     assert turned.angle().sub(turned[64].angle()).abs().max() < 0.4
 
 

@@ -1,4 +1,4 @@
-"""The first result judges both designs alike and warns where diffraction blurs the target."""
+"""Check that the first result judges both designs alike, and warns if diffraction blurs the target."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_pa
         shown = pd.read_csv(tmp_path / table).set_index("designed with")
         for one in (one for one in result.summary if one.figure == figure):
             assert shown.loc[one.arm, f"printed by {one.judge}"] == pytest.approx(one.judged_mean, abs=6e-4)
-    # The judge is the model that took no part. The page comments on chance.
+    # The judge is a model that was not used in the designs. The page says what may be chance.
     assert "Printed by physics, layouts designed with" in page
-    assert "1 seed cannot tell that from chance" in page
+    assert "1 seed cannot tell this difference from chance" in page
     for arm in ("none", "pbl"):
         place = f"designs/{arm}/seed0/report.html"
         assert f'href="{place}"' in page
@@ -58,7 +58,7 @@ def test_the_width_of_strokes_is_found(width):
 
 
 def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path, capsys):
-    """Compare strokes with wavelength x distance / side: the first result must be resolvable."""
+    """Check that the strokes of the first result are wider than wavelength x distance / side."""
     settings = small_hologram()
     finest_um = settings.optics.wavelength_um * settings.optics.distance_um / settings.layout.size_um
     assert stroke_width_px(load_target("text", settings.layout.size_px).pixels) * 0.1 > 1.2 * finest_um
@@ -68,12 +68,13 @@ def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path,
     capsys.readouterr()
     far = hologram_settings(changes=TINY | {"optics.distance_um": 40})
     design = design_hologram(square, "none", tmp_path / "far", settings=far)
-    # 0.6328 µm x 40 µm / 6.4 µm = 3.955 µm, against a square of 1.2 µm.
+    # The finest detail is 0.6328 µm x 40 µm / 6.4 µm = 3.955 µm, but the square is 1.2 µm wide.
     said = capsys.readouterr().err.splitlines()[0]
-    assert "about 1.2 µm wide, narrower than λz/D = 4 µm" in said
+    assert "about 1.2 µm wide, but the finest detail" in said
+    assert "λz/D = 4 µm" in said
     assert "--distance-um 12 or less" in said
     assert said == design.notes[0]
-    assert "narrower than λz/D" in (tmp_path / "far" / "report.html").read_text("utf-8")
+    assert "the finest detail" in (tmp_path / "far" / "report.html").read_text("utf-8")
 
 
 def test_holograms_start_from_gerchberg_saxton_except_as_published():
@@ -86,7 +87,7 @@ def test_for_a_folder_of_another_design_the_message_names_the_difference(tmp_pat
     design_hologram("ring", "none", tmp_path, settings=made, announce=False)
     again = design_hologram("ring", "none", tmp_path, settings=made, announce=False)
     assert again.settings == made.model_dump(mode="json")
-    with pytest.raises(InputError, match=r"search\.start = 'random', but now 'gs' is asked for"):
+    with pytest.raises(InputError, match=r"search\.start = 'random', but now 'gs' is requested"):
         design_hologram("ring", "none", tmp_path, settings=hologram_settings(changes=TINY), announce=False)
     with pytest.raises(InputError, match=r"target\.name = 'ring', but now 'chart'"):
         design_hologram("chart", "none", tmp_path, settings=made, announce=False)

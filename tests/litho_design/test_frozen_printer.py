@@ -1,4 +1,4 @@
-"""Designing through a frozen model on disk, and the command line around it."""
+"""Test designs with a frozen model on disk, and the command line for them."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigm
             parameter.add_(0.1)
     layout = LayoutSettings(size_px=32)
     printer = load_printer(str(save_frozen(simulator, tmp_path / "mtf")), layout)
-    # The guard ring equals the reach, 12, 26 and 33 px, whatever the rounding of a quotient by a pitch of
+    # The guard ring equals the reach (12, 26 and 33 px), whatever the rounding of a division by a pitch of
     # 0.1.
     assert printer.guard_px == simulator.reach_px
     level = torch.randint(0, 13, (1, 1, 32, 32), generator=torch.Generator().manual_seed(0)).float()
@@ -77,7 +77,7 @@ def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigm
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        # The message is the same in `score`, which has no such option.
+        # The message is the same in `score`, which does not have this option.
         (
             {"pitch_um": 0.2, "cell_um": 0.4},
             r"pitch_um of the layout, .*; design with --pitch-um 0\.1, or take a model of 0\.2 µm$",
@@ -122,12 +122,12 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
 
     design = tmp_path / "design"
     output = call("hoe", "--model", affine_folder, "--target", "ring", "--out", design, *SMALL)
-    assert "judged by its own model" in output
+    assert "predicted by the model of the design" in output
     record = Design.read(design)
     assert record.printer.name == "affine"
     # Compare the model on disk before and after.
     assert record.printer.sha256 == load_printer(str(affine_folder), record.layout).weights_sha256()
-    # The card of this model names no training levels, so its extrapolation is unknown.
+    # The card of this model does not state its training levels, so extrapolation is unknown.
     assert "extrapolation" not in stroke_advice(record)
     assert "the card of the model affine does not describe" in distribution_warning(record)
     seen = OutOfDistribution(
@@ -140,7 +140,7 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert distribution_warning(usual) == ""
     levels = np.load(design / "layout_level.npy")
     assert levels.shape == (128, 128)
-    # Layout, print and images; the search; the yield.
+    # The three figures show layout, print and images; the search; and the yield.
     assert (design / "report.html").read_text("utf-8").count("data:image/svg+xml;base64,") == 3
     call("score", design, "--judge", "none", "--judge", f"twin={affine_folder}", "--out", tmp_path / "score")
     judged = json.loads((tmp_path / "score" / "score.json").read_text())
@@ -166,7 +166,7 @@ def test_printers_are_given_by_name_or_as_objects(make_printer):
 
 
 def test_a_score_without_a_judge_uses_the_available_models(tmp_path, monkeypatch):
-    """The score also states how far the models disagree: as stated, in the median and at worst."""
+    """Check that a score without a judge uses the available models and states how far they disagree."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
     spreads = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um")
     steady = {f"window.{one}": 0.0 for one in spreads}
@@ -193,22 +193,22 @@ def test_a_score_without_a_judge_uses_the_available_models(tmp_path, monkeypatch
         stated_nm = [1000 * one.mean_height_difference_um, 1000 * one.rms_height_difference_um]
         assert heights.loc[one.judge.name].tolist() == pytest.approx(stated_nm)
     page = (tmp_path / "score" / "report.html").read_text("utf-8")
-    assert f"{np.median(values):.3g} in the median, {min(values):.3g} at worst" in page
+    assert f"{np.median(values):.3g} as the median, and {min(values):.3g} at worst" in page
     said = spread_sentence("si_psnr_db", {"own": 20.0, "other": 18.0, "third": 18.5}, False, 1.5)
-    assert "18.5 in the median, 18 at worst, by other. They disagree by 2 dB, more than the 1.5" in said
+    assert "18.5 as the median, and 18 at worst (by other). The models disagree by 2 dB, more than" in said
     assert "disagree" not in spread_sentence("rms_nm", {"own": 4.0, "other": 6.0}, True, 3.0)
     alone = design_hologram("ring", "none", tmp_path / "none", settings=settings, **known)
     assert alone.printer.dataset_sha256 == ""
-    with pytest.raises(InputError, match="nothing to judge with"):
+    with pytest.raises(InputError, match="got no judge"):
         score(tmp_path / "none", tmp_path / "empty")
-    # Models of another printer are excluded by their cards, before any weights are read.
+    # Models of another printer are excluded by their cards before their weights are read.
     foreign = design.printer.model_copy(update={"dataset_sha256": 64 * "f"})
     monkeypatch.setattr("litho_design.printers.source.load_printer", None)
     assert models_at_hand([foreign], settings.layout) == []
 
 
 def require_figures_of_a_design(folder, design):
-    """Check the tables beside the scores: models, levels, draws, and distance from the training layouts."""
+    """Check the tables of a design: models, levels, draws, and the distance from the training layouts."""
     tables = {name: pd.read_csv(folder / f"{name}.csv") for name in ("width", "levels", "window", "distance")}
     named = tables["width"].set_index(["layout", "printed by"])
     wanted = {(name, by): own for name, of in design.width.figures.items() for by, own in of.items()}
@@ -220,7 +220,7 @@ def require_figures_of_a_design(folder, design):
     assert tables["distance"].loc[0, [*distance]].to_dict() == pytest.approx(distance)
     extreme = np.isin(np.load(folder / "layout_level.npy"), (0, design.layout.levels - 1))
     assert distance["extreme_level_share"] == pytest.approx(extreme.mean())
-    # Without variation the print equals the modelled one, and its loss is that of the search.
+    # Without variation, each print equals the modelled one, and its loss is that of the search.
     wanted = {"loss": design.polished_loss, **design.predicted}
     assert len(tables["window"]) == 2
     for draw in tables["window"].to_dict("records"):
@@ -256,7 +256,7 @@ def test_a_model_of_another_pitch_designs_at_its_own_pitch(tmp_path, monkeypatch
     layout = Design.read(tmp_path / "d").layout
     assert (layout.pitch_um, layout.size_um) == (0.2, pytest.approx(19.2))
     levels = np.load(tmp_path / "d" / "layout_level.npy")
-    # A hologram's free cell of 0.4 µm is two of these pixels wide. A lens keeps its symmetry.
+    # The free cells of a hologram, 0.4 µm, are two of these pixels wide. A lens keeps its symmetry.
     same = (levels[::2, ::2], levels[1::2, 1::2]) if task[0] == "hoe" else (levels, levels[::-1].T)
     assert np.array_equal(*same)
 
@@ -302,7 +302,7 @@ def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tm
     told = "40 x 90 px centred on a black square; resampled from 90 to 128 px"
     assert told in capsys.readouterr().err
     assert Design.read(tmp_path / "d").notes == [f"target {told}"]
-    # The picture keeps its proportions: 90 px become 128, 50 px of light become 71.
+    # The picture keeps its proportions: 90 px become 128, and 50 px of light become 71.
     lit = np.load(tmp_path / "d" / "target.npy") > 0.5
     assert abs(lit.any(0).sum() - 50 * 128 / 90) <= 1
     assert abs(lit.any(1).sum() - 20 * 128 / 90) <= 1
@@ -324,9 +324,15 @@ def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tm
         (("compare", "--models", "none", *SMALL[:2], "--seeds", "0", "--out", "out"), "at least one"),
         (("hoe", "--model", "none", "--target", "black.png", "--out", "out"), "without any light"),
         (("hoe", "--model", "none", "--target", "nan.tif", "--out", "out"), "not numbers"),
-        (("hoe", "--model", "coarse", "--out", "out"), "got 0.1 µm, wanted 0.2 µm, as the model was"),
-        (("hoe", "--model", "affine", "--levels", "16", "--out", "out"), "what the model was calibrated for"),
-        (("hoe", "--model", "affine", "--level-height-um", "0.13", "--out", "out"), "as the model was"),
+        (("hoe", "--model", "coarse", "--out", "out"), "got 0.1 µm, wanted 0.2 µm, with which"),
+        (
+            ("hoe", "--model", "affine", "--levels", "16", "--out", "out"),
+            "up to which the model was calibrated",
+        ),
+        (
+            ("hoe", "--model", "affine", "--level-height-um", "0.13", "--out", "out"),
+            "with which the model was",
+        ),
         (("hoe", "--model", "none", "--start", "fresnel", "--size-px", "64", "--out", "out"), "'fresnel'"),
         (("hoe", "--model", "none", "--risk-tail", "0", "--out", "out"), "tail"),
         (("hoe", "--model", "none", "--spread-of", "no.zarr", "--out", "out"), "no.zarr"),

@@ -1,4 +1,4 @@
-"""Test the large comparison: equal budgets, reuse of finished designs, and its statements about the fab."""
+"""Test the large comparison: equal budgets, reuse of finished designs, and its tables and conclusions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TINY = Effort.small(64)
 @pytest.mark.parametrize("name", PRINT_KNOBS)
 def test_every_hidden_effect_has_an_rms_of_ten_nanometres(name):
     rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0))
-    # Strengths are stated with three digits and were searched to 1 %.
+    # Strengths were searched to 1 % and are stated with three digits.
     assert rms == pytest.approx(10.0, rel=0.02)
 
 
@@ -152,7 +152,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     }  # fmt: skip
     text = as_markdown(record)
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
-    # The scores are 6 and 4 dB below the ceiling, so the error is 10^(6/20) and 10^(4/20) times as large.
+    # The scores are 6 and 4 dB below the ceiling, so errors are 10^(6/20) and 10^(4/20) times as large.
     assert "| 100 % |" in text
     assert "| 58 % |" in text
     assert "those designed with pbl have the best" in text

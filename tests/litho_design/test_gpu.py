@@ -1,4 +1,4 @@
-"""A GPU and the processor give the same waves, designs and scores."""
+"""Check that a GPU gives the same waves, designs and scores as the processor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_design.workflows.score import score as score_design
 from tests.litho_design import large_rank
 
 GPU = "cuda"
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="this machine has no GPU")
 
 GRID = centred_grid((32, 32), 0.1)
 TARGETS = {
@@ -86,8 +86,8 @@ def test_a_hologram_is_designed_and_scores_the_same(
     )
     assert design.run.device.startswith(GPU)
     assert design.polished_loss < design.start_loss
-    # Convolutions on a GPU may round their factors to 10 bits. Heights may differ by a nanometre, figures by
-    # a per cent.
+    # Convolutions on a GPU may round their factors to 10 bits. Heights may differ by a nanometre, and scores
+    # by one per cent.
     (score,) = score_design(tmp_path / "d", tmp_path / "s", judges=[make_printer(settings.layout)]).scores
     assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)
 

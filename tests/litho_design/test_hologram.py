@@ -1,4 +1,4 @@
-"""Test the way from levels to a scored image: gradients, normalisation, scores against independent code."""
+"""Test the steps from levels to a scored image: gradients, normalisation, and scores by other code."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_gradient_from_mask_through_print_and_field_to_loss(make_printer):
 
 @pytest.mark.parametrize("scale", ["paper", "least-squares"])
 def test_half_the_light_halves_the_efficiency_term(scale):
-    # The published loss divides by the efficiency twice. Here half the light must count half.
+    # The published loss divides by the efficiency twice. Here, half the light must count half.
     target = torch.zeros(8, 8).double()
     target[2:4, 2:4] = 1
     share = torch.rand(8, 8).double() / 64
@@ -77,7 +77,7 @@ def test_scores_of_a_perfect_image():
     score = hologram_score([(1.0, field)], field, target, grid, Optics())
     assert score.eff_window == pytest.approx(1, rel=1e-12)
     assert score.ssim == pytest.approx(1, abs=1e-6)
-    assert score.rmse_paper < 0.1  # I_avg weights by T: exact only for a binary target
+    assert score.rmse_paper < 0.1  # I_avg is weighted by T, so it is exact only for a binary target
     assert score.si_psnr_db > 100
     assert score.uniformity > 0.3
 
@@ -88,10 +88,9 @@ def test_fully_developed_speckle_has_unit_contrast():
     speckle = torch.randn(256, 256, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
     grid = centred_grid((256, 256), 0.1)
     score = hologram_score([(1.0, speckle)], speckle, target, grid, Optics())
-    # There are 32768 independent samples of an exponential distribution: the sd of the contrast is about
-    # 0.006.
+    # With 32768 independent samples of an exponential distribution, the contrast has an sd of about 0.006.
     assert score.speckle_contrast == pytest.approx(1, abs=0.03)
-    # For a target without greys both figures select the same half of the light.
+    # For a target without greys, both efficiencies select the same half of the light.
     assert score.eff_paper == score.eff_signal == pytest.approx(score.eff_window / 2, rel=0.03)
 
 
@@ -100,9 +99,9 @@ def test_the_light_of_four_pixels():
     wanted = {
         "eff_signal": 4.0,
         "eff_window": 4.5,
-        # Each of the four values is 1 from their mean of 2.
+        # Each of the lit pixels differs by 1 from the mean of 2.
         "speckle_contrast": 0.5,
-        # The range is 1.1 to 2.9, a twentieth from either end.
+        # The 5 % and 95 % quantiles are 1.1 and 2.9.
         "uniformity": 1 - 1.8 / 4,
         "background_ratio": 8.0,
     }
@@ -124,7 +123,7 @@ def test_psnr_equals_scikit_image(kind):
     target, seen = torch.from_numpy(image), torch.from_numpy(other)
     scaled = (matched_scale(seen, target) * seen).numpy()
     reference = peak_signal_noise_ratio(image, scaled, data_range=1.0) if image.any() else 300.0
-    # The scale 0 meets a dark target exactly. The floor of the error, 1e-30, is 300 dB.
+    # For a dark target, a scale of 0 gives no error. The floor of the error, 1e-30, is 300 dB.
     assert si_psnr_db(seen, target) == pytest.approx(reference, abs=1e-6)
     figures = similarity(seen, target, "seen")
     assert figures["psnr_seen_db"] == pytest.approx(
@@ -157,8 +156,7 @@ def test_ssim_equals_torchmetrics(kind):
             data_range=1.0,
             return_full_image=True,
         )
-        # The mean of the reference includes windows that reach into reflected padding. The definition does
-        # not.
+        # The reference averages over windows that include reflected padding, but the definition does not.
         edge = SSIM_WINDOW_PX // 2
         reference = float(similarity[..., edge:-edge, edge:-edge].mean())
         assert ssim(*pair) == pytest.approx(reference, abs=1e-4)
@@ -169,7 +167,7 @@ def test_an_aperture_passes_what_is_inside_it_and_nothing_else():
     grid = centred_grid((200, 200), 0.1)
     x = torch.from_numpy(grid.x_um)
     for angle_sine, passed in ((0.2, 1.0), (0.45, 0.0)):
-        # The cosine has whole half periods in the window, so it fits the mirrored window.
+        # The window contains whole half periods of the cosine, so it can be continued by mirroring.
         half_periods = round(2 * 20.0 * angle_sine / WAVELENGTH_UM)
         wave = (
             torch.cos(math.pi * half_periods * (x - x[0] + 0.05) / 20.0).expand(200, 200).to(torch.complex128)
@@ -197,8 +195,8 @@ def test_what_a_flat_plate_shows_is_made_by_a_flat_plate():
         phase, _ = gerchberg_saxton(
             bench.propagator, seen / seen.max(), CellMap(layout), iterations=40, weighted=weighted, seed=1
         )
-        # |mean exp(j phase)| is 1 for a flat plate, sin(1) / 1 = 0.84 for the first phase, which lies within
-        # 1 rad of its mean, and 1 / sqrt(cells) = 0.04 for phases of the whole circle.
+        # |mean exp(j phase)| is 1 for a flat plate, sin(1) / 1 = 0.84 for the first phase, which is within
+        # 1 rad of its mean, and 1 / sqrt(cells) = 0.04 for random phases on the whole circle.
         assert float(torch.polar(torch.ones_like(phase), phase).mean().abs()) > 0.9
 
 
@@ -226,5 +224,5 @@ def test_fresnel_start_focuses_to_the_diffraction_limit():
     height = phase * optics.wave_height_um / (2 * math.pi)
     intensity = propagate(element_field(height, grid, optics)).abs().square()[0]
     assert int(intensity.argmax()) == 20
-    # Square aperture of area A: peak A / (wavelength f)^2 per incident power; paraxial to 1.5 % at a/f = 0.1.
+    # A square aperture of area A has a peak of A / (wavelength f)^2 per power, to 1.5 % at a/f = 0.1.
     assert float(intensity[20]) == pytest.approx(400 / (WAVELENGTH_UM * 100) ** 2, rel=0.02)

@@ -20,7 +20,7 @@ def gaussian_psf(size, sigma, energy=1.0, shift=(0.0, 0.0)):
     return psf * (energy / psf.sum())
 
 
-# The last is wider than twice the frame, so that its rim meets nothing.
+# The last PSF is more than twice as wide as the frame, so that its rim never overlaps the image.
 @pytest.mark.parametrize(("rows", "columns"), [(7, 9), (19, 27), (43, 61)])
 def test_blur_is_a_linear_convolution_and_its_transpose(rows, columns):
     generator = torch.Generator().manual_seed(0)
@@ -29,7 +29,7 @@ def test_blur_is_a_linear_convolution_and_its_transpose(rows, columns):
     blur = Blur(psf, (20, 25))
     expected = convolve2d(image.numpy(), psf.numpy(), mode="full")
     expected = expected[rows // 2 :, columns // 2 :][:20, :25]
-    # Sums of up to 500 products below one, in double precision.
+    # The sums have up to 500 products below one, in double precision.
     assert np.abs(blur.forward(image).numpy() - expected).max() < 1e-11
     left, right = (blur.forward(image) * other).sum(), (image * blur.transpose(other)).sum()
     assert float(left) == pytest.approx(float(right), rel=1e-12)
@@ -49,12 +49,12 @@ def test_richardson_lucy_finds_the_object_for_any_psf_energy(energy, size):
     psf = gaussian_psf(9, 0.9, energy)
     seen = Blur(psf, (size, size)).forward(wanted)
     estimate = richardson_lucy(seen, psf, iterations=2000)
-    # Every step conserves flux, so a wrong global factor of the energy is noticed at once.
+    # Every step conserves flux, so a wrong factor of the energy is noticed at once.
     assert float(Blur(psf, (size, size)).forward(estimate).sum()) == pytest.approx(
         float(seen.sum()), rel=1e-4
     )
     assert float(estimate.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
-    # After 2000 steps the error is a thousandth of the brightest pixel, whatever the energy.
+    # After 2000 steps, the error is a few thousandths of the brightest pixel, whatever the energy.
     assert float((estimate - wanted).abs().max()) < 0.01
     rows = torch.arange(size).double()
     for axis in (0, 1):
@@ -71,7 +71,7 @@ def test_richardson_lucy_equals_scikit_image_away_from_the_border():
     seen = Blur(psf, (64, 64)).forward(torch.from_numpy(wanted)) + 1e-3
     ours = richardson_lucy(seen, psf, iterations=10)
     theirs = reference(seen.numpy(), psf.numpy(), num_iter=10, clip=False)
-    # The effect of different flat starts decays. The reference ignores H^T 1, which is 1 only inside.
+    # The effect of the different flat starts decays. The reference ignores H^T 1, which is 1 only inside.
     middle = slice(20, 44)
     assert np.abs(ours.numpy() - theirs)[middle, middle].max() < 0.05 * theirs.max()
 
@@ -88,5 +88,5 @@ def test_gradient_through_the_reconstruction_kept_and_computed_again(monkeypatch
     (kept,) = torch.autograd.grad(error(psf), psf)
     monkeypatch.setattr(imaging, "_MOST_KEPT_BYTES", 0)
     (again,) = torch.autograd.grad(error(psf), psf)
-    # The same operations in the same order.
+    # Both use the same operations in the same order.
     assert torch.equal(again, kept)

@@ -1,4 +1,4 @@
-"""Bands of rows give the result of one piece for large elements, on any number of processes."""
+"""Check that large elements give the same result in bands, on any number of processes, as in one piece."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.litho_design.large_rank import BAND, SIZE
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> Path:
-    """Return the folder of a run in one process."""
+    """Run the work in a single process and return its folder."""
     folder = tmp_path_factory.mktemp("one")
     large_rank.work(folder, Ranks())
     return folder
@@ -46,8 +46,8 @@ def alone(tmp_path_factory) -> Path:
     ("size", "distance_um", "pitch_um", "kind"),
     [
         (97, 30.0, 0.1, "rayleigh-sommerfeld"),
-        (96, 100.0, 0.5, "angular-spectrum"),  # a period longer than the element
-        (96, 1e4, 4.0, "angular-spectrum"),  # its own period
+        (96, 100.0, 0.5, "angular-spectrum"),  # with a period longer than the element
+        (96, 1e4, 4.0, "angular-spectrum"),  # with the element as its period
     ],
 )
 def test_propagation_in_bands_is_that_of_the_whole(size, distance_um, pitch_um, kind):
@@ -56,7 +56,7 @@ def test_propagation_in_bands_is_that_of_the_whole(size, distance_um, pitch_um, 
     whole, banded = make_propagator(grid, grid, optics), BandedPropagator(pitch_um, optics, Bands(size, 40))
     draw = torch.Generator().manual_seed(0)
     field, other = (torch.randn(size, size, dtype=torch.complex64, generator=draw) for _ in range(2))
-    # Rounding of a float32 transform: a few 6e-8 times the root of log2(192**2), of the largest amplitude.
+    # A float32 transform has rounding errors of a few 6e-8 · sqrt(log2(192**2)) of the largest amplitude.
     for one, two in ((whole(field), banded(field)), (whole.adjoint(field), banded.adjoint(field))):
         assert (one - two).abs().max() < 1e-6 * one.abs().max()
     field.requires_grad_()
@@ -77,7 +77,7 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
         found.append((loss.detach(), torch.autograd.grad(loss, level)[0]))
     (loss, slope), (banded_loss, banded_slope) = found
     assert banded_loss == pytest.approx(float(loss), rel=1e-6)
-    # Rounding of the transforms to float32, as above.
+    # The transforms have float32 rounding errors, as above.
     assert (slope - banded_slope).abs().max() < 1e-6 * slope.abs().max()
 
 
@@ -105,7 +105,7 @@ def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
         for name in ("field", "back", "gradient"):
             joined = np.concatenate([part[name] for part in parts])
             assert np.abs(joined - wanted[name]).max() <= 1e-6 * np.abs(wanted[name]).max(), name
-        # The sum over the pixels is in double precision. Only its terms are rounded to float32.
+        # The sum over pixels is in double precision. Only its terms are rounded to float32.
         assert [float(part["loss"]) for part in parts] == pytest.approx(
             [float(wanted["loss"])] * count, rel=1e-9
         )
@@ -146,10 +146,10 @@ def test_a_score_in_bands_is_that_of_the_whole(alone, tmp_path):
     (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
     assert len(streamed.figures) == 10
     for name, value in streamed.figures.items():
-        # The waves differ by rounding, 1e-6 of the largest amplitude. The figures are sums of their squares.
+        # The waves differ by rounding, 1e-6 of the largest amplitude. The scores are sums of their squares.
         assert value == pytest.approx(whole.figures[name], rel=1e-4, abs=1e-7), name
     assert streamed.rms_height_difference_um == pytest.approx(whole.rms_height_difference_um, abs=1e-7)
-    # The record of the design has the same figures, except for the zero order.
+    # The record of the design has the same scores, except for the zero order.
     predicted = Design.read(design).predicted
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
@@ -182,13 +182,13 @@ def test_a_lens_in_rings_equals_the_lens_of_the_plane(tmp_path):
     free = 12 * torch.rand(plane.cells.cells, generator=torch.Generator().manual_seed(0))
     radius = rings.cells(free[: rings.cells.cells[0]])[None, None]
     printed = rings.search_print(radius, printer)
-    # Beyond the aperture the plane has corners, which affect the print over 8 px. 1e-5 µm is rounding.
+    # Outside the aperture, the plane has corners, which affect the print over 8 px. 1e-5 µm is rounding.
     assert (printed - plane.printed_rings(plane.cells(free)[None, None], printer))[:-8].abs().max() < 1e-5
     found, whole = (
         (one.objective(two)[0], one.score(one.bench.ideal_height_um()))
         for one, two in ((rings, radius), (plane, plane.cells(free)[None, None]))
     )
-    # A circle of square pixels is compared with true rings: one edge pixel in 128, twice, in power.
+    # A circle of square pixels is compared with true rings: one edge pixel in 128, twice that in power.
     assert found[1].focusing_efficiency == pytest.approx(whole[1].focusing_efficiency, rel=1 / 64)
     assert found[1].fwhm_um == pytest.approx(whole[1].fwhm_um, rel=1 / 64)
     design = design_lens(printer, tmp_path, settings=settings, tile_px=48, announce=False)
@@ -198,13 +198,13 @@ def test_a_lens_in_rings_equals_the_lens_of_the_plane(tmp_path):
     again = rings.score(rings.printed_um(torch.from_numpy(level))).model_dump()
     assert design.predicted == pytest.approx(again, rel=1e-6)
     assert 0.2 < design.predicted["strehl"] <= 1
-    # The plane repeats the rings, with the last ring in its corners.
+    # The exported plane consists of the rings, with the last ring extended into its corners.
     cells = CellMap(settings.layout)
     ring = torch.from_numpy(level[:: settings.layout.cell_px])
     whole = cells(torch.cat([ring, ring[-1:].expand(cells.cells[0] - len(ring))])).numpy()
     for kind in ("tiff", "gds", "png16"):
         np.testing.assert_array_equal(import_levels(export(tmp_path, kind, tmp_path / kind))[0], whole)
-    # The model of the design repeats the prediction. Nominal heights lack the losses of the print.
+    # The model of the design gives the prediction again. Nominal heights lack the losses of the print.
     own, nominal = score(tmp_path, tmp_path / "score", judges=[printer, "none"]).scores
     assert own.figures == pytest.approx(design.predicted, rel=1e-6)
     assert own.rms_height_difference_um < 1e-6

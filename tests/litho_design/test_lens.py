@@ -1,4 +1,4 @@
-"""Test lenses: the ring path against the plane path, figures against theory, a whole design."""
+"""Test lenses: rings against the plane, scores against theory, and a whole design."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def settings():
 
 @pytest.mark.parametrize("aperture", ["circle", "square"])
 def test_perfect_lens_reaches_the_diffraction_limit(aperture):
-    # A lens of 30 µm at f = 200 has a/f = 0.075, where the paraxial formulas hold to 1 %.
+    # A lens of 30 µm at f = 200 µm has a/f = 0.075, where the paraxial formulas are right to 1 %.
     bench = LensBench(LAYOUT, Optics(distance_um=200.0), LensView(aperture=aperture, window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
     assert score.strehl == pytest.approx(1, abs=1e-12)
@@ -53,7 +53,7 @@ def test_perfect_lens_reaches_the_diffraction_limit(aperture):
         # The full width at half maximum of an Airy disc is 1.029 lambda f / D.
         assert score.fwhm_um == pytest.approx(1.029 * 0.6328 * 200 / 30, rel=0.01)
     else:
-        # The section of a square's focus is sinc^2 with half width 0.443 lambda f / D.
+        # A section of the focus of a square is sinc^2, with a half width of 0.443 lambda f / D.
         row = psf[127] / psf.max()
         half = 0.443 * 0.6328 * 200 / 30
         position = int((half + 0.05) / 0.1)
@@ -63,8 +63,8 @@ def test_perfect_lens_reaches_the_diffraction_limit(aperture):
 def test_airy_power_inside_the_focusing_radius():
     bench = LensBench(LAYOUT, OPTICS, LensView(window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
-    # The encircled energy is 1 - J0^2(v) - J1^2(v) at v = pi D r / (lambda f), with r = 3 FWHM = 3.08 lambda
-    # f / D.
+    # The encircled energy is 1 - J0^2(v) - J1^2(v) at v = pi D r / (lambda f), where r = 3 FWHM, which is
+    # 3.08 lambda f / D.
     from scipy.special import j0, j1
 
     v = math.pi * 30 * score.focusing_radius_um / (0.6328 * 100)
@@ -88,7 +88,7 @@ def test_a_staircase_lens_loses_as_much_as_the_blaze_formula_states(levels, step
     parameters = task.free_parameters()
     height = task.printer(task.cells(parameters.best_levels())[None, None].float())[0, 0]
     strehl = lens_score(task.bench, height).strehl
-    # One wave is 11.5 steps of 0.1 µm. A lens of seven zones loses one or two per cent more than the formula.
+    # One wave is 11.5 steps of 0.1 µm. A lens with seven zones loses 1 or 2 % more than the formula states.
     steps = {13: 12, 8: 8, 2: 2}[levels]
     assert strehl == pytest.approx(blaze_efficiency(steps, 1.0), abs=0.03)
 
@@ -107,8 +107,8 @@ def test_ring_path_and_plane_path_give_the_same_wave(make_printer):
     level = task.cells(smooth)[None, None]
     plane = bench(task.printer(level)[0, 0])
     strip = rings(task.printed_rings(level, task.printer))
-    # Three things differ: the edge of the disc is a staircase of pixels (1e-3), the layout ends where its
-    # circle touches the sides, and rings are flat across 0.1 µm where this rough print is not.
+    # There are three differences: the edge of the disc is a staircase of pixels (1e-3), the layout ends where
+    # its circle touches the sides, and rings are flat over 0.1 µm, whereas this print is rough.
     assert float((plane - strip).abs().sum() / plane.sum()) < 0.04
 
 
@@ -119,7 +119,7 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
     assert not task.radial
     assert "whole plane" in task.notes[0]
     level = torch.full((1, 1, 300, 300), 3.0)
-    # The objective gets the print of the whole element, not of a strip.
+    # The objective uses the print of the whole element, not of a strip.
     centre_px = round(CENTRE_UM / LAYOUT.pitch_um)
     ratio = centre_to_background(task.bench(printer(level)[0, 0]), centre_px, 300)
     assert float(task.objective(level)[0]) == pytest.approx(-math.log(float(ratio)), rel=1e-6)
@@ -127,7 +127,7 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
 
 
 def test_errors_of_a_computational_lens_by_independent_code(settings, make_printer):
-    """Compute print, PSF, sensor image and Richardson-Lucy again, in NumPy, SciPy and float64."""
+    """Check the errors against a float64 computation in NumPy and SciPy, from the wave to Richardson-Lucy."""
     computational = settings.model_copy(update={"task": "computational"})
     imaging, n, window, z, wavelength = computational.imaging, 300, 128, 100.0, 0.6328
     bench = LensBench(LAYOUT, OPTICS, settings.view)
@@ -135,7 +135,7 @@ def test_errors_of_a_computational_lens_by_independent_code(settings, make_print
     heights = [bench.ideal_height_um() + part * rough for part in (1.0, 0.5)]
     found = lens_task(computational, make_printer(LAYOUT)).score(*heights)
 
-    # First Rayleigh-Sommerfeld integral, summed directly over the aperture.
+    # Sum the first Rayleigh-Sommerfeld integral directly over the aperture.
     x = (np.arange(n) - (n - 1) / 2) * 0.1
     inside = np.hypot(x[:, None], x[None, :]) < 15
     apart = (np.arange(n + window - 1) - (n + window - 2) / 2) * 0.1
@@ -146,7 +146,7 @@ def test_errors_of_a_computational_lens_by_independent_code(settings, make_print
     for height in heights:
         wave = inside * np.exp(1j * k * 0.548 * height.double().numpy())
         seen = np.abs(fftconvolve(wave, kernel, "full")[n - 1 : n - 1 + window, n - 1 : n - 1 + window]) ** 2
-        # Sensor pixels of two pixels, an odd number of them around the axis.
+        # A sensor pixel is two pixels wide. Their number is odd, with one on the axis.
         part = (seen / inside.sum())[1:-1, 1:-1]
         psfs.append(part.reshape(63, 2, 63, 2).sum((1, 3)))
     ours = sensor_psf(bench(heights[0]), imaging.pixel_px)
@@ -169,7 +169,7 @@ def test_errors_of_a_computational_lens_by_independent_code(settings, make_print
                     estimate *= fftconvolve(ratio, mirrored, "same").clip(0) / weight
                 errors[name].append(np.abs(estimate - truth).mean())
     for name, values in errors.items():
-        # Our code uses float32 through ten divisions by dark images.
+        # Our code uses float32, with ten divisions by dark images.
         assert getattr(found, f"mae_{name}") == pytest.approx(np.mean(values), rel=1e-4), name
     # Another PSF changes the error by far more than the tolerance.
     assert found.mae_design != pytest.approx(found.mae_calibrated, rel=0.01)
@@ -190,22 +190,22 @@ def test_width_of_a_gaussian():
 
 
 def test_width_of_a_gaussian_in_an_odd_window():
-    # 17 px are padded to 65, not 68. A pitch of a quarter pixel would make the width 4.6 % too small.
+    # 17 px are padded to 65, not 68, so assuming a quarter of the pitch would make the width 4.6 % too small.
     x = torch.arange(-8, 9).double() * 0.1
     psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.2**2))
-    # Half of the samples on the rim of a circle of 0.24 µm radius count: 2 % of its diameter.
+    # Of the samples on the rim of a circle of 0.24 µm radius, half count, which is 2 % of its diameter.
     assert half_maximum_width_um(psf, 0.1) == pytest.approx(2.3548 * 0.2, rel=0.02)
 
 
 def test_a_window_that_cuts_the_focus_is_reported(settings, make_printer):
-    # The radius is 3 * 0.514 * 0.6328 / NA = 6.6 µm at NA 0.148. 128 px are 12.8 µm; 133 px hold the circle.
+    # At NA 0.148, the radius is 3 * 0.514 * 0.6328 / NA = 6.6 µm, but the window is only 12.8 µm wide.
     (note,) = lens_task(settings, make_printer(LAYOUT)).notes
     assert "--window-px 132" in note
     wide = settings.model_copy(update={"view": settings.view.model_copy(update={"window_px": 132})})
     task = lens_task(wide, make_printer(LAYOUT))
     assert task.notes == []
     radius_um = lens_score(task.bench, task.bench.ideal_height_um()).focusing_radius_um
-    # The sampled width against the Airy formula of the note.
+    # Compare the sampled width with the Airy formula in the note.
     assert radius_um == pytest.approx(132 * 0.1 / 2, rel=0.01)
 
 
@@ -236,7 +236,7 @@ def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, m
     assert foreign.independent
     assert foreign.figures["strehl"] < own.figures["strehl"]
     if task == "computational":
-        # The design uses one PSF on both sides. After another print only calibration gives the right one.
+        # The design uses one PSF for image and deconvolution. For another print, only calibration is right.
         assert own.figures["mae_design"] == pytest.approx(own.figures["mae_calibrated"], rel=1e-6)
         assert foreign.figures["mae_design"] != foreign.figures["mae_calibrated"]
     assert LoadedDesign(tmp_path / "design").target is None
@@ -256,7 +256,7 @@ def test_ring_path_needs_rings(settings, make_printer, change, message):
 
 
 def test_an_mtf_is_interpolated_linearly_between_samples():
-    """For a spot that is wider along one axis, the MTF is the mean of both axes, zero frequency first."""
+    """Check the MTF of a spot that is wider along one axis, which is the mean of both axes."""
     y, x = np.meshgrid(*(np.arange(32) - 16.0,) * 2, indexing="ij")
     psf, pitch_um = torch.from_numpy(np.exp(-(x**2) / 18 - y**2 / 4.5)), 0.2
     curve = mtf(psf)

@@ -1,4 +1,4 @@
-"""A photograph through a printed lens: simulated from a known PSF, it must come back."""
+"""Check that the object is recovered from a photograph through a lens, simulated with a known PSF."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from litho_design.workflows.score import score as score_design
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160
-# Dead camera pixels, by the window pixel (x, y) on the L that they see, and hot ones (y, x).
+# Dead camera pixels, given by the window pixels (x, y) on the L that they see, and hot pixels (y, x).
 DEAD, HOT = ((23, 40), (23, 60), (40, 73)), ((10, 12), (80, 140), (61, 90))
 
 
 @pytest.fixture(scope="module")
 def lens(tmp_path_factory):
-    """Return a lens of 20 µm, f = 40 µm, with a full width at half maximum of 1.4 µm, seven sensor pixels."""
+    """Design a lens of 20 µm with f = 40 µm. Its spot is 1.4 µm wide, or seven sensor pixels."""
     layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
     default = lens_settings("direct")
     settings = default.model_copy(
@@ -68,9 +68,9 @@ def picture(tmp_path):
 
 
 def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
-    """Write the photograph of ``wanted`` (n, n) behind a print.
+    """Write the photograph of an object ``wanted`` (n, n) through a printed lens.
 
-    Return the PSF and the photo-to-window map.
+    Return the PSF and the matrix from photograph to window.
     """
     psf = sensor_psf(loaded.bench(height_um), 2)
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted).double().numpy()
@@ -93,7 +93,7 @@ def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.0
 
 
 def estimate(loaded, recorded, psf, wanted):
-    """Return the deconvolved image, without registration, at the scale of least error."""
+    """Return the deconvolved image without registration, scaled to the least error."""
     found = richardson_lucy(recorded, psf, loaded.task.settings.imaging.iterations)
     return found * matched_scale(found, wanted)
 
@@ -102,7 +102,7 @@ def estimate(loaded, recorded, psf, wanted):
 def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_path, lens, picture):
     loaded = LoadedDesign(lens)
     wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
-    # The print is too low towards its rim, so its PSF is wider and lower than the designed one.
+    # The print is too low near its rim, so its PSF is wider and lower than the designed one.
     radius = torch.from_numpy(np.hypot(*np.mgrid[-99.5:100, -99.5:100]) / 100).float()
     printed = loaded.expected_um * (1 - 0.5 * radius.square())
     np.savetxt(tmp_path / "scan.txt", (printed.double().numpy() + 0.2) * 1e-6)
@@ -118,16 +118,16 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
     assert score.judge.dark_level == DARK
     assert score.judge.saturated_share == pytest.approx(len(HOT) / PHOTO_PX**2)
 
-    # To check the registration, corners of the lit part go to the photograph and back. The images are
-    # compared after a blur of 2 px. A quarter of a pixel is 0.05 µm, a 28th of the width of the PSF.
+    # To check the registration, map corners of the lit part to the photograph and back. Registration compares
+    # images after a blur of 2 px. A quarter of a pixel is 0.05 µm, a 28th of the width of the PSF.
     displaced_px = 0.25
     corners = np.array([[12, 84, 12, 84], [12, 12, 84, 84], [1, 1, 1, 1]])
     found = np.array(score.judge.photo_to_window) @ corners
     assert np.hypot(*(to_window @ (found / found[2]) - corners[:2])).max() < displaced_px
 
-    # A displacement by d changes an image by at most d times its gradient. The mean absolute error and the
-    # rms error obey the triangle inequality, so they change by no more. Noise of 0.3 % of white is taken as
-    # it is: deconvolution amplifies it, and averaging over camera pixels reduces it.
+    # A displacement d changes an image by at most d times its gradient. By the triangle inequality, the mean
+    # absolute error and the rms error change by no more than that. The noise, 0.3 % of white, is added as it
+    # is, because deconvolution amplifies it while averaging over camera pixels reduces it.
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted)
     design_psf = sensor_psf(loaded.bench(loaded.expected_um), 2)
     for name, image in {
@@ -156,12 +156,12 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     verdict = score_lens_photo(loaded, photo)
     score, record = verdict.figures, verdict.record
     assert record.imaged == "text"
-    # In a dark surround with noise the percentile is two or three standard deviations below the level.
+    # In noisy dark surroundings, the percentile is two or three standard deviations below the dark level.
     assert DARK - 3 * NOISE < record.dark_level < DARK + NOISE
     assert score.mae_calibrated is None
     assert list(verdict.pictures) == ["object text", "photograph", "deconvolved, design PSF"]
     assert score.mae_design < score.mae_direct
-    # This object was photographed. Another object does not match, or has a larger error.
+    # Another object than the photographed one does not match, or has a larger error.
     with pytest.raises(InputError, match=r"correlation|proportional to the light"):
         score_lens_photo(loaded, replace(photo, imaged="spots"))
 

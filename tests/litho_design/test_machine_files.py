@@ -1,4 +1,4 @@
-"""One lens and one hologram in every format, read by parsers that share no code with the package."""
+"""Check a lens and a hologram in every format with parsers that share no code with the package."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def gds(file, sidecar):
     found = np.zeros(sidecar["shape_px"])
     for polygon in top.get_polygons():
         (x0, y0), (x1, y1) = np.rint(np.array(polygon.bounding_box()) / PITCH_UM).astype(int)
-        # Layers are cumulative: each raises what it covers by one level.
+        # Layers are cumulative, so each raises what it covers by one level.
         found[len(found) - y1 : len(found) - y0, x0:x1] += sidecar["level_height_um"]
     return found
 
@@ -52,7 +52,7 @@ def dxf(file, sidecar):
         elif code == "8":
             layer = int(word)
         elif (code, word) == ("0", "SEQEND"):
-            # The polyline entity itself has a point at 0, 0.
+            # The polyline entity itself has a point at (0, 0).
             x, y = corners["10"][1:], corners["20"][1:]
             found[len(found) - max(y) : len(found) - min(y), min(x) : max(x)] = height_um[layer]
     return found

@@ -1,4 +1,4 @@
-"""A measured print and a photographed image serve as judges."""
+"""Test a measured print and a photographed image as judges of a design."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FINER = 4
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera: its position and its effect on the light."""
+    """Describe a camera by its position and its effect on the light."""
 
     pitch_um: float = 0.15
     turn_deg: float = 0.0
@@ -44,7 +44,7 @@ class Camera:
     gamma: float = 1.0
 
     def counts(self, light: np.ndarray, pitch_um: float, seed: int) -> np.ndarray:
-        """Return the photograph, uint16, of light (n, n) on pixels of ``pitch_um``."""
+        """Return a uint16 photograph of light (n, n) given on pixels of ``pitch_um``."""
         step = self.pitch_um / pitch_um / self.scale
         side = round(1.15 * len(light) / step)
         place = (np.arange(side * _FINER) + 0.5) / _FINER - side / 2
@@ -84,19 +84,19 @@ def test_a_measured_print_scores_like_the_print_it_is(tmp_path, printed_design):
     loaded = LoadedDesign(printed_design)
     height = loaded.expected_um.numpy().astype(np.float64)
     noise = np.random.default_rng(0).normal(0, 0.002, height.shape)
-    # The AFM's zero is arbitrary: an offset must not matter.
+    # The zero of an AFM is arbitrary, so an offset must not matter.
     np.savetxt(tmp_path / "scan.txt", (height + noise + 0.3) * 1e-6)
     source = MeasuredSource(tmp_path / "scan.txt", unit="m", size_um=(12.8, 12.8))
     score = score_design(printed_design, tmp_path / "score", judges=[], scan=source).scores[0]
     assert score.kind == "scan"
     assert score.judge.coverage > 0.9
     assert score.judge.height_offset_um == pytest.approx(0.3, abs=2e-3)
-    # 2 nm of noise is 0.002 wave, so only the error of registration may be visible.
+    # Noise of 2 nm is 0.002 wave, so only the registration error may be visible.
     assert score.figures["si_psnr_db"] == pytest.approx(loaded.record.predicted["si_psnr_db"], abs=0.5)
 
 
 def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, printed_design):
-    """Such a scan must not lose score: a tilt of 0.05 µm/µm once cost 1.8 dB without a warning."""
+    """Check that such a scan does not score worse; a tilt of 0.05 µm/µm once cost 1.8 dB unnoticed."""
     loaded = LoadedDesign(printed_design)
     expected = loaded.expected_um.numpy().astype(np.float64)
     generator = np.random.default_rng(3)
@@ -113,19 +113,19 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
     for orientation in ("identity", "rotate-90", "flip-y"):
         np.savetxt(source.path, orient(scan, orientation) * 1e-6)
         score = score_design(printed_design, tmp_path / orientation, scan=source).scores[0]
-        # Noise of 3 nm is 0.003 wave: it scatters (2 pi 0.003)^2 = 0.03 % of the light.
+        # Noise of 3 nm is 0.003 wave, so it scatters (2 pi 0.003)^2 = 0.03 % of the light.
         assert score.figures["eff_signal"] == pytest.approx(truth.eff_signal, rel=0.01)
         assert score.figures["si_psnr_db"] == pytest.approx(truth.si_psnr_db, abs=0.15)
         assert score.judge.noise_um == pytest.approx(0.003, rel=0.2)
         assert (score.judge.orientation == "identity") == (orientation == "identity")
-        # A height scale known to 2 % adds more uncertainty than the noise.
+        # The height scale is known to 2 %, which adds more uncertainty than the noise.
         assert 0.01 < score.uncertainty["si_psnr_db"] < 1
-    # Check the report of the first scan, which lies as the layout does.
+    # Check the report of the first scan, which has the orientation of the layout.
     score = ScoreResult.read(tmp_path / "identity").scores[0]
     assert score.judge.tilt_um_per_um == pytest.approx(tilt, abs=0.002)
-    # 2 bow 6.35^2 from the middle to the corners.
+    # The bow is 2 bow 6.35^2 from the centre to the corners.
     assert score.judge.bow_um == pytest.approx(2 * bow * 6.35**2, rel=0.1)
-    assert "removed a tilt of +0.0" in (tmp_path / "identity" / "report.html").read_text("utf-8")
+    assert "a tilt of +0.0" in (tmp_path / "identity" / "report.html").read_text("utf-8")
     np.savetxt(source.path, (scan + 0.15 * x) * 1e-6)
     with pytest.raises(InputError, match=r"correlation .*--scan-levelling"):
         score_design(printed_design, tmp_path / "no", scan=replace(source, levelling="none"))
@@ -133,7 +133,7 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
 
 @dataclass(frozen=True)
 class Widened:
-    """The fields of a scan that tip correction needs."""
+    """Provide the attributes of a scan that tip correction needs."""
 
     height_um: np.ndarray
 
@@ -144,13 +144,13 @@ class Widened:
 def test_a_pillar_is_narrower_without_its_tip_and_as_high():
     y, x = np.meshgrid(0.1 * np.arange(-20, 21), 0.2 * np.arange(-10, 11), indexing="ij")
     radius_um = 0.5
-    # The scan of a needle of 1 µm is a paraboloid.
+    # The scan of a needle 1 µm high is a paraboloid.
     scan = Widened(np.maximum(1 - (x**2 + y**2) / (2 * radius_um), 0))
     freed, found_um, change_um = _without_tip(scan, radius_um)
     assert (found_um, freed.height_um[20, 10]) == (radius_um, pytest.approx(1))
     for beside in ((21, 10), (19, 10), (20, 11), (20, 9)):
         off_um = np.hypot(y[beside], x[beside])
-        # At a distance of √(2R) the foot of the needle carries the tip.
+        # At a distance of √(2R), the tip rests on the foot of the needle.
         assert freed.height_um[beside] == pytest.approx((1 - off_um) ** 2, abs=1e-6)
     assert change_um == pytest.approx(np.std(freed.height_um - scan.height_um))
     assert _without_tip(scan, 0.0) == (scan, 0, 0)
@@ -174,8 +174,8 @@ def test_a_scan_of_something_else_is_refused(tmp_path, printed_design):
 def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design):
     loaded = LoadedDesign(printed_design)
     image = loaded.image(loaded.expected_um)
-    # The camera has 0.2 µm pixels, is turned by 2 degrees and moved by (1.3, -0.8) µm, with a dark level of
-    # 300. Two hot pixels and a dead one lie in the light.
+    # The camera has pixels of 0.2 µm and a dark level of 300, and is rotated by 2° and shifted by
+    # (1.3, -0.8) µm. It has two hot pixels, and a dead pixel in the light.
     turn = np.deg2rad(2.0)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     to_window = np.hstack([2 * matrix, (63.5 - 2 * matrix @ np.array([56.0, 45.5]))[:, None]])
@@ -195,7 +195,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 200
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
-    # photograph = matrix^-1 window / 2: the linear part of the found map must invert the true one.
+    # The photograph is matrix^-1 window / 2. The linear part of the found map must be the inverse.
     found = np.array(score.judge.photo_to_window)[:2, :2]
     assert found == pytest.approx(np.linalg.inv(2 * matrix), abs=0.01)
     blurred = torch.from_numpy(cv2.GaussianBlur(image, (0, 0), 1.4)).double()
@@ -209,7 +209,7 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_without_a_warning(tmp_p
     design_hologram(target, printer, tmp_path / "design", settings=small_settings, announce=False)
     loaded = LoadedDesign(tmp_path / "design")
     image = cv2.GaussianBlur(loaded.image(loaded.expected_um), (0, 0), 1.5)
-    # 0.15 µm pixels; the brightest has 40,000 counts.
+    # The camera has pixels of 0.15 µm, of which the brightest has 40,000 counts.
     to_window = np.array([[1.5, 0, -20.0], [0, 1.5, -15.0]])
     seen = cv2.warpAffine(image, to_window, (120, 110), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP).clip(0)
     counts = 40000 * seen / seen.max() + np.random.default_rng(0).normal(300, 60, seen.shape)
@@ -217,7 +217,7 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_without_a_warning(tmp_p
         cv2.imwrite(
             str(tmp_path / "p.png"), np.ascontiguousarray(orient(counts, orientation)).astype(np.uint16)
         )
-        # One count of the camera is this share of the light, spread over 2.25 window pixels.
+        # A camera count is this share of the light, spread over 2.25 window pixels.
         power = 40000 / seen.max() / 2.25
         source = PhotoSource(tmp_path / "p.png", 0.15, 300.0, power_counts=power)
         try:
@@ -237,7 +237,7 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_without_a_warning(tmp_p
 
 
 def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp_path, small_settings):
-    """Photographs are seen at an angle, turned, noisy, dark in the corners, or too bad for any score."""
+    """Check photographs that are oblique, rotated, noisy, dark in the corners, or too bad for a score."""
     printer = Printer(None, small_settings.layout, source="none")
     design_hologram("text", printer, tmp_path / "design", settings=small_settings, announce=False)
     loaded = LoadedDesign(tmp_path / "design")
@@ -267,7 +267,7 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
 def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
-    """A camera of 12 bits writes 16-bit files. No pixel reaches the largest value of the file."""
+    """Check cameras with fewer bits than their files, whose pixels do not reach the limit of the file."""
     light = np.random.default_rng(0).uniform(0, 1, (100, 100)) ** 2 * 2**bits
     assert _saturated(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
         0.046, abs=0.01
@@ -276,14 +276,14 @@ def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
 
 
 class Power(Record):
-    """A figure that is linear in the measured values, and one that is not."""
+    """Hold a score that is linear in the measured values and one that is not."""
 
     mean: float
     power: float
 
 
 def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
-    """Noise of sd s adds s^2 to a mean of squares and nothing to a mean, whatever figure it affects."""
+    """Check that the s^2 that noise of sd s adds to a mean square is subtracted, and nothing from a mean."""
     generator = np.random.default_rng(0)
     truth, sd = generator.uniform(0, 1, 4000), 0.3
     drawn, freed = [], []
@@ -299,7 +299,7 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
         drawn.append(measured.power)
         freed.append(figures["power"])
     wanted = np.square(truth).mean()
-    # The mean of 40 is known to sqrt((4 s^2 <x^2> + 2 s^4) / 4000 / 40) = 9e-4.
+    # The mean of 40 draws is known to sqrt((4 s^2 <x^2> + 2 s^4) / 4000 / 40) = 9e-4.
     assert np.mean(drawn) - wanted == pytest.approx(sd**2, abs=4e-3)
     assert np.mean(freed) == pytest.approx(wanted, abs=4e-3)
     assert spread["mean"] == pytest.approx(sd / np.sqrt(4000), rel=0.8)
@@ -309,14 +309,14 @@ def test_baselines_stand_beside_every_score(printed_design, tmp_path):
     design = LoadedDesign(printed_design).record
     black, limited, phase, weighted = design.baselines.values()
     target = LoadedDesign(printed_design).target.double()
-    # c = 0 leaves the target itself as the error.
+    # For a black image, the error is the target itself.
     assert black["si_psnr_db"] == pytest.approx(float(-10 * torch.log10(target.square().mean())))
     assert black["ssim"] > design.predicted["ssim"]
     assert phase["loss"] < design.polished_loss
     assert limited["si_psnr_db"] > design.predicted["si_psnr_db"]
     assert weighted["speckle_contrast"] < phase["speckle_contrast"]
     assert design.predicted["eff_signal"] < design.reference_efficiency <= 1
-    # Details that cannot be resolved do not count against an image.
+    # For these scores, details that cannot be resolved do not count against an image.
     assert all(one["si_psnr_resolved_db"] > one["si_psnr_db"] for one in design.baselines.values())
     assert score_design(printed_design, tmp_path / "s", judges=["none"]).baselines == design.baselines
 

@@ -1,4 +1,4 @@
-"""Test the objects of a lens that the user provides: conversion, split, identity, refusals."""
+"""Test objects that the user provides for a lens: conversion, split, identity and refusals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def settings():
 
 @pytest.fixture
 def folder(tmp_path):
-    """Write five pictures. Their names sort in another order than they were written."""
+    """Write five pictures whose names sort in another order than that of writing."""
     place = tmp_path / "pictures"
     place.mkdir()
     for seed, name in enumerate("cebda"):
@@ -70,8 +70,8 @@ def test_drawings_and_pictures_have_a_dark_border(folder, settings):
 
 
 def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
-    # The picture is red and twice as wide as high: a square of 48 px with dark bands above and below, then 24
-    # px.
+    # The picture is red and twice as wide as high. It becomes a square of 48 px with dark bands above and
+    # below, and then one of 24 px.
     colour = np.zeros((24, 48, 3), np.uint8)
     colour[:, :24, 2], colour[:, 24:, 2] = 200, 100
     cv2.imwrite(str(tmp_path / "wide.png"), colour)
@@ -89,8 +89,8 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
     assert deep.adaptation == "divided by its brightest value; dark border of 4 px"
     seen, dark = inputs[PICTURES]
     assert seen.shape == (32, 32)
-    # 12 of the 24 rows are light: full on the left, half on the right. The luma is 59.8 against 29.9. A
-    # decoder may round or cut its counts, by one in 59.
+    # In 12 of the 24 rows, the left half is bright and the right half is half as bright: the luma is 59.8 or
+    # 29.9. A decoder may round or truncate its counts, by one in 59.
     assert np.allclose(seen[10:22, 4:16], 1)
     assert np.allclose(seen[10:22, 16:28], 0.5, atol=1 / 59)
     assert seen.sum() == pytest.approx(seen[10:22, 4:28].sum())
@@ -110,7 +110,7 @@ def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_ou
 
 
 def test_transparent_pixels_are_dark(tmp_path):
-    """A logo may be white everywhere, with its shape in the alpha channel."""
+    """Check a logo that is white everywhere and has its shape in the alpha channel."""
     shape = np.zeros((40, 40), np.uint8)
     shape[8:16, 4:30] = 255
     logo = np.dstack([np.full((40, 40, 3), 255, np.uint8), shape])
@@ -122,7 +122,7 @@ def test_transparent_pixels_are_dark(tmp_path):
 def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, settings, make_printer):
     printer = make_printer(settings.layout)
     design = design_lens(printer, tmp_path / "d", settings=settings, objects=[folder], announce=False)
-    assert "held out: d.png, e.png" in design.notes[-1]
+    assert "d.png, e.png are held out" in design.notes[-1]
     told = design.settings["imaging"]
     assert [item["name"] for item in told["objects"]] == ["a.png", "b.png", "c.png"]
     assert [item["sha256"] for item in told["test_objects"]] == [
@@ -132,7 +132,7 @@ def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, 
         file.unlink()
     own = score_design(tmp_path / "d", tmp_path / "score", judges=[printer]).scores[0]
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
-    # The same print images the built-in drawings with another error.
+    # The same print images the built-in drawings with a different error.
     drawn = lens_task(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
     assert drawn.mae_calibrated != pytest.approx(design.predicted["mae_calibrated"], rel=0.01)
 
@@ -156,7 +156,7 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
             design("cut", [folder])
     with pytest.raises(InputError, match="other settings"):
         design("cut", one_less)
-    # The same name with other pixels is another object too.
+    # A picture with the same name but other pixels is another object too.
     cv2.imwrite(str(folder / "a.png"), np.eye(24, dtype=np.uint8))
     with pytest.raises(InputError, match="other settings"):
         design("done", [folder])
@@ -182,7 +182,7 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
     split = ("--objects", folder / "c.png", "--objects", folder / "a.png", "--held-out-objects")
     split = (*split, folder / "b.png", "--held-out-objects", folder / "d.png")
     told = run("lens", *SMALL, *split, "--out", tmp_path / "d")
-    assert "objects of the design: c.png, a.png; held out: b.png, d.png" in told.err
+    assert "uses the objects c.png, a.png; b.png, d.png are held out" in told.err
     assert "MAE" in told.out
     imaging = Design.read(tmp_path / "d").settings["imaging"]
     run(
@@ -203,7 +203,7 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
         (("--objects", "pictures/a.png"), "got 0 for the design"),
         (("--objects", "pictures/a.png", "--objects", "pictures/b.png"), "0 for the design and 2 held out"),
         (("--objects", "pictures", "--held-out-objects", "extra.png"), "1 held out"),
-        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "given already"),
+        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "given twice"),
         (("--objects", "black.png"), "without any light"),
         (("--objects", "pictures", "--task", "direct"), "images no objects"),
         (("--objects", "pictures", "compare"), "the hoe task"),

@@ -1,4 +1,4 @@
-"""A user-defined task: the example runs from design to score, and its parts are tested."""
+"""Test a user-defined task: the example runs from design to score, and its parts work."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TINY = {
 
 @register_task
 class Corner(Task):
-    """Light is sent into one corner, at two angles of incidence."""
+    """Send light into one corner at two angles of incidence."""
 
     name = "corner"
 
@@ -48,12 +48,12 @@ class Corner(Task):
 
 
 def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, capsys):
-    """The example has fifteen lines at most, as promised. Yield and report are as for the built-in tasks."""
+    """Check that the example has at most fifteen lines, and gets a yield and report like built-in tasks."""
     text = (ROOT / "examples" / "own_task.py").read_text("utf-8")
     body = text.split("class ColoursInPlanes")[1].split("def spots")[0].splitlines()
     assert len([line for line in body if line.strip() and '"""' not in line]) <= 15
     out = tmp_path / "rgb"
-    # A yield of a hundred prints takes longer than everything else.
+    # A yield of a hundred prints would take longer than everything else.
     few = {"window.yield_draws": 2}
     monkeypatch.setattr(litho_design, "design_settings", lambda changes: design_settings(changes | few))
     known = dict(task_module._TASKS)
@@ -68,7 +68,7 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
     assert result.task == "colours-in-planes"
     assert {entry.judge for entry in result.entries} == {"none", "model"}
     place = out / "designs" / "model" / "seed0"
-    # Yield, report and images are kept as for holograms and lenses.
+    # Yield and images are written as for holograms and lenses.
     assert "worst_on_spots" in (place / "window.csv").read_text("utf-8")
     assert np.load(place / "image_share.npy").shape == (9, 64, 64)
     with pytest.raises(InputError, match=r"colours-in-planes.*register_task"):
@@ -76,7 +76,7 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
 
 
 def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsys, refused):
-    """``--plugin`` runs the file with its task. Without it, or if the file fails, the command says so."""
+    """Check that ``--plugin`` loads the task, and the messages without it or if the file fails."""
     file, out = tmp_path / "far_corner.py", tmp_path / "design"
     file.write_text(
         "import litho_design\n@litho_design.register_task\nclass FarCorner(litho_design.Task):\n"
@@ -111,7 +111,7 @@ def test_search_improves_an_own_loss_and_resumes_only_the_same_task(tmp_path):
     assert made.polished_loss == pytest.approx(1 - made.predicted["worst"], abs=1e-5)
     assert made.polished_loss < made.start_loss - 0.1
     flat = made.baselines["no element"]["worst"]
-    # A flat plate leaves the light in place or moves it out of the corner, which is 20 x 20 of 64 x 64
+    # A flat plate leaves the light in place or shifts it out of the corner, which has 20 x 20 of 64 x 64
     # pixels.
     assert 0 < flat < 400 / 4096
     assert made.predicted["worst"] > 2 * flat
@@ -136,7 +136,7 @@ def test_robust_and_ensemble_losses_serve_an_own_task(tmp_path, make_printer):
 
 
 def test_an_oblique_wave_goes_where_its_angle_says():
-    """At the sine s the shadow moves by z tan(asin s), and its phase is that of a tilted plane wave."""
+    """Check that at the sine s the shadow shifts by z tan(asin s), with the phase of a tilted plane wave."""
     layout = Printer(None, design_settings(TINY).layout, source="none").layout
     sine, distance_um = 0.3, 10.0
     bench = ElementBench(layout, Optics(distance_um=distance_um, incidence_x=sine))
@@ -144,7 +144,7 @@ def test_an_oblique_wave_goes_where_its_angle_says():
     x = torch.from_numpy(bench.grid.x_um)
     centroid = float((seen.sum(0) * x).sum() / seen.sum())
     straight = ElementBench(layout, Optics(distance_um=distance_um))(torch.zeros(64, 64)).double()
-    # The window cuts part of the shifted square: compare with the direct sum over a wider one.
+    # The window truncates the shifted square, so compare with the direct sum over a wider window.
     wide = centred_grid((64, 192), 0.1)
     k = 2 * np.pi / 0.6328
     wave = torch.exp(1j * k * sine * x)[None, :].expand(64, 64) / 6.4

@@ -1,4 +1,4 @@
-"""The Python code on the page of this package runs as written, at a smaller size."""
+"""Check that the Python code on the page of this package runs as written, at a smaller size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Free parameters, cells and levels."""
+"""Test free parameters, cells and levels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_rings_are_symmetric_and_a_pixel_wide():
     picture = cells(torch.arange(cells.cells[0]))
     for same in (picture.T, picture.flip(0), picture.flip(1)):
         assert torch.equal(picture, same)
-    # For an odd size the middle pixel is ring 0, and along an axis the ring number counts pixels.
+    # For an odd size, the middle pixel is ring 0, and along an axis each pixel is a further ring.
     assert picture[7, 7:].tolist() == list(range(8))
 
 
@@ -40,8 +40,8 @@ def test_gumbel_samples_follow_the_softmax():
         parameters.logits.copy_(logits[:, None, None].expand_as(parameters.logits))
     sample = parameters.sample(0.001, seed=5).round()
     share = torch.stack([(sample == level).double().mean() for level in range(4)])
-    # By the Gumbel-max trick cold samples are exact draws from softmax(logits). For 40000 draws 4 sigma =
-    # 0.01.
+    # By the Gumbel-max trick, samples at low temperature are exact draws from softmax(logits). For 40000
+    # draws, four sigma are 0.01.
     assert (share - logits.softmax(0)).abs().max() < 0.01
 
 
@@ -59,7 +59,7 @@ def test_straight_through_gradient_is_that_of_the_unrounded_height():
     parameters.start_random(0)
     weight = torch.randn(16, 16)
     sample = parameters.sample(hard=True)
-    # The straight-through estimator adds and removes the real part, which leaves its rounding.
+    # The straight-through estimator adds and subtracts the real value, so a rounding error remains.
     assert (sample - sample.round()).abs().max() < 1e-5
     (sample * weight).sum().backward()
     expected = weight.unflatten(1, (4, 4)).unflatten(0, (4, 4)).sum((1, 3))
@@ -83,7 +83,7 @@ def test_heights_outside_the_range_return_to_it():
 
 def test_nearest_level_on_the_circle():
     printed = torch.tensor([0.1, 1.0, 2.0])
-    # 6.2 rad is 0.18 rad below 0.1 on the circle; 4.0 is 2.0 from 2.0 and 2.38 from 0.1.
+    # On the circle, 6.2 rad is 0.18 rad below 0.1, and 4.0 is 2.0 from 2.0 and 2.38 from 0.1.
     assert nearest_levels(torch.tensor([6.2, 0.9, 4.0, -0.1]), printed).tolist() == [0, 1, 2, 0]
 
 
@@ -96,7 +96,7 @@ def test_cells_must_fill_the_element():
 
 @pytest.mark.parametrize("layout", [SQUARE.model_copy(update={"size_px": 44}), RINGS])
 def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient(layout):
-    """One free cell moves its neighbours by the kernel. Its gradient sums theirs with the same kernel."""
+    """Check that one free cell changes its neighbours by the kernel, and receives their gradients by it."""
     filtered = layout.model_copy(update={"cell_filter_um": 0.8 * layout.cell_um})
     parameters = DirectLevels(filtered)
     middle = tuple(side // 2 for side in parameters.cells.cells)
@@ -107,14 +107,14 @@ def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient
     kernel = kernel / kernel.sum()
     wanted = 4 * (kernel if level.dim() == 1 else kernel[:, None] * kernel)
     around = tuple(slice(one - 4, one + 5) for one in middle)
-    # The kernel ends at four sigma, where 6e-5 of the Gaussian remains.
+    # The kernel is truncated at four sigma, which removes 6e-5 of the Gaussian.
     assert torch.allclose(level[around], wanted, atol=1e-3)
     sample = parameters.sample(hard=True)
     assert torch.equal(sample, sample.round())
     assert sample.min() >= 0
     assert sample.max() <= 4
     (gradient,) = torch.autograd.grad(sample[0, 0].sum(), parameters.height)
-    # Every pixel counts once, and a filter of sum 1 passes on the whole gradient.
+    # Every pixel counts once, and a filter with a sum of 1 keeps the whole gradient.
     assert float(gradient.sum()) == pytest.approx(sample.numel(), rel=1e-5)
     assert torch.equal(DirectLevels(layout)._kept(), DirectLevels(layout).height)
 

@@ -1,4 +1,4 @@
-"""Test varying prints and optics: depth of focus of a perfect lens, draws, measured spreads."""
+"""Test variations of print and optics: depth of focus of a perfect lens, draws, measured spreads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from litho_design.printers.layout import LayoutSettings
 
 
 def test_a_perfect_lens_has_the_depth_of_focus_of_its_aperture():
-    # Defocus by d is a path of d NA^2 / 2 at the edge; the axial intensity behind a circle is
+    # A defocus of d is a path of d NA^2 / 2 at the edge. So the axial intensity behind a circle is
     # sinc^2(d NA^2 / (2 lambda)), which is 0.8 at an argument of 0.2535 on both sides.
     layout = LayoutSettings(size_px=600, cell_um=0.1, symmetry="radial")
     bench = LensBench(layout, Optics(distance_um=100.0), LensView(window_px=64))
@@ -30,9 +30,9 @@ def test_a_perfect_lens_has_the_depth_of_focus_of_its_aperture():
     peak = float(bench(ideal).max())
     for defocus_um in (-depth, depth):
         moved = LensBench(layout, Optics(distance_um=100.0 + defocus_um), LensView(window_px=64))
-        # The focus also falls off as 1 / z^2: 4 % over the depth.
+        # The focus also falls off as 1 / z^2, which is 4 % over the depth.
         assert float(moved(ideal).max()) / peak == pytest.approx(0.8, rel=0.06)
-    # A gain of g leaves sinc^2(1 - g) in the first order of a blazed zone.
+    # At a gain of g, the first order of a blazed zone has sinc^2(1 - g) of the light.
     for gain in (0.85, 1.15):
         assert float(bench(gain * ideal).max()) / peak == pytest.approx(np.sinc(1 - gain) ** 2, abs=0.02)
 
@@ -41,7 +41,7 @@ def test_rings_are_blurred_like_a_plane_wave_of_their_radius():
     ring = torch.cos(2 * torch.pi * (torch.arange(400) + 0.5) * 0.1 / 1.6).double()
     blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(ring, 0.1)
     expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
-    # The mirrored centre continues a cosine exactly. The outer end is left out.
+    # Mirroring at the centre continues a cosine exactly. The outer end is excluded.
     assert torch.allclose(blurred[:360], expected * ring[:360], atol=1e-3)
 
 
@@ -82,7 +82,7 @@ def test_spreads_of_measured_prints_come_back_without_the_locked_ones():
     assert window.offset_sd_um == pytest.approx(kept_offsets.std(ddof=1), rel=1e-6)
     together = np.corrcoef(kept_gains, kept_offsets)[0, 1]
     assert window.gain_offset_correlation == pytest.approx(together, rel=1e-6)
-    # Heights of the locked print change nothing.
+    # The heights of the locked print do not matter.
     gains[locked], offsets[locked] = 40.0, -3.0
     assert measured_window(_store(gains, offsets), ProcessWindow(samples=4)) == window
 
@@ -98,8 +98,8 @@ def test_a_draw_of_another_wavelength_has_the_index_of_its_resin():
     window = ProcessWindow(wavelength_sd_um=0.01)
     for draw in draws(window, Optics(), 3):
         shift_um = draw.optics.wavelength_um - 0.6328
-        # IP-Dip: dn / dlambda = -2 b / lambda^3 - 4 c / lambda^5 = -0.0516 - 0.0100 per µm; the curvature,
-        # 6 b / lambda^4 + 20 c / lambda^6 = 0.33 per µm^2, adds half its square.
+        # For IP-Dip, dn / dlambda = -2 b / lambda^3 - 4 c / lambda^5 = -0.0516 - 0.0100 per µm. The curvature
+        # 6 b / lambda^4 + 20 c / lambda^6 = 0.33 per µm^2 adds half of it times the squared shift.
         change = draw.optics.index_step - 0.548
         assert change == pytest.approx(-0.0616 * shift_um, abs=0.2 * shift_um**2 + 1e-6)
     constant = Optics(dispersion="constant")
@@ -120,5 +120,5 @@ def test_a_yield_counts_prints_and_has_the_interval_of_a_share():
 def test_gain_and_offset_are_drawn_together():
     many = draws(ProcessWindow(gain_offset_correlation=-0.8), Optics(), 4000)
     measured = np.corrcoef([d.gain for d in many], [d.offset_um for d in many])[0, 1]
-    # Standard error of a correlation: (1 - r^2) / sqrt(n) = 0.006.
+    # The standard error of a correlation is (1 - r^2) / sqrt(n) = 0.006.
     assert measured == pytest.approx(-0.8, abs=0.03)

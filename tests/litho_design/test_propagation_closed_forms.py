@@ -1,4 +1,4 @@
-"""Propagators against closed forms of diffraction theory."""
+"""Test propagators against closed forms of diffraction theory."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_on_axis_field_behind_a_circular_aperture(pitch, reported):
     exact = np.exp(1j * WAVENUMBER * z) - z / distance * np.exp(1j * WAVENUMBER * distance)
     propagate = RSPropagator(grid, point(), z, WAVELENGTH_UM, dtype=torch.complex128)
     error = abs(complex(propagate(field)) - exact) / abs(exact)
-    # The rest is the error of the staircase edge of the pixelated circle.
+    # The error is due to the staircase edge of the pixelated circle.
     assert error == pytest.approx(reported, rel=0.1)
     if pitch == 0.1:
         assert error < 1e-3
@@ -52,12 +52,12 @@ def test_perfect_lens_focus():
     intensity = abs(complex(propagate(converging))) ** 2
     exact = (1 - z / math.hypot(a, z)) ** 2 + (WAVENUMBER * z / 2 * math.log1p((a / z) ** 2)) ** 2
     assert intensity == pytest.approx(exact, rel=1e-3)
-    # The paraxial peak (area / (wavelength f))^2 is already 1.8 % too high at a/f = 0.13.
+    # At a/f = 0.13, the paraxial peak (area / (wavelength f))^2 is already 1.8 % too high.
     assert (math.pi * a**2 / (WAVELENGTH_UM * z)) ** 2 == pytest.approx(1.018 * intensity, rel=1e-3)
 
 
 def test_paraxial_square_lens_spot_is_a_sinc():
-    side, focal = 40.0, 400.0  # half diagonal over f is 0.07: the paraxial formula holds to 1 %
+    side, focal = 40.0, 400.0  # half diagonal / f = 0.07: paraxial to 1 %
     grid = centred_grid((400, 400), 0.1)
     converging = torch.exp(-1j * WAVENUMBER * (radius(grid) ** 2 + focal**2).sqrt())
     line = centred_grid((1, 201), 0.1)
@@ -80,13 +80,13 @@ def test_gaussian_beam(propagator):
     curvature = z * (1 + (rayleigh / z) ** 2)
     phase = WAVENUMBER * z - math.atan(z / rayleigh) + WAVENUMBER * radius(grid) ** 2 / (2 * curvature)
     expected = waist / width * torch.exp(-((radius(grid) / width) ** 2) + 1j * phase)
-    # The closed form is paraxial; its own error for a divergence of 0.02 rad is about 2e-4 of the peak.
+    # The closed form is paraxial. For a divergence of 0.02 rad, its error is about 2e-4 of the peak.
     assert (out - expected).abs().max() < 1e-3
 
 
 def test_fresnel_zone_plate_focus_grows_with_the_square_of_its_zones():
-    # The boundaries of n open zones are whole half wavelengths. Every zone adds twice the incident amplitude,
-    # and only the obliquity (z/r, within 1 % here) weakens the later ones.
+    # The paths to the zone boundaries differ by half wavelengths, so every open zone adds twice the incident
+    # amplitude. Only the obliquity (z/r, here within 1 %) weakens the outer ones.
     z, zones = 300.0, 5
     edges = [math.sqrt((z + m * WAVELENGTH_UM / 2) ** 2 - z**2) for m in range(2 * zones + 1)]
     grid = centred_grid((900, 900), 0.1)
@@ -99,7 +99,7 @@ def test_fresnel_zone_plate_focus_grows_with_the_square_of_its_zones():
 
 @pytest.mark.parametrize(("phase_step", "efficiency"), [(0.0, 1 / math.pi**2), (math.pi, 4 / math.pi**2)])
 def test_first_order_of_a_zone_plate(phase_step, efficiency):
-    # Power at the focus relative to that of a perfect lens over the same aperture: (eta_1) by amplitude.
+    # The efficiency is the intensity at the focus relative to that of a perfect lens of the same aperture.
     z, count = 300.0, 40
     edges = [math.sqrt((z + m * WAVELENGTH_UM / 2) ** 2 - z**2) for m in range(count + 1)]
     grid = centred_grid((1760, 1760), 0.1)
@@ -110,7 +110,7 @@ def test_first_order_of_a_zone_plate(phase_step, efficiency):
     plate = torch.where(odd, torch.tensor(second, dtype=torch.complex128), inside.to(torch.complex128))
     lens = inside * torch.exp(-1j * WAVENUMBER * ((r**2 + z**2).sqrt() - z))
     propagate = RSPropagator(grid, point(), z, WAVELENGTH_UM, dtype=torch.complex128)
-    # The undiffracted and the diverging orders add a few parts in count of stray amplitude on the axis.
+    # On the axis, the undiffracted and diverging orders add a stray amplitude of a few parts in ``count``.
     ratio = abs(complex(propagate(plate)) / complex(propagate(lens))) ** 2
     assert ratio == pytest.approx(efficiency, rel=0.02)
 
@@ -121,7 +121,7 @@ def test_talbot_image_shifts_by_half_a_period_at_half_the_distance():
     grid = centred_grid((1, 1000), 0.25)
     wide = centred_grid((600, 1000), 0.25)
     grating = (1 + 0.5 * np.cos(2 * np.pi * wide.x_um / period))[None, :] * np.ones((600, 1))
-    middle = slice(380, 620)  # away from the edges, whose waves reach about 30 µm inwards
+    middle = slice(380, 620)  # exclude the edges, whose waves extend about 30 µm inwards
     for distance, shift in ((talbot, 0), (talbot / 2, 16)):
         propagate = RSPropagator(wide, grid, distance, WAVELENGTH_UM, dtype=torch.complex128)
         seen = propagate(torch.from_numpy(grating).to(torch.complex128)).abs().numpy()[0] ** 2
@@ -139,7 +139,7 @@ def test_grating_order_lands_where_the_grating_equation_says(order):
     target = centred_grid((400, 400), pitch, (0.0, 0.8 * landing))
     intensity = RSPropagator(grid, target, z, WAVELENGTH_UM, dtype=torch.complex128)(beam).abs().square()
     centroid = float((intensity.sum(0) * torch.from_numpy(target.x_um)).sum() / intensity.sum())
-    # The wavelet spectrum of a 12 µm beam shifts its centroid by sec^3(theta), below 0.02 µm here.
+    # The spread of angles in a 12 µm beam shifts its centroid by sec^3(theta), here below 0.02 µm.
     assert centroid == pytest.approx(landing, abs=pitch / 2)
 
 
@@ -150,11 +150,11 @@ def test_radial_path_equals_the_closed_forms_and_the_plane_path():
     distance = math.hypot(a, z)
     exact = np.exp(1j * WAVENUMBER * z) - z / distance * np.exp(1j * WAVENUMBER * distance)
     flat = propagate(torch.ones(400, dtype=torch.complex128))
-    # With two Gauss nodes on a 0.1 µm ring the phase span is 0.13 rad, and the error is below span^4 / 4320.
+    # With two Gauss nodes on a 0.1 µm ring, the phase spans 0.13 rad. The error is below span^4 / 4320.
     assert abs(complex(flat[0]) - exact) / abs(exact) < 1e-6
     fine, aperture = circular_aperture(0.05, a)
     for index, r in enumerate(radii.tolist()):
         plane = RSPropagator(fine, point((0.0, r), 0.05), z, WAVELENGTH_UM, dtype=torch.complex128)
-        # The pixelated circle of the plane path carries an edge error of a few 1e-4.
+        # The pixelated circle of the plane path has an edge error of a few 1e-4.
         assert abs(complex(plane(aperture)) - complex(flat[index])) < 2e-3
     assert float(propagate.ring_area_um2.sum()) == pytest.approx(math.pi * a**2, rel=1e-12)

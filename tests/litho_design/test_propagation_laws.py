@@ -71,7 +71,7 @@ def test_adjoint_and_gradient(name):
     v = random_field(target.shape, seed=1)
     forward = (propagate(u).conj() * v).sum()
     backward = (u.conj() * propagate.adjoint(v)).sum()
-    # Both are the same sum of products; only rounding differs.
+    # Both are the same sum of products, so only rounding differs.
     assert (forward - backward).abs().item() < 1e-10 * forward.abs().item()
     forward.real.backward()
     assert torch.allclose(u.grad, propagate.adjoint(v), rtol=1e-10, atol=1e-12)
@@ -91,7 +91,7 @@ def test_every_separation_lies_at_its_index_of_a_circular_convolution(here, ther
     ("here", "there"), [((30, 33), (400, 21)), ((401, 64), (26, 333)), ((32, 32), (32, 32))]
 )
 def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offset_um, distance):
-    """A ray at f goes z tan; from any source point it and its copies a period on meet the target once."""
+    """Check that the band has the frequencies whose rays hit the target once, not again a period away."""
     source, target = centred_grid(here, 0.4), centred_grid(there, 0.4, (offset_um, -offset_um))
     for axis, band in enumerate(spectrum_axes(source, target, distance, WAVELENGTH_UM)):
         sine = WAVELENGTH_UM * band.frequency.numpy()
@@ -106,14 +106,14 @@ def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offs
             (target.y_um if axis == 0 else target.x_um)[0] - (source.y_um if axis == 0 else source.x_um)[0]
         )
     if abs(distance) > 5000:
-        assert not band.inside.all(), "the period is long enough: nothing is tested"
+        assert not band.inside.all(), "the period is so long that this tests nothing"
 
 
 @pytest.mark.parametrize(
     ("there", "offset"), [((70, 41), (3, -9)), ((25, 90), (0, 0)), ((31, 32), (-11, 20))]
 )
 def test_asm_to_a_part_of_a_plane_equals_that_part_of_asm_to_the_whole_plane(there, offset):
-    """The size and place of the target do not change the wave that arrives there."""
+    """Check that the wave at a point does not depend on the size and place of the target."""
     source = centred_grid((34, 45), 0.4)
     whole = centred_grid((160, 170), 0.4)
     row, column = ((n - m) // 2 + shift for n, m, shift in zip(whole.shape, there, offset, strict=True))
@@ -124,7 +124,7 @@ def test_asm_to_a_part_of_a_plane_equals_that_part_of_asm_to_the_whole_plane(the
     everywhere = ASMPropagator(source, whole, **options)(field)
     part = ASMPropagator(source, PixelGrid(there, (0.4, 0.4), origin), **options)(field)
     wanted = everywhere[row : row + there[0], column : column + there[1]]
-    # The source holds nine decimals of the beam, and the band holds all its rays.
+    # The source contains the beam to nine decimals, and the band contains all its rays.
     assert (part - wanted).abs().max() < 1e-6 * everywhere.abs().max()
 
 
@@ -154,13 +154,13 @@ def test_asm_and_rs_agree_where_both_hold():
     arguments = (source, target, 10.0, WAVELENGTH_UM)
     rs = RSPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
     asm = ASMPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
-    # The beam is band-limited to well inside the band, so both methods are exact.
+    # The frequencies of the beam are well inside the band, so both methods are exact.
     assert (rs - asm).abs().max() < 1e-5 * rs.abs().max()
 
 
 def test_asm_and_rs_agree_on_a_rough_element():
-    # With padding to twice the grid the error was 6 to 13 %. Pixels below half a wavelength have grazing
-    # rays, which no period holds. 1 % is promised.
+    # With padding to twice the grid, the error was 6 to 13 %. Pixels below half a wavelength have grazing
+    # rays, for which no period is long enough. The promised accuracy is 1 %.
     source = centred_grid((96, 96), 0.1)
     cells = torch.randint(0, 13, (24, 24), generator=torch.Generator().manual_seed(0)) * 0.1
     height = torch.nn.functional.avg_pool2d(
@@ -175,7 +175,7 @@ def test_asm_and_rs_agree_on_a_rough_element():
 
 @pytest.mark.parametrize("distance", [5.0, 30.0])
 def test_asm_is_exact_on_pixels_too_coarse_for_the_kernel(distance):
-    """Where the Rayleigh-Sommerfeld kernel is aliased, a wave within its band still has an exact result."""
+    """Check a wave within its band on pixels for which the Rayleigh-Sommerfeld kernel is aliased."""
     count, pitch = 64, 0.4
     coarse, fine = centred_grid((count,) * 2, pitch), centred_grid((4 * count,) * 2, pitch / 4)
     assert distance < 2 * sampling_limit_um(coarse, coarse, WAVELENGTH_UM)
@@ -184,7 +184,7 @@ def test_asm_is_exact_on_pixels_too_coarse_for_the_kernel(distance):
     x = torch.arange(count) - (count - 1) / 2
     window = torch.exp(-(((x[:, None] ** 2 + x[None, :] ** 2) / (count / 6) ** 2) ** 2))
     wave = torch.fft.ifft2(torch.fft.fft2(random_field((count, count))) * low) * window
-    # The same wave on finer pixels, on which the kernel is not aliased.
+    # Compute the same wave on finer pixels, on which the kernel is not aliased.
     offset = torch.from_numpy(fine.x_um)[:, None] - coarse.x_um[0]
     between = torch.exp(2j * math.pi * offset * frequency[None, :] / pitch)
     finer = between @ torch.fft.fft2(wave) @ between.T / count**2
@@ -192,7 +192,7 @@ def test_asm_is_exact_on_pixels_too_coarse_for_the_kernel(distance):
     optics = Optics(distance_um=distance)
     seen = make_propagator(coarse, coarse, optics, dtype=torch.complex128)
     assert isinstance(seen, ASMPropagator) == (distance < sampling_limit_um(coarse, coarse, WAVELENGTH_UM))
-    # The window widens the band: about 1e-5 of the wave lies beyond the Nyquist frequency.
+    # The window widens the band, so about 1e-5 of the wave is beyond the Nyquist frequency.
     assert (seen(wave) - expected).abs().max() < 1e-4 * expected.abs().max()
     forced = make_propagator(
         coarse, coarse, optics.model_copy(update={"propagation": "angular-spectrum"}), dtype=torch.complex128
@@ -218,7 +218,7 @@ def test_asm_semigroup_and_reversal():
     assert (asm(0.0)(u) - u).abs().max() < 1e-12
 
 
-# With a pitch above half a wavelength there are no evanescent waves. Below it, this beam has none.
+# A pitch above half a wavelength excludes evanescent waves. At the finer pitch, this beam has none.
 @pytest.mark.parametrize("pitch", [0.35, 0.1])
 def test_energy_is_kept_by_asm(pitch):
     grid = centred_grid((360, 360), pitch)
@@ -273,7 +273,7 @@ def test_transfer_is_cached_on_the_device_but_not_saved():
 def test_distance_below_the_sampling_limit_is_refused():
     coarse = centred_grid((256, 256), 0.4)
     limit = sampling_limit_um(coarse, coarse, WAVELENGTH_UM)
-    # The largest separation is 255 pixels. The Nyquist limit demands x / (wavelength r) <= 1 / (2 pitch).
+    # The largest separation is 255 pixels. Nyquist requires x / (wavelength r) <= 1 / (2 pitch).
     assert limit == pytest.approx(255 * 0.4 * math.sqrt((0.8 / WAVELENGTH_UM) ** 2 - 1))
     with pytest.raises(InputError, match="angular spectrum"):
         RSPropagator(coarse, coarse, 0.99 * limit, WAVELENGTH_UM)
@@ -284,8 +284,8 @@ def test_distance_below_the_sampling_limit_is_refused():
 
 
 def test_draft_pitch_is_close_inside_the_window():
-    # Pixels of 0.2 µm average 2 x 2 heights of a layout of 0.4 µm cells. The heights are the same; only the
-    # source sampling differs. Angles inside the window stay below 19 degrees.
+    # Pixels of 0.2 µm average 2 x 2 heights of a layout with cells of 0.4 µm. The heights are the same, and
+    # only the sampling of the source differs. Angles inside the window are below 19°.
     cells = torch.randint(0, 13, (64, 64), generator=torch.Generator().manual_seed(0)) * 0.1
     optics = Optics()
     images = []
@@ -296,5 +296,5 @@ def test_draft_pitch_is_close_inside_the_window():
         propagate = RSPropagator(grid, window, 75.0, WAVELENGTH_UM, dtype=torch.complex128)
         images.append(intensity_share(propagate(element_field(height, grid, optics)), window))
     difference = (images[0] - images[1]).abs().sum() / images[0].sum()
-    # The midpoint rule on a 0.2 µm pixel dims a wave of 19 degrees by (pi 0.2 0.33 / 0.6328)^2 / 6 = 1.8 %.
+    # The midpoint rule on 0.2 µm pixels weakens a wave at 19° by (pi 0.2 0.33 / 0.6328)^2 / 6 = 1.8 %.
     assert difference < 0.02

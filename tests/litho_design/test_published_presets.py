@@ -1,4 +1,4 @@
-"""The presets ``paper`` and ``authors`` equal the settings of the paper and the published code, and run."""
+"""Check that the presets ``paper`` and ``authors`` equal the published settings, and that they run."""
 
 from __future__ import annotations
 
@@ -80,17 +80,17 @@ def test_presets_are_as_stated(preset, stated):
 
 
 def test_the_display_is_imaged_at_its_scale():
-    """A display of 36 mm stands at 140 mm. The published code draws objects as wide as its lens of 120 µm."""
+    """Check the scale of images: of a display of 36 mm at 140 mm, or 120 µm as in the published code."""
     for variant, image_um in (("paper", 36e3 * 0.4 / 140), ("authors", 120.0)):
         made = lens_settings("computational", variant)
         frame_px, pixel_um = made.imaging.object_px, made.imaging.pixel_px * made.layout.pitch_um
-        # The object lies inside the dark border, an eighth on each side, in whole pixels of 1 µm.
+        # The object is inside a dark border, an eighth on each side, in whole pixels of 1 µm.
         assert (frame_px - 2 * (frame_px // 8)) * pixel_um == pytest.approx(image_um, abs=0.5)
         (chart,) = object_stack(["chart"], frame_px)
         lit = chart.amax(0).nonzero()
         assert lit.max() - lit.min() < image_um / pixel_um
         assert made.view.window_px * made.layout.pitch_um == pytest.approx(image_um, abs=0.5)
-        # A period of the cut-off frequency has two pixels or more.
+        # A period at the cut-off frequency is at least two pixels long.
         cut_off_um = made.optics.wavelength_um / (2 * 60 / math.hypot(60, 400))
         assert pixel_um < cut_off_um / 2
 
@@ -109,12 +109,12 @@ def test_a_small_lens_of_each_preset_can_be_searched(variant, make_printer, tmp_
 
 def test_rings_of_the_published_code_are_as_wide_as_the_diagonal_of_a_pixel():
     cells = CellMap(lens_settings("direct", "authors").layout)
-    # The corner pixel is 599.5 √2 px from the middle.
+    # The corner pixel is 599.5 √2 px from the centre.
     assert cells.cells == (600,)
     y, x = torch.meshgrid(*[torch.arange(1200, dtype=torch.float64) - 599.5] * 2, indexing="ij")
     assert torch.equal(cells.ring, (torch.hypot(y, x) / 2**0.5).long())
     narrow = LayoutSettings(size_px=16, cell_um=0.05, symmetry="radial")
-    with pytest.raises(InputError, match="rings of a pixel"):
+    with pytest.raises(InputError, match="rings at least one pixel"):
         CellMap(narrow)
 
 
@@ -124,7 +124,7 @@ def test_a_strip_along_a_radius_has_the_rings_of_the_plane(cell_um):
     cells = CellMap(layout)
     strip = strip_rings(layout, 3, cells.cells[0])
     assert torch.equal(strip[3:5, 3:43], cells.ring[39:41, 40:])
-    # For a large lens, the radius runs along the two central rows.
+    # For a large lens, the radius is along the two central rows.
     along = RadiusMap(layout)
     radius_px = torch.arange(40) + 0.5
     assert torch.equal(along(torch.arange(40)), (radius_px / (cell_um / 0.1)).floor().long())
@@ -138,12 +138,12 @@ def test_a_soft_sample_is_the_expected_level_of_equation_a2(temperature):
     parameters = GumbelLevels(layout)
     parameters.start_random(1)
     torch.manual_seed(4)
-    # -log U is exponential, so the noise of equation A1, -log(-log U), is minus the log of that.
+    # -log U is exponential, so the noise of equation A1, -log(-log U), is minus the log of an exponential.
     noise = -torch.empty_like(parameters.logits).exponential_().log()
     weight = ((parameters.logits.detach() + noise).double() / temperature).exp()
     level = (torch.arange(13.0)[:, None, None] * weight).sum(0) / weight.sum(0)
     sample = parameters.sample(temperature, seed=4)[0, 0, ::4, ::4]
-    # Float32 of levels up to 12.
+    # Levels up to 12 are in float32.
     assert (sample - level).abs().max() < 1e-5
 
 
@@ -160,10 +160,10 @@ def test_the_learning_rate_falls_at_fixed_times_or_without_progress():
 
     halved = rates([1.0] * 7, rate_schedule="step", rate_factor=0.5, rate_iterations=3)
     assert halved == [8, 8, 8, 4, 4, 4, 2]
-    # The loss first improves. Then it makes no progress for three steps, one more than the allowed two.
+    # After improving, the loss makes no progress for three steps, one more than the two that are allowed.
     waited = rates([3, 2, 1, 1, 1, 1, 1], rate_schedule="plateau", rate_factor=0.1, rate_iterations=2)
     assert waited == pytest.approx([8] * 6 + [0.8])
-    # A direct lens has a loss below zero.
+    # The loss of a direct lens is negative.
     below = rates([-7, -7, -6.9995, -6.999], rate_schedule="plateau", rate_factor=0.5, rate_iterations=1)
     assert below == [8, 8, 8, 4]
     assert rates([1.0] * 3) == [8, 8, 8]
@@ -200,13 +200,13 @@ def test_a_resumed_search_goes_on_with_its_rate(schedule, tmp_path):
 
 
 def test_photon_noise_grows_with_the_signal_and_leaves_the_gradient_alone():
-    """A point PSF keeps half of the light. The variance of an image is b² + a · image."""
+    """Check images by a point PSF with half of the light, whose variance is b² + a · image."""
     grey = torch.tensor([0.25, 1.0])[:, None, None].expand(2, 400, 400).clone().requires_grad_()
     imaging = ImagingSettings(read_noise=0.02, photon_noise=0.004)
     seen = record(grey, torch.full((1, 1), 0.5), imaging, seed=1)
     for image, wanted in zip(seen.detach(), (0.125, 0.5), strict=True):
         variance = 0.02**2 + 0.004 * wanted
-        # From 160,000 draws, mean and variance are known to five standard errors.
+        # From 160,000 draws, mean and variance agree within five standard errors.
         assert float(image.mean()) == pytest.approx(wanted, abs=5 * math.sqrt(variance / 160_000))
         assert float(image.var()) == pytest.approx(variance, rel=5 * math.sqrt(2 / 160_000))
     seen.sum().backward()
@@ -229,6 +229,6 @@ def test_smooth_l1_is_half_a_square_below_a_tenth(make_printer):
     error = (richardson_lucy(record(objects, kernel, imaging, seed=0), kernel, 3) - objects).abs().double()
     assert 0.1 < (error < 0.1).double().mean() < 0.9
     smooth = torch.where(error < 0.1, error.square() / 0.2, error - 0.05)
-    # Means of 3072 numbers in float32.
+    # These are means of 3072 numbers in float32.
     assert found["l1"] == pytest.approx(float(error.mean()), rel=1e-5)
     assert found["smooth-l1"] == pytest.approx(float(smooth.mean()), rel=1e-5)

@@ -1,4 +1,4 @@
-"""Test the search for a layout whose print is a wanted relief."""
+"""Test the search for a layout whose print is a target relief."""
 
 from __future__ import annotations
 
@@ -37,41 +37,41 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     with torch.no_grad():
         printed = printer(cells.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None])[0, 0].numpy()
     made = correct(printed - 0.4, printer, tmp_path, settings=settings, announce=False)
-    # The zero of a relief is free in whole levels, each 62 nm in print.
+    # The zero of a relief may shift by whole levels, which are 62 nm high in print.
     levels_off = (made.predicted["offset_nm"] - 400) / 62
     assert levels_off == pytest.approx(round(levels_off), abs=0.1)
-    # Each cell that is one level off costs 62 nm x its share. A tenth of the cells gives 6 nm after the blur.
+    # A cell that is one level off is wrong by 62 nm. For a tenth of the cells, the blurred error is 6 nm.
     assert made.predicted["rms_nm"] < 6
     assert made.baselines["free levels"]["rms_nm"] < 6
     assert made.baselines["best affine"]["rms_nm"] > 3 * made.predicted["rms_nm"]
     assert made.baselines["uncorrected"]["rms_nm"] > made.baselines["best affine"]["rms_nm"]
-    # The design is scored again from its folder, as any other design.
+    # The design can be scored again from its folder, like any other design.
     loaded = load_design(tmp_path)
     assert loaded.score(loaded.expected_um).rms_nm == pytest.approx(made.predicted["rms_nm"], rel=1e-4)
     assert np.abs(np.load(tmp_path / "unprintable_um.npy")).mean() < 0.006
 
 
 def test_the_baselines_use_nominal_heights_and_the_best_gain_and_offset(make_printer):
-    """A printer of gain 1/2 without blur has a floor of 0.1 µm, so all figures follow by hand."""
+    """Check the baselines of a printer with gain 1/2, offset 0.1 µm and no blur, which are known by hand."""
     settings = relief_settings({"layout.size_px": 48, "layout.levels": 13})
     printer = make_printer(settings.layout, sigma_um=1e-3, gain=0.5, offset_um=0.1)
     wanted = np.repeat(0.1 * (np.arange(48) // 12), 48).reshape(48, 48).astype(np.float32)
     found = ReliefTask(settings, printer, inputs={"relief_um": wanted}).untouched()
-    # Levels 0 to 3 stay as they are and are not moved to the middle of the range.
+    # Levels 0 to 3 stay as they are, and are not shifted to the middle of the range.
     assert torch.equal(found["uncorrected"], torch.from_numpy(np.rint(wanted / 0.1)).long())
-    # Twice the steps, starting at any level, print the relief to the last bit of a float.
+    # Steps of two levels, starting at any level, print the relief to float precision.
     task = ReliefTask(settings, printer, inputs={"relief_um": wanted})
     baselines = {name: task.figures(task.printed_um(level)) for name, level in found.items()}
     assert baselines["best affine"]["rms_nm"] < 1e-3
     assert baselines["uncorrected"]["rms_nm"] == pytest.approx(0.5e3 * wanted.std(), rel=1e-4)
-    # A relief on a base of 0.3 µm keeps this base. One that reaches below 0 is lifted to 0.
+    # A relief on a base of 0.3 µm keeps this base. A relief that extends below 0 is lifted to 0.
     for shift_um, foot in ((0.3, 3), (-0.2, 0)):
         task = ReliefTask(settings, printer, inputs={"relief_um": wanted + np.float32(shift_um)})
         assert int(task.untouched()["uncorrected"].min()) == foot
 
 
 def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, make_printer):
-    """A model with a gain of 0.4 corrects by a factor of 2.5. Two judges print at nominal height."""
+    """Check a model of gain 0.4, which corrects by 2.5, with two judges that print near nominal heights."""
     settings = relief_settings({"layout.size_px": 48, "search.iterations": 10, "height_um": 0.4})
     layout = settings.layout
     model = make_printer(layout, sigma_um=0.05, gain=0.4, offset_um=0.0, name="low")
@@ -85,14 +85,14 @@ def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, m
     width = judged.width
     assert width.returned == "uncorrected"
     assert list(width.level_heights_um) == ["low", "j1.0", "j1.1"]
-    # The steps lie between levels, so a third of a step is lost by rounding. The judges err by no more than
+    # The steps are between levels, so rounding loses a third of a step. The errors of the judges are at most
     # this and a tenth.
     assert width.values("searched").max() > 3 * np.delete(width.values(), 0).max()
     assert "available models print the layout “uncorrected” better" in judged.notes[-1]
     said = width_sentence(judged)
     assert "3 models of this printer" in said
     assert "level 12 (0.480 to 1.320 µm)" in said
-    # If the search minimises the worst error, the layout is a compromise that beats both.
+    # If the search minimises the worst error, the layout is a compromise that is better than both.
     robust = correct("staircase", model, tmp_path / "robust", judges=judges, **fit)
     assert robust.width.searched_with == 3
     assert robust.width.values().max() <= min(width.values().max(), width.values("best affine").max()) + 1e-3
@@ -116,16 +116,16 @@ def test_the_offset_of_a_print_does_not_affect_the_yield(make_printer):
     drawn, found = passed(settings.window)
     assert found.share == 1
     assert {"rms_nm", "mae_nm", "p95_nm"} == set(found.figures)
-    # 10 nm / sqrt(2), whatever the offset; float32 is exact to 1e-4 nm.
+    # The error is 10 nm / sqrt(2), whatever the offset. Float32 is exact to 1e-4 nm.
     assert [one["rms_nm"] for one in drawn] == pytest.approx(
         [1e3 * (printed.numpy() - wanted).std()] * 20, abs=0.01
     )
-    # A gain is not an offset: 5 % of a staircase of 0.2 µm rms is more than the modelled error.
+    # A gain does matter: 5 % of a staircase of 0.2 µm rms is more than the modelled error.
     assert passed(settings.window.model_copy(update={"gain_sd": 0.05}))[1].share < 0.5
 
 
 def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_printer, refused):
-    """The model does not know its printer, whose gain falls smoothly to one side by up to 20 %."""
+    """Check a second round for a printer whose gain, unlike the model's, falls by 20 % from side to side."""
     settings = relief_settings(TINY | {"off_blur_um": 0.2})
     model = make_printer(settings.layout, sigma_um=0.15)
     cells = torch.from_numpy(np.random.default_rng(0).integers(3, 10, (24, 24))).float()
@@ -148,15 +148,15 @@ def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_pr
     def rms_nm(folder):
         return 1e3 * (printed_um(folder) - wanted).std()
 
-    # The error of the levels remains, 62 nm for a tenth of the cells. The slope of 50 nm rms is removed.
+    # The error due to levels remains, 62 nm for a tenth of the cells. The tilt of 50 nm rms is removed.
     assert rms_nm(first) > 20
     assert rms_nm(again) < rms_nm(first) / 3
-    # The figures compare the print as modelled with the wanted relief.
+    # The scores compare the modelled print with the target relief.
     expected = np.load(again / "predicted_height_um.npy")
     assert made.predicted["rms_nm"] == pytest.approx(1e3 * (expected - wanted).std(), rel=1e-4)
     assert made.predicted["rms_nm"] > 20
     assert made.baselines["uncorrected"] == load_design(first).record.baselines["uncorrected"]
-    # So small an element cannot be registered. A scan of another size does not lie on its pixels.
+    # Such a small element cannot be registered, and a scan of another size does not match its pixels.
     with pytest.raises(InputError, match="--scan-aligned"):
         measured_print(load_design(first), replace(scan, aligned=False))
     with pytest.raises(InputError, match="pixels of the element"):
@@ -171,7 +171,7 @@ def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_pr
 
 
 def test_the_part_of_a_relief_that_no_layout_prints_is_shown(tmp_path, monkeypatch, capsys):
-    """A step of one pixel cannot be printed. Neither can heights beyond the range of the levels."""
+    """Check a relief with steps of one pixel and heights beyond the levels, which cannot be printed."""
     words = ["correct", "staircase", "--model", "zoo:physics", "--size-px", "48", "--iterations", "10"]
     words += ["--set", "search.polish_rounds=0", "--set", "window.yield_draws=2", "--height-um", "1.5"]
     words += ["--judge", "none", "--out", str(tmp_path / "out")]
@@ -180,10 +180,10 @@ def test_the_part_of_a_relief_that_no_layout_prints_is_shown(tmp_path, monkeypat
         main()
     assert stop.value.code == 0
     said = capsys.readouterr()
-    assert "the levels print 0.841 µm" in said.err
-    assert "take --height-um 0.84" in said.err
+    assert "the levels print only 0.841 µm" in said.err
+    assert "use --height-um 0.84" in said.err
     assert "free levels" in said.out
-    assert "nm rms from the relief" in said.out
+    assert "nm rms error" in said.out
     rest = np.load(tmp_path / "out" / "unprintable_um.npy")
     assert rest.std() > 0.02
     assert rest.mean() == pytest.approx(0, abs=1e-5)

@@ -1,4 +1,4 @@
-"""Test the process window: its draws, its risk, and the gain of a robust search."""
+"""Test the process window: its draws, its risk, and the benefit of a robust search."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_draws_have_their_spread_and_repeat():
     window = ProcessWindow(gain_sd=0.05, defocus_sd_um=4.0, wavelength_sd_um=0.001)
     many = draws(window, Optics(), 4000)
     assert draws(window, Optics(), 3) == many[:3]
-    # Standard error of a standard deviation over 4000 draws is 1.1 %.
+    # From 4000 draws, a standard deviation has a standard error of 1.1 %.
     assert np.std([draw.gain for draw in many]) == pytest.approx(0.05, rel=0.05)
     assert np.std([draw.optics.distance_um for draw in many]) == pytest.approx(4.0, rel=0.05)
     assert np.std([draw.optics.wavelength_um for draw in many]) == pytest.approx(0.001, rel=0.05)
@@ -58,7 +58,7 @@ def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
     x = (torch.arange(128) + 0.5) * 0.1
     wave = torch.cos(2 * torch.pi * x / 1.6).double().expand(128, 128)
     blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(wave, 0.1)
-    # exp(-2 pi^2 sigma^2 f^2) with sigma 0.2, f = 1 / 1.6; the kernel is cut at four sigma.
+    # The factor is exp(-2 pi^2 sigma^2 f^2). The kernel is truncated at four sigma.
     expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
     middle = slice(32, 96)
     assert torch.allclose(blurred[middle, middle], expected * wave[middle, middle], atol=1e-3)
@@ -67,7 +67,7 @@ def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
 def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     tmp_path, small_settings, make_printer
 ):
-    # The element lies a third of a standard deviation below 1 µm, so some of 16 draws are behind it.
+    # The distance of 1 µm is a third of a standard deviation, so some of 16 draws are behind the element.
     settings = small_settings.model_copy(update={"optics": Optics(distance_um=1.0)})
     with pytest.raises(InputError, match=r"defocus spread of 3 µm.*defocus-sd-um"):
         design_hologram(
@@ -86,7 +86,7 @@ def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, 
     robust = nominal.model_copy(update={"window": spread})
     target = load_target("ring", 128)
     risks = {}
-    # These draws differ from those of the search: the gain must hold for unseen prints.
+    # These draws differ from those of the search, because the benefit must extend to unseen prints.
     unseen = robust.model_copy(update={"window": spread.model_copy(update={"seed": 1})})
     judge = HologramTask(unseen, make_printer(robust.layout), inputs={"target": target.pixels})
     for name, settings in (("nominal", nominal), ("robust", robust)):

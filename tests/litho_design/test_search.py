@@ -1,4 +1,4 @@
-"""A search reports only printable results: kept layout and history are of whole levels."""
+"""Check that a search reports only printable results: its layout and its history have whole levels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 LAYOUT = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
-# The target lies between two levels, so a layout of fractions scores better than any printable one.
+# The target is between levels, so a layout of fractional levels would score better than a printable one.
 WANTED = torch.linspace(0.6, 3.4, 16)[:, None].expand(16, 16)
 
 
@@ -22,10 +22,10 @@ def objective(level):
 @pytest.mark.parametrize("keep", ["best", "last"])
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
 def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
-    """Runs of 1, 2 … iterations end where a longer run was after as many iterations."""
+    """Check the history against runs of 1, 2 … iterations, which end like a longer run after as many."""
     told, shown = [], []
     for iterations in range(1, 6):
-        # Soft samples are used to the end. Their score would be far below that of the printable layout.
+        # Soft samples are used to the end, and differ much from the printable layout.
         settings = SearchSettings(
             parametrisation=parametrisation, keep=keep, iterations=iterations, evaluate_every=1,
             learning_rate=0.3, temperature_start=1.0, temperature_end=1.0,
@@ -42,12 +42,12 @@ def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
         assert state.best_loss == pytest.approx(kept)
         assert kept == pytest.approx(min(told) if keep == "best" else told[-1])
     samples = [entry["sample_loss"] for entry in state.history]
-    # The test can fail: samples and layouts differ here.
+    # Samples and layouts differ, so the test could fail.
     assert max(abs(one - other) for one, other in zip(samples, told, strict=True)) > 0.01
 
 
 def test_a_search_takes_the_same_steps_in_height_for_any_number_of_levels():
-    """More levels only divide the same height: a gradient in levels shrinks as their number grows."""
+    """Check different numbers of levels for the same height, although gradients per level differ."""
     ways = []
     for levels in (2, 13, 121):
         layout = LayoutSettings(size_px=16, cell_um=0.4, levels=levels)
@@ -60,6 +60,6 @@ def test_a_search_takes_the_same_steps_in_height_for_any_number_of_levels():
 
         search_layout(parameters, share_off, settings)
         ways.append(parameters.height.detach() / (levels - 1))
-    # Adam sees the scale of a gradient only by the 1e-8 beside its size, here 1e-4 of it with 121 levels:
-    # 1e-4 of each of 30 steps of 1/12 of the height.
+    # Adam depends on the scale of a gradient only by the 1e-8 added to its size. With 121 levels, this is
+    # 1e-4 of the size, and changes each of 30 steps of 1/12 of the height by 1e-4.
     assert all(torch.allclose(way, ways[1], rtol=0, atol=2.5e-4) for way in ways)

@@ -1,4 +1,4 @@
-"""Settings: each is stated in one field, and can be reached by option, by --set and from a file."""
+"""Check that each setting is stated in one field and can be set by option, by --set and from a file."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from litho_design.reliefs.task import ReliefTask
 
 ROOT = Path(__file__).parents[2]
 PRESETS = {"hoe": HologramSettings(), "lens": LensSettings(), "relief": ReliefSettings()}
-# Another preset or another kind of lens changes more than one value.
+# Choosing another preset or another kind of lens changes more than one value.
 CHOOSE = ("variant", "task")
 of_each_task = pytest.mark.parametrize("task", PRESETS)
 
 
 def other(leaf: Leaf):
-    """Return another value that the field accepts."""
+    """Return a different value that the field accepts."""
     if get_origin(leaf.kind) is Literal:
         return next(choice for choice in get_args(leaf.kind) if choice != leaf.value)
     if isinstance(leaf.value, tuple):
@@ -66,7 +66,7 @@ def flat(content, prefix=""):
 
 
 def single(task):
-    """Return the settings that can change without changing others."""
+    """Return the settings that can be changed without changing others."""
     return [leaf for leaf in leaves(PRESETS[task]) if leaf.path not in CHOOSE]
 
 
@@ -86,7 +86,7 @@ def test_every_setting_is_reached_by_its_path(task):
 
 @of_each_task
 def test_every_option_sets_the_field_that_states_it(task):
-    """All options are set at once, so that an option that sets a wrong field is noticed."""
+    """Check all options at once, so that an option that sets a wrong field is noticed."""
     given = [leaf for leaf in single(task) if leaf.options]
     for number in range(max(len(leaf.options) for leaf in given)):
         having = [leaf for leaf in given if len(leaf.options) > number]
@@ -206,13 +206,13 @@ def test_python_takes_the_same_changes():
         (("hoe", "--set", "loss.weight=0.2"), "got 'loss.weight', wanted loss.scale"),
         (("hoe", "--set", "los.weight=0.2"), "got 'los.weight', wanted variant, layout, optics, search"),
         (("hoe", "--set", "loss=0.2"), "wanted one of loss.scale"),
-        (("hoe", "--set", "layout.levels.top=2"), "layout.levels, which is a value"),
+        (("hoe", "--set", "layout.levels.top=2"), "layout.levels itself, which is a single value"),
         (("hoe", "--set", "layout.levels"), "PATH=VALUE"),
         (("hoe", "--set", "layout.levels=many"), "setting layout.levels, got 'many', wanted a valid integer"),
         (("hoe", "--set", "layout.levels=1"), "wanted greater than or equal to 2"),
         (("hoe", "--set", "optics.distance_um=Infinity"), "wanted a finite number"),
         (("hoe", "--set", "layout.levels=5", "--set", "layout.levels=6"), "layout.levels twice"),
-        (("hoe", "--levels", "5", "--set", "layout.levels=6"), "an option sets too"),
+        (("hoe", "--levels", "5", "--set", "layout.levels=6"), "another option sets too"),
         (("hoe", "--config", "unknown.toml"), "setting of unknown.toml, got 'layout.size'"),
         (("hoe", "--config", "broken.toml"), "broken.toml"),
         (("hoe", "--config", "list.json"), "wanted settings by name"),
@@ -220,7 +220,7 @@ def test_python_takes_the_same_changes():
         (("hoe", "--config", "nowhere.toml"), "nowhere.toml"),
         (("hoe", "--config", "settings.yaml"), ".toml or .json"),
         (("lens", "--set", "imaging.objects=[]"), "are needed"),
-        (("compare", "--models", "none", "--window-px", "64"), "--window-px, got an option of the hoe task"),
+        (("compare", "--models", "none", "--window-px", "64"), "got an option of another task"),
         (("compare", "--models", "none", "--task", "lens-direct", "--loss-scale", "paper"), "--loss-scale"),
         (("compare", "--models", "none", "--set", "search.seed=4"), "search.seed"),
     ],
@@ -253,7 +253,7 @@ def test_help_needs_no_torch():
 
 
 def test_designs_with_removed_choices_stay_readable():
-    """Any other unknown choice is refused."""
+    """Check that removed choices can still be read, and that other unknown choices are refused."""
     now = hologram_settings().model_dump(mode="json")
     older = {
         **now,

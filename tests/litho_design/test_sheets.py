@@ -1,4 +1,4 @@
-"""Test sheets of prints, with the virtual fab as the lab: its files, and what is made of its scans."""
+"""Test sheets of prints with the virtual fab as the lab: the files, and the results from its scans."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def sheet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def print_and_scan(sheet: Path) -> None:
-    """Print and scan every field in the order of the file for the printer, as a lab would."""
+    """Print and scan all fields as a lab would."""
     fab = Fab(Printer(), Microscope(), Noise(), KnobBoard((), 0), 5)
     record = Sheet.read(sheet)
     for folder in ("scans", SCANS_OF_HOLOGRAMS):
@@ -68,7 +68,7 @@ def test_a_lab_gets_every_file_and_instructions(sheet):
         assert f"| {field.order} | {field.id} |" in page
         if field.file:
             assert field.file in page
-            # The files for the printer hold the layouts that the card states.
+            # The files for the printer contain the layouts that the card names.
             assert _levels(sheet, field.file).shape == (160, 160)
     levels = {arm: np.load(design_folder(sheet / HOLOGRAM, arm, 0) / "layout_level.npy") for arm in ARMS}
     for arm in ARMS:
@@ -79,20 +79,20 @@ def test_a_lab_gets_every_file_and_instructions(sheet):
 
 
 def test_scans_of_a_sheet_give_a_model_a_loop_and_a_comparison(sheet, tmp_path, monkeypatch):
-    # One base is enough: the loop and its results are the same for every base.
+    # One base is enough to test the steps, which are the same for every base.
     monkeypatch.setattr(read, "_BASE", "affine-mtf")
     with pytest.raises(InputError, match=r"without.*none.*hologram-scans"):
         read_sheet(sheet, tmp_path / "answer")
     assert not (tmp_path / "answer").exists()
     print_and_scan(sheet)
     result = read_sheet(sheet, tmp_path / "answer")
-    # Witnesses are stored and not used for training, including empty ones.
+    # Witnesses, including empty ones, are stored but not used for training.
     store = open_store(tmp_path / "answer" / "prints.zarr")
     assert len(store.scans()) == 7
     assert store.references() == {"flat": "flat", "steps": "steps", "substrate": "substrate"}
     printer = load_frozen(tmp_path / "answer" / "printer")
     assert printer.card["levels"] == 13
-    # The noise of the fab is some nm. The model of the design was trained on another printer.
+    # The noise of the fab is some nm, and the model of the design was trained on another printer.
     assert 1 < result.own_nm < result.model_nm
     assert result.measured_db["with"] == pytest.approx(result.expected_db["with"], abs=6)
     assert f"{result.measured_db['with']:.1f} instead of" in sheet_text(result)

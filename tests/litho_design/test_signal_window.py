@@ -1,4 +1,4 @@
-"""Outside the signal window of a hologram the light is free, which improves the likeness inside."""
+"""Check that light outside the signal window of a hologram is free, which improves the image inside."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_light_beyond_the_signal_window_is_free():
     target[8:12, 8:12] = 1
     settings = HologramLoss(signal_window_um=0.35, efficiency_weight=0.0)
     counted = counted_pixels(target, settings, 0.1)
-    # The window reaches three pixels beyond the target along the axes, and less along the diagonal.
+    # The window extends three pixels beyond the target along the axes, and less along the diagonal.
     assert counted[10, 5]
     assert not counted[10, 4]
     assert not counted[5, 5]
@@ -37,7 +37,7 @@ def test_light_beyond_the_signal_window_is_free():
 
 
 def test_a_signal_window_gives_more_likeness_inside_for_less_light(tmp_path):
-    """The start and the search use this freedom. Both figures are reported, also for the baselines."""
+    """Check that a signal window improves the image inside it, and that its score is reported."""
     made, size = {}, {"layout.size_px": 64, "optics.distance_um": 12, "search.iterations": 15}
     for name, window_um in (("whole", 0.0), ("window", 0.5)):
         loss = {"loss.signal_window_um": window_um, "loss.efficiency_weight": 0}

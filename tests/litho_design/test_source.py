@@ -1,4 +1,4 @@
-"""An incoherent source of some width and bandwidth, against convolution, brute force and a point."""
+"""Test a source with width and bandwidth against convolution, brute force and a point source."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_point_of_one_colour_is_the_plane_wave_bit_for_bit(height):
 
 
 def test_a_wide_source_blurs_the_image_by_its_disc(height):
-    """The sine s moves the image of a thin element by z s (Fresnel), so a disc of sines blurs by a disc."""
+    """Check that a disc of sines s blurs the image by a disc, as each shifts it by z s (Fresnel)."""
     sine, z_um = 0.02, OPTICS.distance_um
     wide = HologramBench(LAYOUT, OPTICS.model_copy(update={"source_sine": sine}))(height).numpy()
     point = HologramBench(LAYOUT, OPTICS)(height).numpy()
@@ -43,12 +43,12 @@ def test_a_wide_source_blurs_the_image_by_its_disc(height):
     disc = (np.hypot(x[:, None], x) < z_um * sine).astype(np.float32)
     middle = np.s_[20:-20, 20:-20]
     expected = cv2.filter2D(point, -1, disc / disc.sum())[middle]
-    # A few directions represent the disc, closer than lambda z / D = 2 um. Without the disc the error is far
-    # larger.
+    # A few directions, less than lambda z / D = 2 µm apart, represent the disc. Without the disc, the error
+    # is far larger.
     error = np.abs(wide[middle] - expected).mean() / expected.mean()
     assert error < 0.05
     assert np.abs(point[middle] - expected).mean() / expected.mean() > 4 * error
-    # The variance of a disc along one axis is a quarter of its squared radius. The centre does not move.
+    # The variance of a disc along one axis is a quarter of its squared radius. Its centre does not move.
     parts = coherent_parts(OPTICS.model_copy(update={"source_sine": sine, "incidence_x": 0.1}), 100.0)
     sines = np.array([part.incidence_x for _, part in parts])
     assert sines.mean() == pytest.approx(0.1, abs=1e-12)
@@ -70,7 +70,7 @@ def test_a_bandwidth_is_the_mean_over_a_gaussian_spectrum(height):
 
 
 def test_scores_add_up_the_light_of_the_source(height):
-    """A wide source averages speckle away. Power is kept, except for light that leaves the window."""
+    """Check that a wide source reduces speckle and keeps the power, except for light outside the window."""
     target = torch.zeros(128, 128)
     target[30:100, 30:100] = 1
     contrast, power = {}, {}
@@ -83,7 +83,7 @@ def test_scores_add_up_the_light_of_the_source(height):
 
 
 def test_a_hologram_is_designed_for_its_source(tmp_path):
-    """The source is a setting of the scene: search, score, yield and a reopened design use the same light."""
+    """Check that search, score, yield and a reloaded design use the source in the settings."""
     changes = {
         "layout.size_px": 64, "optics.distance_um": 20, "optics.source_sine": 0.05, "search.iterations": 4,
         "search.polish_rounds": 0, "window.yield_draws": 2,

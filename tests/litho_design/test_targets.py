@@ -1,4 +1,4 @@
-"""Targets: drawings by code and pictures from files."""
+"""Test targets that are drawn by code or read from picture files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def test_drawings_look_the_same_at_every_size(name):
     assert fine.min() >= 0
     assert fine.max() == 1
     assert 0.01 < fine.mean() < 0.3
-    # Averaging 2 x 2 must give the coarse drawing; edges may differ by the oversampling of 4.
+    # Averaging 2 x 2 pixels must give the coarse drawing. Edges may differ by the oversampling of 4.
     assert np.abs(fine.reshape(128, 2, 128, 2).mean((1, 3)) - coarse).mean() < 0.02
 
 
 def test_ring_area():
-    # pi (0.28^2 - 0.2^2) of the unit square; the 4-fold oversampled edge is exact to 1e-3.
+    # The ring covers pi (0.28^2 - 0.2^2) of the unit square. With 4-fold oversampling, this is exact to 1e-3.
     assert draw_target("ring", 256).mean() == pytest.approx(np.pi * (0.28**2 - 0.2**2), abs=1e-3)
 
 
@@ -34,7 +34,7 @@ def test_another_size_and_shape_are_adapted_and_reported(tmp_path):
     assert image.shape == (200, 200)
     assert "60 x 100" in record.adaptation
     assert "from 100 to 200" in record.adaptation
-    # Letterboxed by 20 rows, then doubled: the block's centre goes from (19.5, 39.5) to (79.5, 79.5).
+    # After 20 more rows on top and doubling, the block's centre is at (79.5, 79.5), not (19.5, 39.5).
     rows, columns = np.indices(image.shape)
     assert (image * rows).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
     assert (image * columns).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
@@ -46,7 +46,7 @@ def test_a_colour_is_its_luma_and_what_is_transparent_is_black(tmp_path, depth):
     white = np.iinfo(depth).max
     colour = np.zeros((4, 2, 4), depth)
     colour[:, :, :3], colour[:2, :, 3], colour[2:, :, 3] = [white // 4, white // 2, white], white, white // 2
-    # ITU-R BT.601 of blue, green and red.
+    # This is the luma by ITU-R BT.601 of blue, green and red.
     luma = 0.114 * 0.25 + 0.587 * 0.5 + 0.299
     for channels, shares in ((4, [1, 0.5]), (3, [1, 1])):
         cv2.imwrite(str(tmp_path / "colour.png"), colour[..., :channels])

@@ -1,4 +1,4 @@
-"""Small scans whose print and microscope are known, for the tests of the measurement model and the twin."""
+"""Make small scans of a known print by a known microscope, to test the measurement model and the twin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FIELDS, BLUR_UM = 2, 0.25
 
 
 def blank_scan(number: int, size_px: int = 48, **facts: object) -> PrintedScan:
-    """Return scan ``number`` with a random layout and all heights 0; each print has two fields."""
+    """Return a scan with a random layout and all heights 0. Each print has two scans."""
     rng = np.random.default_rng([3, number])
     smooth = gaussian_filter(rng.normal(size=(size_px, size_px)), 4.0, mode="wrap")
     ranks = np.argsort(np.argsort(smooth.ravel())).reshape(smooth.shape) / smooth.size
@@ -47,13 +47,13 @@ def blank_scans(count: int, size_px: int = 48) -> list[PrintedScan]:
 
 
 def with_heights(scans: Sequence[PrintedScan], heights_um: Sequence[np.ndarray]) -> list[PrintedScan]:
-    """Return the scans with these measured heights (ny, nx), µm."""
+    """Return the scans with their measured heights replaced by ``heights_um``."""
     pairs = zip(scans, heights_um, strict=True)
     return [replace(scan, height_um=own.astype(np.float32)) for scan, own in pairs]
 
 
 def base_model() -> Simulator:
-    """Return a base of one blur, with a gain and an offset that differ from their initial values."""
+    """Return a base model with one blur, whose gain and offset differ from their initial values."""
     facts = {"pitch_um": PITCH_UM, "level_height_um": LEVEL_HEIGHT_UM, "levels": LEVELS}
     model = build_model("affine-mtf", sigmas_um=(BLUR_UM,), **facts)
     for name, value in (("weights", 0.9), ("offset_um", 0.03)):
@@ -70,7 +70,7 @@ def planted(
     seed: int = 0,
     base: Simulator | None = None,
 ) -> list[PrintedScan]:
-    """Return scans of a base with effects (name, grouping, values by label), datums and white noise."""
+    """Return scans of a base model with effects (name, grouping, values by label), datums and white noise."""
     rng = np.random.default_rng(seed)
     scans = blank_scans(count, size_px)
     prepared = prepare_scans(scans)
@@ -85,11 +85,11 @@ def planted(
 
 
 def study_of(scans: Sequence[PrintedScan], folds: int = 3, seed: int = 0) -> Study:
-    """Return a study of the prepared scans, which are assigned to the folds in turn."""
+    """Return a study of the scans, which are assigned to the folds in turn."""
     prepared: list[PreparedScan] = prepare_scans(scans)
     return Study(prepared, np.arange(len(scans)) % folds, seed)
 
 
 def bare_state(study: Study) -> State:
-    """Return the fitted state of the base without effects."""
+    """Return the base model fitted to the study, without effects."""
     return fit_state(Twin.bare(base_model()), study)

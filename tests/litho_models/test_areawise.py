@@ -1,4 +1,4 @@
-"""A frozen PBL predicts the same print as the trained PBL, with and without the border."""
+"""Check that a frozen PBL predicts the same print as the trained PBL, with and without the border."""
 
 from __future__ import annotations
 

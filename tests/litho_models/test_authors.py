@@ -30,7 +30,7 @@ def test_heights_are_those_of_the_authors_classes(name, oracles, measured_prints
         with torch.no_grad():
             height = model(layout_um[None, None])[0, 0].numpy()
         theirs = oracle[f"height_um_{field}_{size}" + (f"_every_{every}px" if every > 1 else "")]
-        # Both sum in float32, in different orders. 0.01 nm is a hundred times the rounding error of 1 µm.
+        # The two sum in float32 in different orders. 0.01 nm is a hundred times the rounding error at 1 µm.
         assert np.abs(height[::every, ::every] - theirs).max() < 1e-5
 
 
@@ -39,7 +39,7 @@ def layout_um(size: int = 60) -> np.ndarray:
 
 
 def blurred(field: np.ndarray, sigma_px: float, radius: int) -> np.ndarray:
-    """Blur with one normalised two-dimensional kernel; the field is zero outside."""
+    """Blur a field with a normalised two-dimensional kernel. Outside, the field is zero."""
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     kernel = np.exp(-(x**2 + y**2) / (2 * sigma_px**2))
     return fftconvolve(field, kernel / kernel.sum(), mode="same")
@@ -71,7 +71,7 @@ def test_physics_is_the_transcribed_equations_in_micrometres(variant):
     dose = blurred(initial, sigma_px, radius(sigma_px))
     lowest = dose.min() if variant == "paper" else 0.0
     kept = v["kappa_min"] + (1 - v["kappa_min"]) * (dose - lowest) / (dose.max() - lowest)
-    # 1e-6 nm leaves room only for rounding in double precision.
+    # A tolerance of 1e-6 nm allows only for rounding in double precision.
     assert np.abs(in_double(model, layout_um()) - (initial * kept + v["bias_um"])).max() < 1e-9
 
 
@@ -147,7 +147,7 @@ def test_models_frozen_with_the_older_variants_print_as_they_did():
     y = torch.arange(60.0)
     wave = torch.sin(y[:, None] / 7) * torch.cos(y[None, :] / 11)
     field = (torch.floor(6.5 + 6 * wave) * 0.1)[None, None]
-    # The settings that older cards hold, and the heights that the code of that time computed.
+    # These are the settings in older cards, and the heights that the code at that time computed.
     shared = {
         "alpha_init": 1.0,
         "bias_init_um": 0.0,
@@ -163,7 +163,7 @@ def test_models_frozen_with_the_older_variants_print_as_they_did():
         with torch.no_grad():
             height = build_model("physics", variant, **card)(field)[0, 0]
         assert [float(height[at]) for at in ((0, 0), (30, 30), (13, 50))] == pytest.approx(then, abs=2e-7)
-    # A card without the new fields stands for the older form of the model.
+    # A card without the new fields describes the older form of the model.
     config = build_model("physics").Config(variant="authors")
     assert (config.reference_height_um, config.kernel_support, config.gain_init) == (None, "four-sigma", None)
     assert build_model("pbl", "authors", kernel_support="four-sigma").reach_px == 8 + 50 + 5

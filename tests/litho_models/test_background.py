@@ -1,4 +1,4 @@
-"""The background that all scans share is learned on training scans, reported, and never in a design."""
+"""Check the background that scans share: learned on training scans, reported, and never part of a design."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def some_background(**changes):
 
 def test_a_planted_bow_is_learned_whatever_each_scan_s_datum(scans):
     learned = learn_background(scans, [truth(scan) for scan in scans])
-    # 6 · 128² heights with 4 nm of white noise: the standard error is 4/√(6 · 128²)/0.3 = 0.04 nm for a term
-    # whose standard deviation is 0.3. The tolerance is five standard errors.
+    # There are 6 · 128² heights with white noise of 4 nm. For a term whose standard deviation is 0.3, the
+    # standard error is 4/√(6 · 128²)/0.3 = 0.04 nm. The tolerance is five standard errors.
     assert learned.yy_nm == pytest.approx(BOW_NM, abs=0.2)
     for other in (learned.x_nm, learned.y_nm, learned.xx_nm, learned.xy_nm):
         assert abs(other) < 0.2
@@ -97,7 +97,7 @@ def test_the_background_changes_only_errors_by_policies_without_smooth_terms(res
         assert stated == {e.policy: e.mae_nm for e in without.by_policy if e.policy not in SMOOTH}
         for ours, theirs in zip(with_it.by_policy, without.by_policy, strict=True):
             if ours.policy in SMOOTH:
-                # The terms of these policies span the background, so least squares finds the same residual.
+                # These policies fit terms that span the background, so the residual is the same.
                 assert ours.mae_nm == pytest.approx(theirs.mae_nm, abs=1e-6)
             elif ours.policy != "none":
                 assert ours.mae_nm < theirs.mae_nm
@@ -108,12 +108,12 @@ def test_the_background_changes_only_errors_by_policies_without_smooth_terms(res
 
 
 def test_the_shared_part_of_a_prediction_is_learned_on_training_scans_only(result, scans, store, tmp_path):
-    """Scans share only a bow: the error is as with a background, and held-out heights do not matter."""
+    """Check the shared part of scans that share only a bow, which a background describes equally well."""
     shared = benchmark(store, tmp_path / "shared", models=("affine",), folds=2, background="shared")
     (scores,) = shared.scores
     usual = next(one for one in result[0].scores if one.model == "affine")
     plain = next(error for error in usual.without_background if error.policy == "offset")
-    # At most a tenth of the error that the bow of 40 nm would add may remain.
+    # Without a background, the bow of 40 nm adds an error. At most a tenth of this may remain.
     lost = scores.mae_datum_free_nm - usual.mae_datum_free_nm
     assert abs(lost) < 0.1 * (plain.mae_nm - usual.mae_datum_free_nm)
     fold = plan_folds(scans, [], "grouped", folds=2)[0]

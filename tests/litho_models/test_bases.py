@@ -1,4 +1,4 @@
-"""A base that is trained without each fold, or frozen: nothing leaks, and effects it lacks are found."""
+"""Check bases that are trained without each fold, or frozen: no leaks, and missing effects are found."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:
 
 
 def trained(scans: Sequence[PrintedScan]) -> Simulator:
-    """Return a base with gain and offset of these scans, as a network comes trained from outside the loop."""
+    """Return a base trained on these scans outside the loop: only its gain and offset are fitted."""
     model = base_model()
     with torch.no_grad():
         own = [model(torch.from_numpy(scan.layout_um)[None, None]).numpy().ravel() for scan in scans]
@@ -80,7 +80,7 @@ def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]
 def test_no_height_of_a_held_out_scan_changes_its_prediction(
     base: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The base, the law, the print and what scans share are all found without the held-out scan's heights."""
+    """Check that base, law, print and shared terms do not depend on the held-out scan's heights."""
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
     study = study_of(scans)
@@ -93,8 +93,8 @@ def test_no_height_of_a_held_out_scan_changes_its_prediction(
         state = fit_state(closed.base.twin.with_effect(LAW, ALL, {"": STRENGTH}), closed.study)
         fitted.append(state.per_fold[1].vector)
         maps.append(np.stack([HeldOut(closed).maps_um(state)[i] for i in out]))
-    # The fit without a fold starts from the fit to all scans and stops when a step reduces the error by less
-    # than 1e-4 of it. So a trace of the common start may stay; the heights were changed by up to 0.2 µm.
+    # The fit without a fold starts from the fit to all scans. It stops when a step reduces the error by less
+    # than 1e-4 of it, so it may depend slightly on this start. The heights were changed by up to 0.2 µm.
     assert np.abs(maps[1] - maps[0]).max() < 1e-4
     np.testing.assert_allclose(fitted[1], fitted[0], atol=1e-3)
 
@@ -117,7 +117,7 @@ def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
 
 
 class Carrying(nn.Module):
-    """The base with the law built in, as if trained elsewhere."""
+    """Imitate a base that was trained elsewhere and already contains the law."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -148,7 +148,7 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
     coarse = [replace(scan, pitch_um=0.2) for scan in scans]
     with pytest.raises(InputError, match=r"pitch of zoo:pbl, got 0.1 µm, wanted 0.2 µm"):
         chosen("zoo:pbl", coarse, tmp_path)
-    # A frozen base is not fitted, so nested selection has nothing to choose anew.
+    # A frozen base is not fitted, so nested selection cannot repeat any choice.
     store = write_store(tmp_path / "s.zarr", scans)
     with pytest.raises(InputError, match="--nested with zoo:pbl"):
         close_loop(store, tmp_path / "out", base="zoo:pbl", nested="prints")
@@ -156,19 +156,19 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
-    """For a network trained per fold, loop and benchmark use the same fits and state the same error."""
+    """Check that loop and benchmark use the same fits of a network and state the same error."""
     store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=56, bow_um=0.02)), tmp_path / "l"
     scored = benchmark(store, tmp_path / "b", models=["features"], folds=2).scores[0]
     loop = close_loop(store, out, base="features", folds=2, cache=tmp_path / "b" / "cache")
     first = loop.error("base", "offset", "published")
     assert first is not None
-    # Predictions, pixels, terms and background are the same; only the order of summation differs.
+    # Predictions, pixels, terms and background are the same. Only the order of sums differs.
     assert first.mae_nm == pytest.approx(scored.mae_datum_free_nm, abs=1e-6)
     assert first.rmse_nm == pytest.approx(
         np.sqrt(np.mean([row.rmse_datum_free_nm**2 for row in scored.scans])), abs=1e-6
     )
     assert first.by_scan_nm == pytest.approx({row.scan: row.mae_datum_free_nm for row in scored.scans})
-    # The background matters for this: without it the same fits have another error.
+    # This depends on the background: without it, the same fits have another error.
     bare = loop.error("base", "offset", "print alone")
     assert bare is not None
     assert abs(bare.mae_nm - first.mae_nm) > 0.1

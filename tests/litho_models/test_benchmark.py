@@ -1,4 +1,4 @@
-"""Benchmarks and evaluations: no leak of held-out scans, no repeated fit, no mix of protocols."""
+"""Check that benchmarks do not leak held-out scans, repeat fits or compare different protocols."""
 
 from __future__ import annotations
 
@@ -107,8 +107,8 @@ def test_the_report_shows_the_result_in_words_tables_and_pictures(result):
     )
     assert all(f">{scan_id}<" in page for scan_id in [*record.split.scored_ids, *MODELS])
     assert all(f">{scores.mae_abs_nm:.2f}<" in page for scores in record.scores)
-    # Five figures: errors, one scan as maps and as a profile, levels, frequencies.
-    # tests/test_reports.py checks such a report in a browser.
+    # The five figures show errors, one scan as maps and as a profile, levels, and frequencies.
+    # A report is checked in a browser by tests/test_reports.py.
     assert page.count("data:image/svg+xml;base64,") == 5
 
 
@@ -120,7 +120,7 @@ def test_errors_of_training_and_of_held_out_scans_are_defined_alike(result):
         plain = next(error for error in scores.without_background if error.policy == "offset")
         assert np.mean([held_out[row.scan] for row in scores.scans]) == pytest.approx(plain.mae_nm)
         assert all(fit.diagnostics.training_nm > 0 for fit in fits)
-        # Gauss-Newton fits have no checkpoint to choose, so no inner validation.
+        # Gauss-Newton fits choose no checkpoint, so they need no inner validation.
         assert all(fit.diagnostics.inner_validation_nm is None for fit in fits)
 
 
@@ -205,7 +205,7 @@ def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_re
 
 
 def listed_store(path, scans, lab, name):
-    """Write a store that lists a separate raw file for each scan, and one layout file for all."""
+    """Write a store whose manifest lists a raw file for each scan and one layout file for all scans."""
     write_store(path, scans, name=name)
     rows = [{"scan": scan.id, "sha256": f"{lab} {scan.id}", "read": '{"unit": "um"}'} for scan in scans]
     rows += [{"scan": scan.id, "sha256": "one layout", "read": "{}"} for scan in scans]
@@ -214,7 +214,7 @@ def listed_store(path, scans, lab, name):
     return path
 
 
-# One scan more, so that another one is drawn; one fewer, so that a sixth is one scan and no longer two.
+# With one scan more, another scan is drawn. With one fewer, a sixth is one scan instead of two.
 @pytest.mark.parametrize(("before", "after"), [(4, 5), (9, 8)])
 def test_locked_files_stay_locked_in_a_store_of_more_or_fewer_scans(tmp_path, before, after):
     first = listed_store(tmp_path / "first.zarr", make_scans(before, size_px=48), "ours", "first")
@@ -260,7 +260,7 @@ def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_fil
         build_dataset(card, tmp_path / f"{name}.zarr")
         return tmp_path / f"{name}.zarr"
 
-    # The new store draws the added scan, instead of the scan that the first store drew.
+    # The lock box drawn from the new store holds the added scan, not the scan drawn from the first store.
     first, anew = built("first", 4, 0, "affine"), built("anew", 5, 0, "homography")
     run = train(first, "identity", tmp_path / "run")
     drawn = locked_ids(open_store(anew).scans())
@@ -315,7 +315,7 @@ def test_first_folds_are_those_of_the_whole_and_never_replace_it(result, store, 
     with pytest.raises(InputError, match=r"first folds.*got 4, wanted 1 to 3"):
         benchmark(store, tmp_path / "none", models=["affine"], folds=3, first_folds=4, settings=SETTINGS)
     benchmark(store, tmp_path / "part", models=["affine"], folds=3, settings=SETTINGS)
-    with pytest.raises(InputError, match=r"holds a benchmark of \d+ scans more"):
+    with pytest.raises(InputError, match=r"holds a benchmark that also contains \d+ other scans"):
         benchmark(store, tmp_path / "part", models=["affine"], folds=3, first_folds=2, settings=SETTINGS)
 
 
@@ -337,7 +337,7 @@ def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, 
     analyse_noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
     scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=tmp_path / "noise")
     assert scored.noise_floor.kind == "measured"
-    # 64² independent heights: the relative standard error of σ is 1/√(2 · 64²) = 1.1 %; three are allowed.
+    # With 64² independent heights, the relative standard error of σ is 1/√(2 · 64²) = 1.1 %. Allow three.
     assert scored.noise_floor.rmse_nm == pytest.approx(16, rel=0.034)
     assert "flat print" in (tmp_path / "b" / "report.html").read_text()
     train(store, "identity", tmp_path / "run")

@@ -1,4 +1,4 @@
-"""What a benchmark says of few scans, too many folds, and a folder that holds another benchmark."""
+"""Check what a benchmark says about few scans, too many folds, and a folder with another benchmark."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A blind board for anyone's loop: what it hides, how the judge rates answers, and a plain loop."""
+"""Test blind boards for any loop: what they hide, how the judge rates answers, and a plain loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXAMPLE = f"{sys.executable} {Path(__file__).parents[2] / 'examples' / 'plain_lo
 
 
 def at_half_its_limit(draw: Draw, jobs: object) -> list[Planted]:
-    """Plant every cause at half its limit, which is strong, without a search for the strength."""
+    """Plant every cause at half its largest strength, without a search for the strength."""
     return [
         Planted(draw=one, names=[*names_of(one.name)], strength=0.5, unit="1", at_limit=False, rms_nm=40.0)
         for one in draw.causes
@@ -49,9 +49,9 @@ def test_a_board_gives_stores_to_the_loop_and_hides_the_causes(board):
     assert [one.names for one in planted] == [["vignetting"]]
     assert Hidden.read(board / HIDDEN / "01").planted == []
     for store in (board / STORES).iterdir():
-        # Registration may fail on fields this small.
+        # Registration may fail on such small fields.
         assert len(open_store(store).scans()) >= 4
-        # Neither the name of a cause nor its strength is in any file of a store.
+        # No file of a store contains the name of a cause or its strength.
         texts = [file.read_bytes() for file in store.rglob("*.json")]
         assert texts
         assert not any(b"vignetting" in text or b"strength" in text for text in texts)
@@ -68,7 +68,7 @@ def test_a_board_of_other_settings_is_refused(board):
         (Answer(found=[Found(names=["vignetting"], knowledge="cause")]), ["right", "false-positive"], [0, 1]),
         (Answer(left=True), ["noticed", "false-positive"], [0, 0]),
         (Answer(), ["missed", "clean"], [0, 0]),
-        # One error alone has nothing to be compared with.
+        # A single error cannot be compared with anything.
         (Answer(after_nm=20), ["missed", "clean"], [0, 0]),
     ],
 )
@@ -78,14 +78,14 @@ def test_the_judge_compares_names_with_what_is_hidden(board, tmp_path, answer, w
     assert [len(trial.false_names) for trial in scoreboard.trials] == false
 
 
-def test_the_error_that_a_loop_states_stands_beside_that_of_the_true_models(board, tmp_path):
-    """The error of the true models is that of the noise, which is the same for every loop."""
+def test_a_trial_has_the_errors_of_the_loop_and_of_the_true_models(board, tmp_path):
+    """Check that a trial records the error that the loop states and that of the true models, the noise."""
     said = iter([Answer(before_nm=30, after_nm=20), Answer(before_nm=30, after_nm=10)])
     first, second = judge_board(board, tmp_path / "one", lambda store, folder: next(said)).trials
     assert first.errors is not None
     assert second.errors is not None
     assert (first.errors.after_nm, second.errors.after_nm) == (20, 10)
-    # The fab's default noise, nm.
+    # This is the fab's default noise in nm.
     assert 1 < second.errors.floor_nm < 15
 
 
@@ -112,7 +112,7 @@ def test_an_error_in_a_loop_is_its_result_and_a_judged_trial_is_kept(board, tmp_
 
 
 def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monkeypatch, capsys):
-    """Run the example as a user would. The command prints the figures of the scoreboard."""
+    """Run the example as a user would, and check that the command prints the scoreboard."""
     words = ["litho-models", "board", "judge", str(board), "--out", str(tmp_path / "j"), "--loop", EXAMPLE]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit, match="0"):
@@ -122,7 +122,7 @@ def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monke
     assert printed.startswith("\n".join(figure_lines(scoreboard)))
     strong = scoreboard.trials[0]
     assert [one.verdict for one in strong.outcomes] == ["right"]
-    # The cause makes most of the error, and only the covariate "vignetting" has its form.
+    # The cause is responsible for most of the error, and only the covariate "vignetting" has its form.
     assert strong.errors.after_nm < 0.5 * strong.errors.before_nm
     assert strong.found == plain_loop(board / STORES / "00.zarr", tmp_path).found
 

@@ -1,4 +1,4 @@
-"""The check that a printer still behaves as its model says: alarm rates, invariances, the command."""
+"""Test the check that a printer still behaves as its model says: alarm rates, invariances, the command."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _equal(reference: np.ndarray, new: np.ndarray) -> Series:
 
 
 def _alarms(series: Series, rate: float) -> np.ndarray:
-    """Return, for each set, whether it raises an alarm, from the t statistics of all comparisons."""
+    """Return for each set whether the t statistic of any comparison raises an alarm."""
     n, m = series.reference.shape[-1], series.new.shape[-1]
     sizes, errors = step_statistics(series)
     limit = stats.t.isf(rate * shares(m) / 2, n + m - 2)
@@ -59,7 +59,7 @@ def test_each_comparison_is_students_t_with_the_spread_pooled():
     sizes, errors = step_statistics(_equal(reference, new))
     for first in range(4):
         before, after = np.concatenate([reference, new[:first]]), new[first:]
-        # Only rounding differs.
+        # The results differ only by rounding.
         assert sizes[first] == pytest.approx(after.mean() - before.mean(), rel=1e-9)
         if len(after) > 1:
             of_scipy = stats.ttest_ind(after, before).statistic
@@ -86,7 +86,7 @@ def test_an_unchanged_printer_alarms_no_more_often_than_stated(n, m):
     series = _gaussian(n, m, draws)
     alarms = _alarms(series, rate)
     share = float(alarms.mean())
-    # Four standard errors. The share may be lower, as correlated comparisons are counted as independent.
+    # Allow four standard errors. The share may be lower, as correlated comparisons are counted separately.
     assert share <= rate + 4 * np.sqrt(rate / draws)
     assert share >= 0.5 * rate
     for number in (0, int(np.argmax(alarms))):
@@ -95,7 +95,7 @@ def test_an_unchanged_printer_alarms_no_more_often_than_stated(n, m):
 
 
 def test_a_normal_distribution_in_place_of_students_would_alarm_too_often():
-    """With 5 reference prints the normal distribution gives over 3 % false alarms in place of 0.5 %."""
+    """Check that with 5 reference prints a normal distribution gives over 3 % false alarms, not 0.5 %."""
     random = np.random.default_rng(1)
     series = _equal(random.normal(size=(20_000, 5)), random.normal(size=(20_000, 1)))
     z = (series.new[:, 0] - series.reference.mean(axis=1)) / series.reference.std(axis=1, ddof=1)
@@ -104,12 +104,12 @@ def test_a_normal_distribution_in_place_of_students_would_alarm_too_often():
 
 @pytest.mark.parametrize(("n", "m"), [(12, 3), (48, 3), (24, 1), (10, 7)])
 def test_a_step_is_noticed_as_often_as_the_closed_form_says(n, m):
-    """The last three of Gaussian prints have a step of three standard deviations."""
+    """Check Gaussian prints, of which the last three are shifted by three standard deviations."""
     rate, draws, soon = 0.004, 20_000, min(3, m)
     stated = chance_to_notice(3, np.ones(n), np.ones(m), rate)
     moved = np.where(np.arange(m) >= m - soon, 3.0, 0.0)
     share = float(_alarms(_gaussian(n, m, draws, moved, seed=4), rate).mean())
-    # At least the stated share, less four standard errors. Other comparisons notice some more steps.
+    # The lower limit allows four standard errors. Other comparisons also notice some steps.
     error = np.sqrt(stated * (1 - stated) / draws)
     assert stated - 4 * error <= share <= stated + 0.02 + 4 * error
 
@@ -117,12 +117,12 @@ def test_a_step_is_noticed_as_often_as_the_closed_form_says(n, m):
 def test_the_noticeable_step_is_noticed_in_nine_of_ten_cases():
     variances = np.array([1.0, 1.0, 0.5, 2.0, 1.0]), np.array([1.5, 1.0])
     step = noticeable_step(*variances, rate=0.01)
-    # The step is a root that is found to 1e-12.
+    # The step is a root, found to 1e-12.
     assert chance_to_notice(step, *variances, rate=0.01) == pytest.approx(0.9, abs=1e-6)
 
 
 def test_the_page_has_the_chance_to_notice_three_spreads_within_three_prints():
-    """Compute the table of docs/checking.md: our rule, the most powerful test, and the noticeable step."""
+    """Check the table of docs/checking.md: our rule, the most powerful test, and the noticeable step."""
     page = (Path(__file__).parents[2] / "docs" / "checking.md").read_text("utf-8")
     own = rates(DEFAULT_RATE)[0]
     for prints in (6, 12, 24, 30, 48):
@@ -146,7 +146,7 @@ def test_an_alarm_names_the_first_changed_print_and_the_size_of_the_step():
 
 
 def _scans(values: np.ndarray, first_print: int = 0) -> list[ScanFigures]:
-    """Return scans with these gains, an array of (prints, scans)."""
+    """Return the figures of scans whose gains are given by print and scan."""
     return [
         ScanFigures(
             scan=f"P{p}F{f}",
@@ -166,7 +166,7 @@ def _scans(values: np.ndarray, first_print: int = 0) -> list[ScanFigures]:
 
 @pytest.mark.parametrize(("between", "within"), [(0.02, 0.0), (0.0, 0.02), (0.01, 0.02)])
 def test_prints_of_one_scan_beside_prints_of_four_keep_the_rate(between, within):
-    """A print with one scan varies more. If this were ignored, the second case would alarm far too often."""
+    """Check prints with one scan, whose values vary more; ignoring this would cause too many alarms."""
     draws, rate = 800, 0.05
     random = np.random.default_rng(11)
     alarms = 0
@@ -180,7 +180,7 @@ def test_prints_of_one_scan_beside_prints_of_four_keep_the_rate(between, within)
         parts = [print_values(group, GAIN) for group in (rows, fresh)]
         variances = [spread.relative_variance(part.counts) for part in parts]
         alarms += likeliest_step(Series(parts[0].values, parts[1].values, *variances))[1] <= rate
-    # Four standard errors are 0.031. The variances are themselves estimated.
+    # The tolerance of 0.031 is four standard errors. The variances are estimated too.
     assert alarms / draws <= rate + 0.031
 
 
@@ -189,7 +189,7 @@ def test_a_steady_drift_reaches_the_tolerance_when_it_must():
     reference = np.arange(12) < 9
     found = forecast(values, np.ones(12), reference, tolerance=0.2)
     assert found.per_print == pytest.approx(0.01)
-    # 0.2 is reached 20 prints after the middle of the reference, which is print 4, 7 prints ago.
+    # The middle of the reference is print 4, which was 7 prints ago. The drift reaches 0.2 20 prints later.
     assert found.prints_left in (12, 13)  # rounding may exclude the thirteenth
     noisy = values + np.random.default_rng(0).normal(0, 0.02, 12)
     assert forecast(noisy, np.ones(12), reference, tolerance=0.2).prints_left < 12
@@ -207,11 +207,11 @@ def test_figures_do_not_depend_on_datum_tilt_and_bow_and_follow_the_height():
     assert plain is not None
     assert moved is not None
     assert taller is not None
-    # Heights in float32: the error of 0.5 µm is 3e-8 µm, and is averaged over thousands of pixels.
+    # A float32 height of 0.5 µm has an error of 3e-8 µm, which is averaged over thousands of pixels.
     assert moved.gain == pytest.approx(plain.gain, rel=1e-6)
     assert moved.error_nm == pytest.approx(plain.error_nm, rel=1e-5)
     assert taller.gain == pytest.approx(1.1 * plain.gain, rel=1e-6)
-    # It equals the gain of the joint fit of all seven terms.
+    # The gain equals that of a joint fit of all seven terms.
     joint = fitted_terms(scan.height_um, level, scan.valid, POLICIES["full"])[0]
     assert np.min(np.abs(1 + joint - plain.gain)) < 1e-6
 
@@ -230,7 +230,7 @@ def test_a_flat_layout_has_no_gain():
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """Write a model of twelve prints and new sets: one unchanged, one 8 % taller from its second print on."""
+    """Write a model of twelve prints and new sets: one unchanged, one 8 % taller from the second print on."""
     folder = tmp_path_factory.mktemp("check")
     scans = make_scans(44, size_px=64)
     made = write_store(folder / "made.zarr", scans[:24])
@@ -256,12 +256,12 @@ def test_unchanged_prints_raise_no_alarm_whatever_their_datum(lab, tmp_path):
     other = [make_scan(number, size_px=64, datum_um=0.4, bow_um=0.1) for number in range(24, 32)]
     moved = check(lab / "model", write_store(tmp_path / "moved.zarr", other, name="m"), tmp_path / "moved")
     for first, second in zip(plain.figures, moved.figures, strict=True):
-        # Heights are kept in float32, as above.
+        # Heights have float32 errors, as above.
         assert second.p == pytest.approx(first.p, rel=1e-3)
 
 
 def test_an_error_that_the_fit_has_made_small_is_not_judged(lab, tmp_path):
-    """Else unchanged prints would alarm, as their error is larger than that of prints the fit has seen."""
+    """Check this because the error of unchanged new prints is larger than that of prints used in the fit."""
     shutil.copytree(lab / "model", tmp_path / "model")
     card = json.loads((tmp_path / "model" / "card.json").read_text())
     honest = check(lab / "model", lab / "same.zarr", tmp_path / "honest")
@@ -303,13 +303,17 @@ def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
 @pytest.mark.parametrize(
     ("store", "given", "message"),
     [
-        ("same", {"reference": "few"}, "prints in the reference, got 3, wanted 4 at least"),
-        ("same", {"reference": "same"}, "scans of .* too, wanted prints that are not checked; --new"),
+        ("same", {"reference": "few"}, "prints in the reference, got 3, wanted at least 4"),
+        (
+            "same",
+            {"reference": "same"},
+            "which shares scans with .*, wanted a store without the checked scans; use --new",
+        ),
         ("same", {"reference": "made", "new": ["12"]}, "got both a store and --new, wanted only one"),
         ("same", {"new": ["99"]}, "--new, got 99, wanted a print of"),
-        ("made", {}, "got the prints from which the model was made, wanted new prints; --reference"),
+        ("made", {}, "got the prints from which the model was made, wanted new prints; use --reference"),
         ("same", {"false_alarms": 0.0}, "rate of false alarms, got 0.0"),
-        ("same", {"tolerance": 5.0}, "0.05 is 5 %"),
+        ("same", {"tolerance": 5.0}, "0.05 for 5 %"),
         ("pitch", {}, "pitch_um for model affine, got 0.2 µm, wanted 0.1 µm"),
         ("other", {"reference": "other-too"}, "the model describes another printer"),
     ],
@@ -337,7 +341,9 @@ def test_an_older_card_asks_for_a_reference_and_takes_one(lab, tmp_path):
     card = json.loads(file.read_text())
     assert len(card.pop("baseline")) == 20
     file.write_text(json.dumps(card))
-    with pytest.raises(InputError, match="got no figures of prints, wanted a reference; --reference"):
+    with pytest.raises(
+        InputError, match="got no values of reference prints, wanted a reference; use --reference"
+    ):
         check(tmp_path / "older", lab / "same.zarr", tmp_path / "out")
     given = check(tmp_path / "older", lab / "same.zarr", tmp_path / "out", reference=lab / "made.zarr")
     of_card = check(lab / "model", lab / "same.zarr", tmp_path / "of_card")

@@ -1,4 +1,4 @@
-"""Curves over spatial frequency are right for a known blur and white noise, and obey Parseval."""
+"""Check curves over spatial frequency for a known blur and white noise, and by Parseval's theorem."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def test_white_error_has_a_flat_density_whose_integral_is_its_variance():
     curves = transfer_curves([scan_of(height)], [height + white(1, 0.010)])
     width = curves.frequency_per_um[1] - curves.frequency_per_um[0]
     for density in (curves.error_psd_x, curves.error_psd_y):
-        # The density is one-sided: σ² spread over 0 … 5 cycles/µm. A band averages 512 lines of some 7
-        # independent frequencies, as the Hann window joins neighbours. Its standard error is 1/√3500 = 1.7 %;
-        # four are allowed. The lowest band is left out, as each line's mean is removed.
+        # The one-sided density spreads σ² over 0 … 5 cycles/µm. A band averages 512 lines and about 7
+        # frequencies that are independent in spite of the Hann window. Its standard error is 1/√3500 = 1.7 %;
+        # four are allowed. The lowest band is excluded, because each line's mean is removed.
         assert density[1:] == pytest.approx([100 / 5] * (len(density) - 1), rel=0.07)
         assert np.sum(density) * width == pytest.approx(100, rel=0.03)
 
@@ -40,9 +40,9 @@ def test_a_blurred_prediction_follows_as_far_as_the_gaussian_does():
     sigma_um = 0.15
     curves = transfer_curves([scan_of(height)], [gaussian_filter1d(height, sigma_um / PITCH_UM, axis=1)])
     frequency = np.array(curves.frequency_per_um)
-    # A band is 0.2 cycles/µm wide. Within it the Gaussian changes by 0.06 at most.
+    # Within a band, which is 0.2 cycles/µm wide, the Gaussian changes by at most 0.06.
     assert curves.gain_x == pytest.approx(np.exp(-2 * (np.pi * sigma_um * frequency) ** 2), abs=0.02)
-    # The blur is across lines along y, so it weakens all their frequencies equally.
+    # The blur acts across the lines along y, so it reduces all their frequencies equally.
     assert np.ptp(curves.gain_y[1:]) < 0.05
 
 

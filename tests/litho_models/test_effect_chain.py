@@ -1,4 +1,4 @@
-"""Effects around a base model act in the order of their stages, and design sees no measurement effect."""
+"""Check that effects act in the order of their stages, and that designs see no measurement effect."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Check effects on a plane, where each formula of the catalogue is simple arithmetic.
 
-The formulas are written again from the docstrings. On a plane the slope is known, a smoothed height equals
-the height, and heights at other places follow from the plane.
+The formulas are written anew from the docstrings. On a plane, the slope is known, smoothing does not change
+the height, and the heights at displaced positions are known.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SLOPE_Y, SLOPE_X, MIDDLE_UM = 0.03, -0.05, 0.6
 LOCAL_Y, LOCAL_X = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * PITCH_UM for n in SHAPE), indexing="ij")
 Y, X = LOCAL_Y + CENTRE_UM[0], LOCAL_X + CENTRE_UM[1]
 R2 = X**2 + Y**2
-# The position from -1 to 1 along the lines of the scan, and half the length of a line.
+# The position along a scan line, from -1 to 1, and half the length of a line.
 U, HALF_X_UM = np.linspace(-1, 1, SHAPE[1]), SHAPE[1] * PITCH_UM / 2
 M = MIDDLE_UM + SLOPE_Y * LOCAL_Y + SLOPE_X * LOCAL_X
 NEARBY = M / FULL_UM
@@ -80,20 +80,20 @@ FORMULAS: dict[str, tuple[dict[str, float], Callable[..., Field]]] = {
         {"radius_um": 0.4, "along": 1.0, "across": 1.0},
         lambda radius_um, **shape: M + radius_um * (SLOPE_X**2 + SLOPE_Y**2) / 2,
     ),
-    # Effects that blur, fill narrow structures or lag around their mean delay leave a plane unchanged.
+    # A plane is not changed by effects that blur, fill narrow structures, or lag relative to a mean delay.
     "diffusion-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "resampling-blur": ({"variance_um2": 0.04}, lambda **values: M),
     "long-range-proximity": ({"weight": 0.3, "length_um": 0.3}, lambda **values: M),
     "feature-collapse": ({"fraction": 0.3, "width_um": 0.5}, lambda **values: M),
     "trench-residue": ({"fraction": 0.3, "width_um": 0.5}, lambda **values: M),
-    # A falling edge lags by l. The mean delay, which is removed, is that of falling and rising edges.
+    # A falling edge lags by l. The mean delay of falling and rising edges is removed.
     "feedback-lag": (
         {"length_um": 0.2, "rising": 0.5, "direction": 1.0},
         lambda length_um, rising, direction: M - SLOPE_X * length_um * (1 - (1 + rising) / 2),
     ),
     "galvo-lag": ({"length_um": 0.1, "direction": 1.0}, lambda **values: M),
 }
-# PyTorch's cubic (a = -0.75) is off by 0.0482 px on a ramp.
+# PyTorch's cubic interpolation (a = -0.75) is wrong by 0.0482 px on a ramp.
 RAMP_OFF_UM = 0.0482 * PITCH_UM * abs(SLOPE_X)
 WARPS = {"galvo-nonlinearity", "piezo-nonlinearity", "feedback-lag"}
 

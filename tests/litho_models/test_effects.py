@@ -1,4 +1,4 @@
-"""Check one contract for every effect of the catalogue, then closed forms of single effects."""
+"""Check the contract that every effect of the catalogue obeys, and closed forms of single effects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PER_EFFECT = pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for eff
 
 
 def field(seed: int = 0) -> tuple[torch.Tensor, FieldContext]:
-    """Return a smooth random height with flat parts, (1, 1, 36, 44) float64 µm, and its context."""
+    """Return a smooth random height in µm with flat parts, as float64 (1, 1, 36, 44), and its context."""
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.randint(0, 13, (1, 1, 9, 11), generator=generator).double() * 0.1
     layout = torch.nn.functional.interpolate(coarse, size=(36, 44), mode="nearest")
@@ -41,7 +41,7 @@ def test_the_catalogue_is_not_empty_and_holds_all_stages_and_roles() -> None:
     assert {effect.role for effect in EFFECTS} == {"process", "measurement", "nuisance", "undetermined"}
 
 
-# Stage and role of each effect, as known from print and microscope. Designs use only process effects.
+# The stage and role of each effect follow from how it arises. Designs use only process effects.
 BELONGS_TO = {
     ("exposure", "process"): """elliptical-psf long-range-proximity dose-exponent galvo-lag
         galvo-nonlinearity vignetting
@@ -59,7 +59,7 @@ BELONGS_TO = {
 def test_every_effect_has_the_stage_and_role_of_the_table() -> None:
     wanted = {name: key for key, names in BELONGS_TO.items() for name in names.split()}
     assert len(wanted) > 30
-    # A new effect states its own role. The effects in this table must keep theirs.
+    # New effects need not be in the table, but the effects of the table must keep their roles.
     assert {name: (CATALOGUE[name].stage, CATALOGUE[name].role) for name in wanted} == wanted
 
 
@@ -74,7 +74,7 @@ def test_fab_and_catalogue_agree_on_stage_and_role() -> None:
 def test_off_is_the_identity(effect: Effect) -> None:
     array, context = input_of(effect)
     changed = effect(array, effect.off_values(), context)
-    # Some effects rescale and scale back in float64. 1e-7 is nine orders of magnitude above its rounding.
+    # Some effects scale heights and scale them back in float64, whose rounding is far below 1e-7.
     assert torch.allclose(changed, array, rtol=0, atol=1e-7)
 
 
@@ -102,16 +102,16 @@ def test_gradient_equals_finite_difference(effect: Effect) -> None:
             (gradient,) = torch.autograd.grad(
                 (weights * effect(array, {**typical, name: value}, context)).sum(), value
             )
-            # At its null an amplitude may be at a bound or a kink. So step to one side only.
+            # At its null, an amplitude may be at a bound or a kink, so step to one side only.
             step = 1e-6 * (parameter.typical - parameter.null if at == parameter.off else parameter.typical)
-            # An angle may have no typical size. Its step is then relative to its range.
+            # The typical size of an angle may be zero. Its step is then relative to its range.
             step = step or 1e-6 * (parameter.typical or parameter.upper - parameter.lower)
             up, here, down = (
                 float((weights * effect(array, {**typical, name: at + k * step}, context)).sum())
                 for k in (1, 0, -1)
             )
             difference = (up - here) / step if at == parameter.off else (up - down) / (2 * step)
-            # The truncation error of one-sided differences is ~ step, rounding is ~ 1e-16 * 1584 px / step.
+            # One-sided differences err by truncation, ~ step, and by rounding, ~ 1e-16 * 1584 px / step.
             assert float(gradient) == pytest.approx(difference, rel=1e-3, abs=1e-3)
 
 
@@ -152,7 +152,7 @@ def test_the_tip_is_tried_at_the_radius_that_the_store_knows() -> None:
 
     assert radii(0.13) == [0.04, 0.4, 0.13]
     assert radii(None) == radii(0.39) == [0.04, 0.4]
-    # No larger than the upper bound of the effect.
+    # The radius is limited to the upper bound of the effect.
     assert radii(9.0) == [0.04, 0.4, get_effect("tip-dilation").parameters["radius_um"].upper]
 
 
@@ -189,7 +189,7 @@ def test_diffusion_blur_has_the_gaussian_transfer(frequency: float) -> None:
     wave, context = cosine(frequency, "x")
     changed = get_effect("diffusion-blur")(wave, {"variance_um2": 0.09}, context)
     expected = math.exp(-2 * math.pi**2 * 0.09 * frequency**2)
-    # The edge is 6 µm = 20 sigma away, so only rounding differs.
+    # The edge is 6 µm = 20 sigma away, so the results differ only by rounding.
     assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-9)
 
 
@@ -201,7 +201,7 @@ def test_elliptical_psf_widens_one_axis_and_narrows_the_other() -> None:
         wave, context = cosine(frequency, axis)
         changed = effect(wave, effect.with_values({"stretch_um2": stretch}), context)
         expected = math.exp(-(math.pi**2) * (isotropic + sign * stretch) * frequency**2)
-        # The sharpened axis rings slightly, as the layout is cut at its edge.
+        # Along the sharpened axis there is slight ringing, because the layout ends at its edge.
         assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-5)
 
 
@@ -211,7 +211,7 @@ def test_long_range_proximity_keeps_a_flat_dose_and_damps_a_fast_wave() -> None:
     changed = effect(wave, {"weight": 0.25, "length_um": 2.0}, context)
     blur = math.exp(-2 * math.pi**2 * 4 * 0.25)
     expected = (1 + 0.25 * blur) / 1.25
-    # The edge is 3 sigma from the window, so it changes the background by 0.2 * erfc(3 / sqrt 2) / 2 at most.
+    # The edge is 3 sigma from the window and changes the background by at most 0.2 * erfc(3 / sqrt 2) / 2.
     assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=3e-4)
     flat, context = torch.ones(1, 1, 240, 240, dtype=torch.float64), context
     inner = effect(flat, {"weight": 0.25, "length_um": 2.0}, context)[..., 60:-60, 60:-60]
@@ -224,11 +224,11 @@ def test_galvo_lag_is_a_one_sided_exponential_of_unit_area_about_its_mean() -> N
     point[..., 4, 100] = 1
     context = FieldContext(point, PITCH_UM, 1.2)
     response = effect(point, {"length_um": 0.3, "direction": 1.0}, context)[0, 0, 4]
-    # The tail starts early by the mean delay of 0.3 µm = 3 px, so that the mean response is not shifted.
+    # The tail starts 3 px early, by the mean delay of 0.3 µm, so that the mean response is not shifted.
     lags = torch.arange(200) - 100 + 3
     ratio = 0.3 / (0.3 + PITCH_UM)
     expected = torch.where(lags >= 0, (1 - ratio) * ratio ** lags.clamp(min=0).double(), 0.0)
-    # The padded period is 6 lengths longer than the field. The tail that wraps around is below ratio^100.
+    # Padding makes the period 6 lengths longer than the field. The tail that wraps around is below ratio^100.
     assert torch.allclose(response, expected, rtol=0, atol=1e-9)
     assert float((response * (torch.arange(200) - 100)).sum()) == pytest.approx(0, abs=1e-6)
     mirrored = effect(point, {"length_um": 0.3, "direction": -1.0}, context)[0, 0, 4]
@@ -259,9 +259,9 @@ def test_write_order_memory_makes_no_negative_dose() -> None:
     layout[..., :30, :] = 1.2
     values = {"strength": 0.5, "length_um": 1.0, "direction": 1.0}
     dose = get_effect("write-order-memory")(layout, values, FieldContext(layout, PITCH_UM, 1.2))
-    # Unwritten lines have no dose that could be reduced: it stays 0 but for rounding.
+    # Unwritten lines have no dose to reduce, so it stays 0 except for rounding.
     assert float(dose[..., 30:, :].abs().max()) < 1e-12
-    # The tail is cut 3 lengths away at the edge of the layout plus 5.9 beyond it: e^-8.9 is 1.4e-4.
+    # The tail ends after 3 lengths inside the layout and 5.9 beyond its edge, at e^-8.9 = 1.4e-4.
     assert float(dose[..., 29, 0]) == pytest.approx(0.6, rel=5e-4)
 
 
@@ -283,7 +283,7 @@ def test_threshold_softness_is_the_normalised_tanh_projection() -> None:
     )
     top = math.tanh(alpha * eta) + torch.tanh(alpha * (height / 1.2 - eta))
     expected = 1.2 * top / (math.tanh(alpha * eta) + math.tanh(alpha * (1 - eta)))
-    # The effect refers to alpha = 1e-3 instead of 0, which differs by 1e-6 of the height.
+    # The effect is relative to alpha = 1e-3 instead of 0, which changes heights by 1e-6 of their value.
     assert torch.allclose(changed, expected, rtol=0, atol=3e-6)
 
 
@@ -294,21 +294,21 @@ def test_slope_thinning_and_tip_dilation_on_a_ramp() -> None:
     dilated = get_effect("tip-dilation")(ramp, {"radius_um": 0.2}, context)
     inner = (..., slice(1, -1), slice(1, -1))
     assert torch.allclose((thinned - ramp)[inner], torch.tensor(-0.2 * 0.25, dtype=torch.float64))
-    # A paraboloid of radius R rests R s² / 2 above a plane of slope s, and touches it R s = 1 px away.
+    # The apex of a paraboloid on a plane of slope s is R s² / 2 above it. The contact is R s = 1 px away.
     touched = (..., slice(None), slice(3, -3))
     assert torch.allclose((dilated - ramp)[touched], torch.tensor(0.2 * 0.25 / 2, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0])
 def test_equal_losses_along_both_axes_are_a_loss_by_the_size_of_the_slope(degrees: float) -> None:
-    """A ramp of slope 0.5 loses c 0.5^p in any direction. A loss below zero by rounding counts as zero."""
+    """Check that a ramp of slope 0.5 loses c 0.5^p in any direction, and that a tiny negative loss is 0."""
     y, x = torch.meshgrid(*(torch.arange(40, dtype=torch.float64) * PITCH_UM,) * 2, indexing="ij")
     ramp = 0.5 * (math.cos(math.radians(degrees)) * x + math.sin(math.radians(degrees)) * y)[None, None]
     context, inner = FieldContext(ramp, PITCH_UM, 1.2), (..., slice(1, -1), slice(1, -1))
     for power, turn in ((1.0, 0.0), (3.0, 0.0), (3.0, 30.0)):
         values = {"along_x_um": 0.2, "along_y_um": 0.2, "exponent": power, "turn_deg": turn}
         change = (get_effect("slope-thinning")(ramp, values, context) - ramp)[inner]
-        # The power law is smoothed below slopes of about a thousandth.
+        # The power law is smoothed for slopes below about a thousandth.
         assert torch.allclose(change, torch.tensor(-0.2 * 0.5**power, dtype=torch.float64), rtol=5e-3)
     values = {"along_x_um": -1e-9, "along_y_um": 0.0, "exponent": 1.0, "turn_deg": 0.0}
     assert torch.equal(get_effect("slope-thinning")(ramp, values, context), ramp)
@@ -322,7 +322,7 @@ def test_an_asymmetric_tip_rests_on_a_slope_by_its_radius_along_it() -> None:
     for along, across in ((1.0, 0.25), (0.25, 1.0)):
         values = {"radius_um": 0.4, "along": along, "across": across}
         lifted = get_effect("tip-dilation")(slope, values, context) - slope
-        # Each axis adds R s² / 2, with the radius along this axis.
+        # Each axis adds R s² / 2, where R is the radius along this axis.
         expected = torch.tensor(0.4 / 2 * (along * 0.5**2 + across * 0.3**2), dtype=torch.float64)
         assert torch.allclose(lifted[inner], expected)
 
@@ -334,19 +334,19 @@ def test_uneven_scanners_of_printer_and_microscope_are_one_formula_until_the_sca
     written, scanned = get_effect("galvo-nonlinearity"), get_effect("piezo-nonlinearity")
     values = {"strength": 0.03}
     printed = written(square, values, context)
-    # For both effects positions run to the outermost pixels. Half a field of 36 px is 1.8 µm.
+    # For both effects, positions extend to the outermost pixels. Half a field of 36 px is 1.8 µm.
     assert torch.allclose(printed, scanned(square, values, context), rtol=0, atol=1e-12)
     across = scanned(square, values, replace(context, quarter_turns=1), scanned=True)
     assert float((across - printed).abs().max()) > 1e-3
     back = scanned(square, values, replace(context, backward=True), scanned=True)
     assert torch.allclose(back, written(square, {"strength": -0.03}, context), rtol=0, atol=1e-12)
-    # A part of a write field four times as large follows the bend of the whole field, c x² / 2R.
+    # In a write field four times as large, the displacement is that of the whole field, c x² / 2R.
     wide = written(square, {"strength": 0.12}, replace(context, field_radius_um=4 * context.radius_um()))
     assert torch.allclose(wide, printed, rtol=0, atol=1e-12)
 
 
 def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands() -> None:
-    """No two maxima of the field are equal, so a step of 1e-6 leaves the tip on the same piece."""
+    """Check derivatives of a dilation of random heights, where small steps do not move the contact."""
     draw = torch.Generator().manual_seed(4)
     surface = (0.3 * torch.rand(1, 1, 6, 12, generator=draw, dtype=torch.float64)).requires_grad_()
     radius_um = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
@@ -358,8 +358,8 @@ def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands
 
 
 def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
-    # The maximum over u of a (1 - (x - u)² / w²) - u² / 2R is again a parabola. Its curvature 1/q, with
-    # q = w² / 2a, becomes 1/(q + R). Straight pieces of half a pixel lie below it by (dx/2)² / 8q at most.
+    # The maximum over u of a (1 - (x - u)² / w²) - u² / 2R is again a parabola, with curvature 1/(q + R)
+    # instead of 1/q, q = w² / 2a. Straight pieces of half a pixel lie at most (dx/2)² / 8q below it.
     x = (torch.arange(61, dtype=torch.float64) - 30) * PITCH_UM
     q, radius = 2.0, 0.7
     hump = (-(x**2) / (2 * q)).expand(1, 1, 9, 61)
@@ -371,7 +371,7 @@ def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
 
 @pytest.mark.parametrize(("name", "sign"), [("trench-residue", 1.0), ("feature-collapse", -1.0)])
 def test_only_narrow_pits_are_filled_and_only_narrow_ridges_are_lost(name: str, sign: float) -> None:
-    """Check narrow and wide pits in a plateau, and the same surface upside down, with ridges."""
+    """Check narrow and wide pits in a plateau, and ridges in the same surface upside down."""
     pits = torch.ones(1, 1, 60, 60, dtype=torch.float64)
     pits[..., 10:50, 10:13] = 0
     pits[..., 10:50, 30:45] = 0
@@ -384,7 +384,7 @@ def test_only_narrow_pits_are_filled_and_only_narrow_ridges_are_lost(name: str, 
 
 @pytest.mark.parametrize(("width_um", "share"), [(0.6, 0.0), (0.65, 0.25), (0.7, 0.5), (0.8, 1.0)])
 def test_a_width_between_two_kernel_sizes_fills_a_pit_in_part(width_um: float, share: float) -> None:
-    """A square of 7 pixels leaves a pit of 7 unfilled; one of 9 pixels, half width 0.4 µm, fills it."""
+    """Check a pit of 7 px, which a kernel of 7 px leaves unfilled and one of 9 px (0.4 µm) fills."""
     pit = torch.ones(1, 1, 40, 40, dtype=torch.float64)
     pit[..., 16:23] = 0
     values = {"fraction": 1.0, "width_um": width_um}
@@ -394,7 +394,7 @@ def test_a_width_between_two_kernel_sizes_fills_a_pit_in_part(width_um: float, s
 
 
 def test_a_field_continues_beyond_its_edge_when_narrow_pits_are_filled() -> None:
-    """The inner part of a field with constant continuation is filled as the continued field is."""
+    """Check that a field is filled in the same way as the inner part of the continued field."""
     part = torch.rand(1, 1, 40, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     whole = torch.nn.functional.pad(part, (20,) * 4, mode="replicate")
     values = {"fraction": 1.0, "width_um": 0.9}
@@ -423,7 +423,7 @@ def test_slices_set_alike_in_wide_areas_and_differ_where_narrower_than_the_spot(
     context = FieldContext(layout, 0.1, 1.2)
     effect = get_effect("layer-stacking")
     changed = effect(layout, effect.with_values({"share": share}), context) - layout
-    # In wide areas 0 and 1 are fixed points of the step. A line of one pixel stays below the threshold.
+    # In wide areas, the values 0 and 1 stay fixed. The dose of a one-pixel line is below the threshold.
     assert float(changed[..., 50].abs().max()) < 1e-4
     line = float(changed[..., 30, 12])
     assert line < -0.05 if share else line == 0.0
@@ -433,10 +433,10 @@ def test_the_interface_cuts_the_print_from_below() -> None:
     height = torch.linspace(0, 1.2, 13).reshape(1, 1, 1, 13)
     values = {"depth_um": 0.25, "substrate_um": 0.05, "shrinkage": 0.0}
     cut = get_effect("interface-offset")(height, values, FieldContext(height, 0.1, 1.2))
-    # Heights not above the substrate stay. Heights above lose the depth, but do not fall below the substrate.
+    # Heights up to the substrate stay. Higher ones lose the depth, but do not fall below the substrate.
     assert float(cut[..., 0]) == 0
     assert torch.allclose(cut[..., 1:], torch.clamp(height[..., 1:] - 0.25, min=0.05), atol=1e-6)
-    # Where the layout has half of the full height, the lost part had shrunk by half of `shrinkage`.
+    # Where the layout has half of the full height, the lost part is reduced by half of `shrinkage`.
     half = FieldContext(torch.full_like(height, 0.6), 0.1, 1.2)
     shrunk = get_effect("interface-offset")(height, {**values, "shrinkage": 0.4}, half)
     assert torch.allclose(shrunk[..., 1:], torch.clamp(height[..., 1:] - 0.2, min=0.05), atol=1e-6)

@@ -1,4 +1,4 @@
-"""Evaluation of a frozen model: equal scan ids count as training scans only in the same prints."""
+"""Check that equal scan ids count as training scans only if the prints are the same."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def trained(tmp_path_factory):
     return store, train(store, "identity", folder / "run"), folder / "run"
 
 
-# In a store built anew the heights and so the hash differ. The name shows that the prints are the same.
+# A store built anew has other heights and another hash, but its name shows that the prints are the same.
 @pytest.mark.parametrize(("name", "same"), [("made", True), ("other", False)])
 def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_path, name, same):
     _, run, folder = trained

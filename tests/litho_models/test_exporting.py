@@ -1,4 +1,4 @@
-"""An exported model predicts the same print as before, or the export says why it is impossible."""
+"""Check that an exported model predicts the same print, or that the export says why it is impossible."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep
 SETTINGS = {
     "affine-mtf": {"sigmas_um": (0.1, 0.3)},
     "linear": {"sigmas_um": (0.1, 0.3)},
-    # Uses all operations of the model, on few features.
+    # These settings use all operations of the model, with few features.
     "pbl": {"sigma_diffusion_init_um": 0.2, "surroundings": FEW, "scan_axis": FEW},
 }
 CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear")
@@ -57,12 +57,12 @@ def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> No
     assert export_model(model, tmp_path / "model.pt2", SIZE_PX) <= LARGEST_DIFFERENCE_UM
     facts = {"card.json": ""}
     program = torch.export.load(tmp_path / "model.pt2", extra_files=facts).module()
-    # A layout that was not used for the export.
+    # This layout was not used for the export.
     torch.testing.assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
     assert json.loads(facts["card.json"])["pitch_um"] == model.pitch_um
 
 
-# The blurs of the other models are those of Physics.
+# The other models use the same blurs as Physics.
 @pytest.mark.parametrize("name", ["zoo:physics", "pbl", pytest.param("zoo:pbl", marks=pytest.mark.long)])
 def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
     onnxruntime = pytest.importorskip("onnxruntime")

@@ -1,4 +1,4 @@
-"""Feature networks separate what is printed from what the microscope adds along x."""
+"""Check that feature networks separate the print from what the microscope adds along x."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def narrow(**fields: object) -> Pbl:
 
 
 def moved(model: Pbl) -> Pbl:
-    """Change every parameter at random, so that no part of the model is idle."""
+    """Change every parameter at random, so that every part of the model has an effect."""
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
@@ -45,7 +45,7 @@ def test_the_printer_does_not_know_x_from_y_and_the_scan_axis_does():
     model = moved(narrow())
     with torch.no_grad():
         turned = [part(layout().mT).mT - part(layout()) for part in (model.printer(), model)]
-    # Sums in another order round heights of 1 µm by 1e-7 of their value.
+    # The order of sums differs, so heights of 1 µm differ by 1e-7 of their value.
     assert float(turned[0].abs().max()) < 1e-5
     assert float(turned[1].abs().max()) > 1e-3
 
@@ -60,7 +60,7 @@ def test_a_print_that_is_constant_along_x_is_measured_as_it_is_printed():
 
 
 def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypatch):
-    # Several blocks of pixels; the last is not full.
+    # There are several blocks of pixels, of which the last is not full.
     monkeypatch.setattr(pixelwise, "_PIXELS_AT_ONCE", 700)
     model, found = moved(narrow()).double(), []
     for learns in (True, False):
@@ -68,7 +68,7 @@ def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypa
         height = model.requires_grad_(learns)(field)
         pull = torch.rand(height.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
         found.append((height.detach(), *torch.autograd.grad((pull * height).sum(), field)))
-    # Double precision, sums of some hundred products of order one.
+    # The sums have some hundred products of order one, in double precision.
     for learnt, fixed in zip(*found, strict=True):
         assert float((fixed - learnt).abs().max()) < 1e-11
 
@@ -77,7 +77,7 @@ def test_a_fit_to_pixels_separates_what_the_microscope_adds_along_x_from_the_pri
     def lost_um(printed: np.ndarray) -> np.ndarray:
         return 0.15 * np.abs(np.gradient(printed, 0.1, axis=1))
 
-    # Small batches, so that the fit takes as many steps as with a hundred scans.
+    # With small batches, the fit takes as many steps as with a hundred scans.
     monkeypatch.setattr(pixels, "BATCH_PX", 256)
     scans = []
     for scan in make_scans(5, bow_um=0.02):
@@ -86,7 +86,7 @@ def test_a_fit_to_pixels_separates_what_the_microscope_adds_along_x_from_the_pri
     model = narrow()
     record = pixels.fit_feature_networks(model, scans, [], TrainingConfig(nuisance="full", steps=7))
     assert record.step == 7 + pixels.EPOCHS * -(-5 * 96**2 // 256)
-    # White noise of 4 nm has a mean absolute value of 3.2 nm. The fit is off by some nm more.
+    # White noise of 4 nm has a mean absolute value of 3.2 nm. The error of the fit adds some nm.
     assert 3.2 < record.training_mae_nm < 2 * 3.2
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     printed = printed_height_um(unseen.layout_um)
@@ -95,7 +95,7 @@ def test_a_fit_to_pixels_separates_what_the_microscope_adds_along_x_from_the_pri
     def error_nm(part: Pbl, truth: np.ndarray) -> float:
         return 1000 * float(np.abs(predict_scan(part, unseen) - truth).mean())
 
-    # The error of each part is below half of 15.7 nm, the difference between the two.
+    # Print and scan differ by 15.7 nm. The error of each is below half of that.
     apart = 1000 * float(lost.mean())
     assert error_nm(model, printed - lost) < 0.5 * apart < 0.6 * error_nm(model, printed)
     assert error_nm(model.printer(), printed) < 0.5 * apart < 0.6 * error_nm(model.printer(), printed - lost)
@@ -112,7 +112,7 @@ def test_a_finished_chain_is_found_in_the_cache_and_the_networks_are_fitted_to_t
         assert torch.equal(a, b), name
     assert first.history[0] == second.history[0]
     assert isinstance(first.model, Pbl)
-    # Both the chain and the networks after it were trained.
+    # Both the chain and the networks that follow it were trained.
     assert not torch.equal(first.model.tau, build_model("pbl").state_dict()["tau"])
     assert all(
         float(network.linear.weight.detach().abs().max()) > 0 for network in first.model.feature_networks

@@ -1,4 +1,4 @@
-"""Ridge regressions on many features: closed form, free of scan terms, the same for any tiles."""
+"""Test ridge regressions on many features: closed form, no influence of scan terms or tiles."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def test_a_print_made_of_its_features_is_found_through_datum_bow_and_blobs(name)
     for number, scan in enumerate(scans):
         added = 0.05 * (-1) ** number + 0.02 * number * (rows**2 - np.mean(rows**2))
         height = predict_scan(known, scan) + added
-        # A blob of 1 µm on 0.2 % of the pixels. Plain least squares would let it change the weights.
+        # A blob of 1 µm covers 0.2 % of the pixels. In plain least squares, it would change the weights.
         height[10:14, 20:24] += 1.0
         printed.append(replace(scan, height_um=height.astype(np.float32)))
     model = fitted(name, printed, units=32) if name == "random-features" else fitted(name, printed)
     unseen = make_scan(20)
-    # Exact but for the ridge of 1e-5 and the blobs of weight 0.002 µm / 1 µm: well below 1 nm.
+    # The fit is exact except for the ridge of 1e-5 and blobs with a weight of 0.002 µm / 1 µm.
     assert error_nm(model, unseen, predict_scan(known, unseen)) < 1.0
 
 
@@ -71,7 +71,7 @@ def test_a_bead_on_slopes_along_x_is_seen():
         name: error_nm(fit(name, beaded[:-1], TrainingConfig(nuisance="offset")).model, beaded[-1], truth)
         for name in ("linear", "features")
     }
-    # The bead is 12 nm high on average. Squares of slopes describe it only roughly.
+    # The bead is 12 nm high on average. Squared slopes describe it only roughly.
     assert errors["features"] < 0.25 * errors["linear"]
 
 
@@ -89,7 +89,7 @@ def test_steep_surroundings_along_x_are_seen():
     for fields in ({}, wide):
         model = fitted("features", lowered[:-1], policy="offset", **fields)
         errors.append(error_nm(model, lowered[-1], lowered[-1].height_um))
-    # The feature equals the planted change except at the edge, so little of the change remains.
+    # Except at the edge, the feature equals the planted change, so little of the change remains.
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -105,7 +105,7 @@ def test_weights_do_not_depend_on_the_tiles_that_features_are_made_in(monkeypatc
     whole = fitted("random-features", scans, units=8)
     monkeypatch.setattr(ridge, "TILE_PX", 40)
     tiled = fitted("random-features", scans, units=8)
-    # Features in float32 round by 1e-7, and the ridge of 1e-5 amplifies this a hundredfold at most.
+    # Features in float32 have rounding errors of 1e-7, which the ridge of 1e-5 amplifies at most 100 times.
     assert error_nm(whole, scans[0], predict_scan(tiled, scans[0])) < 0.1
 
 

@@ -1,4 +1,4 @@
-"""Blind trials on films: which causes are planted, and when an answer is right."""
+"""Test blind trials on films: which causes are planted, and which answers are right."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_an_answer_is_right_if_it_names_the_cause_and_nothing_else(
 ) -> None:
     row = SimpleNamespace(leading_nm=1.0)
     causes = [SimpleNamespace(name=one, confusable_with=[], knowledge="cause") for one in named]
-    # A law is no name.
+    # A law does not name a cause.
     effects = [*causes, SimpleNamespace(name="edge-shift", knowledge="law")]
     result = SimpleNamespace(effects=effects, error=lambda stage: row)
     monkeypatch.setattr(film_trials, "simulate_films", lambda out, *more, **knobs: out.mkdir(parents=True))

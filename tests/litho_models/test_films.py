@@ -1,4 +1,4 @@
-"""Closed forms for edges, areas and features of films, and an electron-beam printer made of parts."""
+"""Test edges, areas and features of films against closed forms, and an electron-beam printer of parts."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def test_a_disc_that_is_too_large_is_off_by_the_difference_of_radii() -> None:
     scores = score_model(
         "m", [_scan(_disc(30))], [Prediction(_disc(31.5))], NuisanceProtocol.of_policy("none")
     )
-    # Contours of the coverage agree with the disc to a twentieth of a pixel.
+    # The contours of the coverage agree with the disc to a twentieth of a pixel.
     assert scores.leading_nm == scores.edge_mean_nm == pytest.approx(1e3 * 1.5 * PITCH_UM, abs=0.05 * 4)
-    # The area counts whole pixels, so that of a circle of radius 30 px is right to some 10 of 2,800.
+    # The area counts whole pixels. For a circle of radius 30 px it is right to some 10 of 2,800 pixels.
     assert scores.metrics["area_error_percent"] == pytest.approx(100 * (31.5**2 / 30**2 - 1), abs=0.8)
     assert scores.metrics["features_missing"] == scores.metrics["features_merged"] == 0
     assert scores.ssim is None
@@ -64,10 +64,10 @@ def test_features_are_counted_as_lost_too_many_and_joined() -> None:
     measured[10:20, 10:20] = measured[10:20, 24:34] = measured[40:45, 40:45] = 1
     measured[30:50, 5:25] = 1
     expected = measured.copy()
-    expected[40:45, 40:45] = 0  # an island lost
-    expected[14:16, 20:24] = 1  # two islands joined
-    expected[38:42, 12:16] = 0  # a hole too many
-    expected[55, 55] = 1  # a dot that is no feature
+    expected[40:45, 40:45] = 0  # one island is lost
+    expected[14:16, 20:24] = 1  # two islands are joined
+    expected[38:42, 12:16] = 0  # there is an extra hole
+    expected[55, 55] = 1  # a dot does not count as a feature
     found = film_errors(measured, expected, 0.5)
     assert (found.missing, found.extra, found.merged) == (1, 1, 1)
     assert film_errors(expected, measured, 0.5)[1:] == (1, 1, 1)
@@ -99,7 +99,7 @@ def test_etching_moves_an_edge_by_its_bias_whatever_the_slope_of_the_resist(bias
         resist = torch.sigmoid((x - 30) / width).expand(1, 1, 8, 60)
         film = etch(resist, 0.5, bias_px * PITCH_UM, PITCH_UM)[0, 0, 0].numpy()
         edge = 1 + float(np.interp(0.5, film, np.arange(len(film))))
-        # The slope is taken at the pixel, not at the edge: bias³ / 6 width², 0.04 px. Curvature adds to this.
+        # Using the slope at the pixel, not at the edge, adds bias³ / 6 width² = 0.04 px. Curvature adds more.
         assert edge == pytest.approx(30 - bias_px, abs=0.1)
 
 
@@ -125,7 +125,7 @@ def test_a_fit_finds_the_spot_the_threshold_and_the_bias_of_a_film() -> None:
         scans.append(replace(scan, height_um=height))
     found = build_model("e-beam", **BARE, fixed=(), **GEOMETRY)
     fit_small_model(found, scans, "none")
-    # Without noise the fit stops when a step gains less than 1e-4 of the error, which is almost zero.
+    # The fit stops when a step reduces the error by less than 1e-4. Without noise, the error is almost zero.
     for name, value in true.values.items():
         assert float(found.values[name]) == pytest.approx(float(value), rel=0.03, abs=0.05), name
 

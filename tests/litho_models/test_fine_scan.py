@@ -1,4 +1,4 @@
-"""With smaller scan pixels blur and delay of the microscope shrink, in fab, models and plan."""
+"""Check that with smaller scan pixels the blur and delay of the microscope shrink in fab, models and plan."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FINE = Way(pixel_size=0.5)
 
 @pytest.mark.parametrize("pixel_size", [1.0, 0.5])
 def test_in_the_fab_the_blur_of_a_scan_is_one_of_its_pixels(pixel_size: float) -> None:
-    """The blur is two pixels: 0.2 µm with pixels of 0.1 µm, and 0.1 µm with pixels of half that size."""
+    """Check a blur of two pixels, which is 0.2 µm with pixels of 0.1 µm, and 0.1 µm with half that size."""
     boards = KnobBoard([KnobSetting("resampling-blur", 0.2, 1)], 0), KnobBoard([], 0)
     job = Job("a", random_layout((48, 48), seed=1), pixel_size=pixel_size)
     blurred, plain = (
@@ -51,7 +51,7 @@ def test_a_fine_scan_shows_the_surface_of_a_plain_one_at_more_points() -> None:
     plain, fine = (scan_job(fab, Job("a", level, pixel_size=size)).height_um for size in (1.0, 0.5))
     middle = (slice(8, -8),) * 2
     means = fine.reshape(plain.shape[0], 2, plain.shape[1], 2).mean(axis=(1, 3))
-    # The mean of four points a quarter of a pixel away differs by the curvature times h² / 16, 1 nm here.
+    # The mean of four points a quarter of a pixel away differs by curvature times h² / 16, here 1 nm.
     assert np.abs(means - plain)[middle].max() < 0.003
     assert np.ptp(plain) > 0.2
 
@@ -72,7 +72,7 @@ def test_effects_that_lag_shrink_with_the_pixels_of_the_scan(name: str) -> None:
 
 
 def test_smaller_pixels_tell_a_blur_of_the_resist_from_one_of_the_scan() -> None:
-    """Both blurs have the same formula, so scans with plain pixels show no difference for any layout."""
+    """Check two blurs with the same formula, which scans with plain pixels cannot tell apart."""
     blurs = {
         "diffusion-blur": {"variance_um2": 0.04},
         "resampling-blur": {"variance_um2": 0.04},

@@ -1,4 +1,4 @@
-"""The FNO's spectral layer is a Fourier sum, its tiles are periodic, its blending weights sum to one."""
+"""Check the FNO: its spectral layer against the Fourier sum, its periodic tiles and its blending weights."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def test_the_spectral_layer_is_the_fourier_sum(shape):
             wave = np.exp(-2j * np.pi * (ky * y / ny + kx * x / nx))
             spectrum = (field[0].numpy() * wave[..., None]).sum(axis=(0, 1))
             mixed = spectrum @ weight[sign, :, :, row, kx]
-            # A positive k_x also stands for its mirror image. The first and the last possible k_x have none.
+            # A positive k_x also represents its mirror image. The first and the last k_x have none.
             share = (1 if kx in (0, nx / 2) else 2) / (ny * nx)
             wanted = wanted + share * (mixed[:, None, None] * wave.conj()).real
     with torch.no_grad():
         found = layer(field)[0].permute(2, 0, 1).numpy()
-    # Sums of some dozen products of order one, in double precision.
+    # The sums have some dozen products of order one, in double precision.
     assert np.abs(found - wanted).max() < 1e-12
 
 
@@ -100,7 +100,7 @@ def test_the_local_layer_is_periodic_and_so_is_its_gradient(shape, side):
     pull = torch.randn(2, *shape, 2, dtype=torch.float64)
     found, wanted = layer(field), reference(field.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
     slopes = [torch.autograd.grad((height * pull).sum(), field)[0] for height in (found, wanted)]
-    # Sums of up to 98 products of order one, in double precision.
+    # The sums have up to 98 products of order one, in double precision.
     assert (found - wanted).abs().max() < 1e-12
     assert (slopes[0] - slopes[1]).abs().max() < 1e-12
 
@@ -125,7 +125,7 @@ def test_coordinates_break_the_periodicity():
 def test_a_field_moved_by_whole_strides_moves_its_print():
     model = trained()
     stride = SMALL["tile_px"] - SMALL["overlap_px"]
-    # A wide uniform border, so that only the pattern moves.
+    # The pattern has a wide uniform border, so that only the pattern moves.
     field = torch.zeros(1, 1, 160, 160, dtype=torch.float64)
     field[..., 48:80, 48:80] = torch.rand(32, 32, dtype=torch.float64)
     with torch.no_grad():
@@ -157,7 +157,7 @@ def test_a_patch_without_its_border_leaves_out_the_tiles_of_the_border():
     whole = sum(seen)
     seen.clear()
     blend_tiles(count, torch.rand(1, 1, 160, 160), tile, border_px=64)
-    # The middle 32 px touch two or three of the field's seven tiles, of stride 24, along each axis.
+    # Along each axis, the field has seven tiles of stride 24. The middle 32 px touch two or three of them.
     assert whole == 49
     assert sum(seen) <= 9
 
@@ -175,10 +175,11 @@ def test_the_variants_are_those_of_paper_and_code():
     assert paper.config.coordinates
     assert authors.config.coordinates
     assert not ours.config.coordinates
-    # 9 px of 256, and the same fraction for other sizes.
+    # This is 9 px of 256, and the same fraction for other sizes.
     assert [round(paper.config.padding_fraction * size) for size in (256, 540)] == [9, 19]
     assert (authors.config.padding_px, authors.config.padding_fraction) == (9, 0)
-    # Lift, four layers of two spectral blocks and one 1 x 1 convolution, projection.
+    # The parameters are those of the lift, of four layers, each with two spectral blocks and one 1 x 1
+    # convolution, and of the projection.
     width = 24
     spectral = 4 * 2 * width**2 * 12 * 12 * 2
     local = 4 * (width**2 + width)
@@ -221,7 +222,7 @@ def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
         return interior(self, layout_um)
 
     monkeypatch.setattr(Fno, "interior", watched)
-    # Scans narrower than a tile, and a crop size that differs from the tile's.
+    # The scans are narrower than a tile, and the crop size differs from the tile size.
     for size_px in (28, 64):
         fit("fno", make_scans(3, size_px=size_px), TrainingConfig(**QUICK, crop_px=40, model=SMALL))
     assert set(shapes) == {(32, 32)}
@@ -238,7 +239,7 @@ def test_fno_learns_a_blur_beyond_its_start():
     def error(model):
         return np.mean([np.abs(predict_scan(model, s) - s.height_um).mean() for s in scans])
 
-    # The initial prediction is the layout itself, so blur and saturation have to be learned.
+    # The initial prediction is the layout itself, so blur and saturation must be learned.
     assert error(fitted.model) < 0.5 * error(start)
 
 

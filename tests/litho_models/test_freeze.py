@@ -1,4 +1,4 @@
-"""Frozen models reload unchanged, refuse other printers' layouts, and run no code on loading."""
+"""Check that frozen models reload unchanged, refuse other printers' layouts, and run no code when loaded."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_values_on_a_bound_are_named_in_card_and_page(tmp_path):
         model.raw_alpha.fill_(-5.0)
     folder = save_frozen(model, tmp_path / "model")
     assert ModelCard.read(folder).at_bounds == {"alpha": 0.0, "sigma_diffusion_um": 2.5}
-    assert "more than the model allows: alpha (0), sigma_diffusion_um (2.5)." in (
+    assert "the best fit may lie outside: alpha (0), sigma_diffusion_um (2.5)." in (
         folder / README_FILE
     ).read_text(encoding="utf-8")
 
@@ -191,7 +191,7 @@ DAMAGE = {
 
 
 def nested(depth):
-    """Return a list in a list in a list …"""
+    """Return a list nested to the given depth."""
     return json.loads("[" * depth + "]" * depth)
 
 
@@ -213,7 +213,7 @@ def one_weight_a_little_off(weights):
 
 def lowest_bit_turned(weights):
     data = bytearray(weights.read_bytes())
-    data[-4] ^= 1  # of the last float32
+    data[-4] ^= 1  # lowest byte of the last float32
     weights.write_bytes(data)
 
 
@@ -224,8 +224,8 @@ def another_fit(weights):
 
 @pytest.mark.parametrize("change", [one_weight_a_little_off, lowest_bit_turned, another_fit])
 def test_weights_other_than_those_of_the_card_are_refused(folder, tmp_path, change):
-    # The changed weights are finite, with the right shapes and precision. Only the card's hash differs.
-    # Copy the weights, because the loaded ones are views of the file.
+    # The changed weights are finite and have the right shapes and precision. Only their hash is wrong.
+    # Copy the weights, because the loaded weights are views of the file.
     before = {key: value.clone() for key, value in load_file(folder / WEIGHTS_FILE).items()}
     change(folder / WEIGHTS_FILE)
     after = load_file(folder / WEIGHTS_FILE)
@@ -295,7 +295,7 @@ def test_process_effects_are_part_of_the_model_and_measurement_effects_are_not(t
     effects = {"vertical-shrinkage": {"fraction": 0.1}}
     process = load_frozen(save_frozen(base, tmp_path / "process", process_effects=effects))
     measured = load_frozen(save_frozen(base, tmp_path / "measured", measurement_effects=effects))
-    # H becomes (1 - fraction) H.
+    # The effect changes H to (1 - fraction) H.
     assert torch.allclose(process(layout), 0.9 * plain(layout), atol=1e-6)
     assert torch.equal(measured(layout), plain(layout))
 
@@ -312,7 +312,7 @@ def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_
         assert card.attributed == {"slope-thinning": side}
         page = (tmp_path / side / README_FILE).read_text(encoding="utf-8")
         assert f"do not show the cause: slope-thinning to the {side}." in page
-    # A design includes what the printer does, but not what the microscope does.
+    # A design includes effects of the printer, but not those of the microscope.
     layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
     heights = [load_frozen(tmp_path / name)(layout) for name in ("printer", "microscope", "kept")]
     assert torch.equal(heights[1], heights[2])
@@ -340,7 +340,7 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     assert float((heights["source"] - heights["left"]).abs().max()) > 0.01
     assert (cards["left"].undetermined_effects, cards["left"].attributed) == ({"scan-axis": {}}, {})
     assert cards["microscope"].measurement_effects == {"scan-axis": {}}
-    assert "belongs to measured maps" in cards["microscope"].limitations[-1]
+    assert "a part for measured maps" in cards["microscope"].limitations[-1]
     assert cards["printer"].process_effects == {}
     assert cards["again"].attributed == {"scan-axis": "printer"}
     with pytest.raises(InputError, match="frozen without it"):

@@ -1,4 +1,4 @@
-"""Check closed forms, derivatives by the width, and edges of the Gaussian blur."""
+"""Check the Gaussian blur: closed forms, derivatives with respect to the width, and edges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PITCH = 0.1
 
 
 def blur_interior(field, sigma_px, radius_px):
-    """Blur a field and return only the pixels whose whole kernel lies inside."""
+    """Blur a field, and return only the pixels whose kernel lies completely inside the field."""
     return gaussian_blur(field, sigma_px, 1.0, edge=None, radius_px=radius_px)
 
 
@@ -50,7 +50,7 @@ def test_attenuates_a_grating_as_the_fourier_transform_of_a_gaussian():
     grating = torch.cos(2 * math.pi * x / period_um).expand(20, 400)
     blurred = gaussian_blur(grating, sigma_um, PITCH)[10, 100:300]
     gain = blurred.max() / 1.0
-    # The cut at four sigma leaves out 6e-5 of the weight.
+    # Truncation at four sigma removes 6e-5 of the weight.
     assert float(gain) == pytest.approx(math.exp(-2 * (math.pi * sigma_um / period_um) ** 2), abs=2e-4)
 
 
@@ -59,7 +59,7 @@ def test_widths_add_in_quadrature():
     field[..., 60, 60] = 1
     twice = gaussian_blur(gaussian_blur(field, 0.3, PITCH), 0.4, PITCH)
     once = gaussian_blur(field, 0.5, PITCH)
-    # Both are cut at four sigma, where the kernel is exp(-8) = 3e-4 of its peak of 1/(2π 25).
+    # Both kernels are truncated at four sigma, at exp(-8) = 3e-4 of their peak of 1/(2π 25).
     assert float((twice - once).abs().max()) < 3e-4 * float(once.max()) * 2
 
 
@@ -70,7 +70,7 @@ def test_anisotropic_blur_has_its_own_width_per_axis():
     offset = (torch.arange(81, dtype=torch.float64) - 40) * PITCH
     variance_y = float((spot.sum(1) * offset**2).sum())
     variance_x = float((spot.sum(0) * offset**2).sum())
-    # A cut at four sigma lowers the variance by 0.1 %.
+    # Truncation at four sigma reduces the variance by 0.1 %.
     assert variance_y == pytest.approx(0.04, rel=2e-3)
     assert variance_x == pytest.approx(0.16, rel=2e-3)
 
@@ -82,15 +82,15 @@ def test_derivative_with_respect_to_the_width_matches_finite_differences():
     (gradient,) = torch.autograd.grad((weight * gaussian_blur(field, sigma, PITCH)).sum(), sigma)
     step = 1e-5
     high, low = (float((weight * gaussian_blur(field, 0.33 + s, PITCH)).sum()) for s in (step, -step))
-    # The error of a central difference is of order step², plus rounding of 1e-13/1e-5.
+    # The error of a central difference is of order step², plus a rounding error of 1e-13/1e-5.
     assert float(gradient) == pytest.approx((high - low) / (2 * step), rel=1e-6)
 
 
 def test_the_width_may_move_through_a_change_of_support_without_a_jump():
     field = torch.rand(1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    # Four sigma of 0.25 µm are exactly 10 px, so just above this width the support grows by one pixel.
+    # At a width of 0.25 µm, four sigma are exactly 10 px. Just above, the kernel is one pixel longer.
     below, above = gaussian_blur(field, 0.2499999, PITCH), gaussian_blur(field, 0.2500001, PITCH)
-    # The added ring has exp(-0.5 (11/2.5)²) = 6e-5 of the peak, and 1e-5 of the sum.
+    # The added ring is exp(-0.5 (11/2.5)²) = 6e-5 of the peak, and has 1e-5 of the sum.
     assert float((below - above).abs().max()) < 5e-5
 
 
@@ -117,7 +117,7 @@ def test_a_field_without_pixels_is_refused():
 
 @pytest.mark.parametrize("sigma_px", [(1.3, 9.0), (17.0, 4.0)])
 def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
-    # In the part and in the whole field, blocks begin at different pixels.
+    # Blocks begin at different pixels in the part and in the whole field.
     radii = tuple(kernel_radius_px(sigma) for sigma in sigma_px)
     field = torch.rand(2, 1, 800, 830, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     strip = field[..., 100:500, 150:600]
@@ -126,7 +126,7 @@ def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
     wide, narrow = blur_interior(field, sigmas, radii), blur_interior(strip, sigmas, radii)
     assert wide.shape == (2, 1, 800 - 2 * radii[0], 830 - 2 * radii[1])
     part = wide[..., 100 : 100 + narrow.shape[-2], 150 : 150 + narrow.shape[-1]]
-    # Sums of at most 137 terms of at most 1 in double precision.
+    # The sums have at most 137 terms, each at most 1, in double precision.
     assert torch.allclose(part, narrow, rtol=0, atol=1e-14)
     of_part = torch.autograd.grad(part.square().sum(), [field, *sigmas])
     of_narrow = torch.autograd.grad(narrow.square().sum(), [strip, *sigmas])
@@ -138,7 +138,7 @@ def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
 @pytest.mark.parametrize("samples", [1, 2])
 def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice(samples):
     generator = torch.Generator().manual_seed(0)
-    # Two blocks along y, of which the second is not full, and one along x.
+    # There are two blocks along y, of which the second is not full, and one block along x.
     field = torch.rand(samples, 1, 41, 11, dtype=torch.float64, generator=generator, requires_grad=True)
     widths = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.6, 1.1)]
 

@@ -1,4 +1,4 @@
-"""Compare the grouped ridge with plain least squares on written-out columns."""
+"""Compare the grouped ridge with plain least squares with one column for each strength of each group."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ BLOCKS = {
     "two groupings": [Block((2,)), Block((3, 4), "print", 0.5), Block((5,), "field")],
 }
 BY_BLOCKS = pytest.mark.parametrize("blocks", BLOCKS.values(), ids=BLOCKS.keys())
-# The ridge regularises equal columns by 1e-7 of their size, which plain least squares does not.
+# Unlike plain least squares, the ridge regularises equal columns by 1e-7 of their size.
 CLOSE = {"rtol": 2e-5, "atol": 2e-6}
 
 
 def rows(seed: int = 0) -> np.ndarray:
-    """Return residual and columns (scans, 1 + m, n); the columns are partly correlated."""
+    """Return a residual and m columns as an array (scans, 1 + m, n). Some columns are correlated."""
     rng = np.random.default_rng(seed)
     found = rng.normal(size=(SCANS, 1 + COLUMNS, PIXELS))
     found[:, 2] += 0.5 * found[:, 1]
@@ -36,7 +36,7 @@ def products(maps: np.ndarray) -> Products:
 
 
 def written_out(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> tuple[np.ndarray, list[tuple]]:
-    """Return a column (scans of ``scans``, n) for each strength of each label, and which strength it is."""
+    """Return a column (scans, n) for each strength of each label, with the names of the strengths."""
     found, names = [], []
     for number, block in enumerate(blocks):
         labels = np.array(GROUPS[block.by])
@@ -48,7 +48,7 @@ def written_out(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> tup
 
 
 def solved(maps: np.ndarray, blocks: list[Block], scans: np.ndarray, target: int = 0) -> np.ndarray:
-    """Solve least squares with one penalty row for each strength."""
+    """Solve the least-squares problem with a penalty row for each strength."""
     columns, names = written_out(maps, blocks, scans)
     usual = np.mean(maps[scans] ** 2, axis=(0, 2))
     penalty = [blocks[number].shrinking * usual[column] for number, _, column in names]
@@ -99,7 +99,7 @@ def test_held_out_is_a_fit_without_the_fold(blocks: list[Block]) -> None:
 
 
 def test_a_scan_does_not_help_to_predict_itself() -> None:
-    """A scan's residual changes only its own squared error, as a parabola: the strengths stay."""
+    """Check that a scan's residual does not change its strengths: its squared error is a parabola."""
     maps, blocks = rows(), BLOCKS["two groupings"]
     change = np.random.default_rng(5).normal(size=PIXELS)
     errors = []
@@ -127,7 +127,7 @@ def test_nothing_fitted_leaves_the_residual() -> None:
 
 @pytest.mark.parametrize("shrinking", [0.3, 1.0, 3.0])
 def test_shrinking_counts_in_scans(shrinking: float) -> None:
-    """If k scans have the same strength, the fit finds k / (k + shrinking) of it."""
+    """Check that the fit finds k / (k + shrinking) of a strength that k scans share."""
     column = np.random.default_rng(1).normal(size=PIXELS)
     maps = np.zeros((SCANS, 2, PIXELS))
     maps[:, 1] = column
@@ -153,8 +153,8 @@ def test_freed_of_leaves_what_is_orthogonal_to_the_columns() -> None:
     assert found.groups is GROUPS
 
 
-def test_freed_of_some_the_rest_has_the_strengths_of_the_whole_fit() -> None:
-    """The theorem of Frisch and Waugh. A strength by group would need a projection within each group."""
+def test_strengths_after_a_projection_equal_those_of_the_whole_fit() -> None:
+    """Check the theorem of Frisch and Waugh for strengths that are shared by all scans."""
     first, second = [Block((1,), "field"), Block((2,))], [Block((3, 4)), Block((5,))]
     whole = products(rows()).strengths([*first, *second], EVERY)[len(first) :]
     freed = products(rows()).freed_of(first).strengths(second, EVERY)

@@ -1,4 +1,4 @@
-"""Scans are grouped by the card, by their ids and by their order."""
+"""Check how scans are grouped by the card, by their ids and by their order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.litho_models.prints import make_scans, write_store
 
 
 def scans_of(*ids: str, **facts: object) -> list[PrintedScan]:
-    """Return a scan of four pixels for each id, in this order; the first digit of the id is the print."""
+    """Return a scan of four pixels for each id, in this order. The id's second character is the print."""
     scans = [blank_scan(number, 2, **facts) for number in range(len(ids))]
     return [
         replace(scan, id=one, print_id=one[1:2] or one, groups={})
@@ -29,7 +29,7 @@ def test_all_scans_are_one_group_and_it_comes_first() -> None:
 
 
 def test_every_label_is_that_of_the_scan_alone() -> None:
-    """The same rule also gives the group of a scan that was not learned from."""
+    """Check that the same rule gives the group of a scan alone, so that it holds for new scans."""
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32")
     found = groupings(scans)
     assert len(found) > 3
@@ -39,7 +39,7 @@ def test_every_label_is_that_of_the_scan_alone() -> None:
 
 def test_characters_of_the_ids_stand_for_groups_unless_the_card_has_them() -> None:
     scans = scans_of("F11", "F12", "F21", "F22")
-    # The second character groups the scans as the print does. The first is the same for all.
+    # The second character gives the same groups as the print. The first is the same for all scans.
     assert list(groupings(scans, by_order=False)) == [ALL, "print", "character 3"]
     stated = [replace(scan, groups={"field": scan.id[2]}) for scan in scans]
     assert list(groupings(stated, by_order=False)) == [ALL, "field", "print"]
@@ -73,7 +73,7 @@ def test_a_change_may_come_where_a_print_begins() -> None:
 
 
 def test_a_scan_of_a_left_out_print_at_the_place_of_a_change_has_no_label() -> None:
-    """A print that was left out lies between them, so it gets the mean of both sides."""
+    """Check scans of a held-out print that lies between both sides of a change, so it has no label."""
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32", "F41", "F42")
     by, _ = (by for by in groupings([*scans[:2], *scans[4:]]) if by.startswith("order"))
     assert by == "order 1-4"
@@ -100,7 +100,7 @@ def test_a_group_of_the_card_may_have_any_name(name: str) -> None:
         replace(s, groups={name: own}) for s, own in zip(scans_of("a", "b", "c", "d"), labels, strict=True)
     ]
     assert groupings([replace(s, print_id="1") for s in scans])[name] == labels
-    # A scan without the group has no label, even if the group's name has another meaning too.
+    # A scan without the group has no label, even if the group's name also has another meaning.
     assert label_of(replace(scans[0], groups={}), name) == ""
 
 
@@ -111,7 +111,7 @@ def test_a_group_of_the_card_may_have_any_name(name: str) -> None:
         ({"ids": {"print": r"P(?P<print>\d)F(?P<field>\d)(?P<day>[ab]|)"}}, {"field": "0", "day": ""}),
         ({"ids": {"print": r"P(?P<print>\d)F\d"}}, {}),
         ({"ids": {"print": r"X(?P<print>\d)(?P<field>\d)"}}, {}),
-        # A pattern with nested repeats could take for ever. A store from elsewhere may hold an invalid one.
+        # A pattern with nested repetitions could run forever. A foreign store may have an invalid pattern.
         ({"ids": {"print": r"P(?P<print>\d+)F(?P<field>\d+)"}}, {}),
         ({"ids": {"print": r"P(?P<print>\dF"}}, {}),
         ({"ids": {"print": None}}, {}),

@@ -1,4 +1,4 @@
-"""A pushed model can be fetched back, and a failure is told in one line. No network is used."""
+"""Check, without a network, that a pushed model can be fetched, and that a failure is one line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from litho_models.frozen.files import push
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """Replace huggingface_hub by functions with its signatures; return the folder of its repositories."""
+    """Replace huggingface_hub by local functions, and return the folder with their repositories."""
     root = tmp_path / "hub"
     library = ModuleType("huggingface_hub")
 

@@ -1,4 +1,4 @@
-"""The same call continues earlier work, another call is refused, and damaged files name their folder."""
+"""Check that a repeated call continues earlier work, and that other calls and damaged files are refused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from litho_models.noise.residuals import read_residuals
 from litho_models.splits.folds import grouped_folds, plan_folds
 from tests.litho_models.prints import make_scans, write_store
 
-# The paper's PBL is fitted in steps only. The default PBL then fits networks to pixels, each time anew.
+# The paper's PBL is fitted in steps only. The default PBL also fits networks to pixels, anew in each call.
 QUICK = {
     "variant": "paper",
     "steps": 2,
@@ -40,7 +40,7 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(store, tmp_path_factory):
-    """Return the folder of a network's training run, with its checkpoint."""
+    """Return the training run of a network, and its folder with the checkpoint."""
     folder = tmp_path_factory.mktemp("run") / "pbl"
     return train(store, "pbl", folder, settings=QUICK), folder
 
@@ -139,7 +139,7 @@ def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, sto
 def test_a_damaged_fit_is_told_with_its_folder(scored, store, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(scored[1], out)
-    # The new call names fewer models than the result holds, so the result is not replaced.
+    # Remove the result, because a call that names fewer models would not replace it.
     (out / "benchmark.json").unlink()
     folder = next(path for path in (out / "cache").glob("affine-*"))
     for name, damage in (

@@ -1,4 +1,4 @@
-"""Compare laws and descriptions with their formulas, written again in numpy."""
+"""Compare laws and descriptions with their formulas, written independently in NumPy."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from litho_models.effects.registry import register_effect
 PITCH_UM, SHAPE, FULL_UM = 0.1, (170, 168), 1.2
 NAMELESS = {**LAWS, **TABLES}
 BY_NAME = pytest.mark.parametrize("name", NAMELESS)
-# Below this, slopes are smoothed. It changes the size of a slope by no more than this.
+# The absolute value of a slope is smoothed below this slope, which changes it by at most this amount.
 ROUNDED = 1e-3
 
 
 def height_of(shape: tuple[int, int] = SHAPE, seed: int = 0) -> np.ndarray:
-    """Return a smooth random height with a flat corner, (y, x) µm."""
+    """Return a smooth random height (y, x) in µm with a flat corner."""
     smooth = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 4.0)
     height = 0.5 + 0.25 * smooth / smooth.std()
     height[:20, :20] = 0.5
@@ -40,17 +40,17 @@ def context_of(height: np.ndarray, pitch_um: float = PITCH_UM) -> FieldContext:
 def changed(
     name: str, values: dict[str, float], height: np.ndarray, pitch_um: float = PITCH_UM
 ) -> np.ndarray:
-    """Return what the effect adds to the height, (y, x) µm."""
+    """Return the change (y, x) in µm that the effect makes to the height."""
     field = torch.from_numpy(height)[None, None]
     effect = NAMELESS.get(name) or get_effect(name)
     return (effect(field, values, context_of(height, pitch_um)) - field)[0, 0].numpy()
 
 
-# The formulas again: central differences for slopes, a Gaussian for means, a running mean for sides.
+# The formulas use central differences for slopes, a Gaussian for means, and a running mean for sides.
 
 
 def turned(axis: str, turn_deg: float, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the component along an axis that is turned from x towards y."""
+    """Return the component along the axis x or y after rotating both axes from x towards y."""
     cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     return cosine * x + sine * y if axis == "x" else cosine * y - sine * x
 
@@ -67,7 +67,7 @@ def mean_within(h: np.ndarray, reach_um: float) -> np.ndarray:
 
 
 def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
-    """Return the running mean y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx) from one side."""
+    """Return the running mean y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx), starting at one side."""
     turned = {"left": h, "right": h[:, ::-1], "above": h.T, "below": h.T[:, ::-1]}[side]
     found = turned.copy()
     for i in range(1, turned.shape[1]):
@@ -79,7 +79,7 @@ AXES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y",
 
 
 def tail(h: np.ndarray, sides: tuple[str, ...], length_um: float, turn_deg: float) -> np.ndarray:
-    """Return the running mean from both sides; along a turned axis it is computed by frequencies."""
+    """Return the mean of the running means from the sides, by Fourier transform along a rotated axis."""
     if not turn_deg:
         return np.mean([beside(h, side, length_um) for side in sides], axis=0)
     edge = 6 * round(length_um / PITCH_UM)
@@ -106,12 +106,12 @@ def rim(length_um: float) -> np.ndarray:
 
 
 def jump(axis: str, at: float) -> np.ndarray:
-    """Return a step at the position ``at`` (-1 … 1): 0 before it, 1 after it, a fraction in its pixel."""
+    """Return a step at a position from -1 to 1: 0 before it, 1 after it, and a fraction in its pixel."""
     size = SHAPE["yx".index(axis)]
     return np.clip((PLACES[axis] - at) * (size - 1) / 2 + 0.5, 0, 1)
 
 
-# Each formula maps a height and the shapes of a law to the change for a strength of one.
+# Each formula gives the change of a height for a strength of one and for the shapes of a law.
 Formula = Callable[..., np.ndarray]
 
 
@@ -167,7 +167,7 @@ WAVES = ("height-wave", "dose-wave")
 
 
 def shapes_of(name: str) -> list[dict[str, float]]:
-    """Return the shapes in which a law is screened, also with twice a length that screening keeps fixed."""
+    """Return the shapes that screening tries, plus one in which a length that it keeps fixed is doubled."""
     shapes = [{k: v for k, v in trial.items() if k != "strength"} for trial in LAWS[name].trials]
     untried = {k: 2 * one.typical for k, one in LAWS[name].parameters.items() if one.off and not one.tried}
     return list(map(dict, dict.fromkeys(tuple(one.items()) for one in (*shapes, {**shapes[0], **untried}))))
@@ -183,8 +183,8 @@ def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
     for shape in shapes_of(name):
         wanted = FORMULAS[name](HEIGHT, **shape)
         assert wanted.std() > 1e-3
-        # The tolerance allows for rounding, and for kernels that are cut: a Gaussian after 4 sigma, a tail
-        # after 6 lengths or at the end of the field, where it wraps around from the other side.
+        # The tolerance allows for rounding and for truncated kernels: a Gaussian after 4 sigma, a tail after
+        # 6 lengths or at the end of the field, where it wraps around to the other side.
         allowed = 2 * ROUNDED
         if "length_um" in shape:
             steps = shape["length_um"] / PITCH_UM
@@ -222,7 +222,7 @@ def test_a_flat_print_has_a_finite_derivative(name: str) -> None:
 POWERS_OF_UM = {"1": 0, "µm": 1, "µm²": 2, "1/µm": -1, "1/µm²": -2}
 
 
-# Leave out laws with a fixed length or a length in micrometres.
+# Exclude laws with a fixed length or with a length in micrometres.
 SCALED = [
     name
     for name in FORMULAS
@@ -232,7 +232,7 @@ SCALED = [
 
 @pytest.mark.parametrize("name", SCALED)
 def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
-    """In a unit half as large the numbers of all lengths double, and so does the change of the height."""
+    """Check that in a unit half as large, where all lengths double, the change of the height doubles too."""
     unit = LAWS[name].parameters["strength"].unit
     height = HEIGHT[:60, :64].copy()
     one = changed(name, {"strength": 0.05}, height)
@@ -246,7 +246,7 @@ def test_a_table_of_one_height_is_a_datum_and_each_level_has_its_own() -> None:
     np.testing.assert_allclose(changed("level-table", dict.fromkeys(names, 0.02), HEIGHT), 0.02, atol=1e-12)
     flat = np.full((30, 30), 0.6)
     for knot, name in enumerate(names):
-        # 0.6 µm of 1.2 µm is the eighth of sixteen steps.
+        # 0.6 µm is the eighth of the sixteen steps of 1.2 µm.
         np.testing.assert_allclose(changed("level-table", {name: 0.02}, flat), 0.02 * (knot == 8), atol=1e-9)
 
 
@@ -292,7 +292,7 @@ def test_slope_thinning_is_a_power_of_the_slope(power: float, axis: str) -> None
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_shortened_line_loses_its_delta_at_both_ends(axis: str) -> None:
-    """The area of a line of 0.8 µm falls by twice delta times its height. Across the line it stays."""
+    """Check a line 0.8 µm high, whose area decreases by twice delta times its height only along the line."""
     line = np.zeros((30, 60))
     line[:, 15:45] = 0.8
     line = line if axis == "x" else line.T

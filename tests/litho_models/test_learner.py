@@ -1,4 +1,4 @@
-"""The learner measures how much predictions still lack, and finds nothing where they lack nothing."""
+"""Check that the learner measures how much predictions lack, and finds nothing if they lack nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Change = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[Study, list[np.ndarray], Learner]:
-    """Return scans, their heights without noise, and the learner of these scans."""
+    """Return a study, the heights of its scans without noise, and a learner for them."""
     study = study_of(planted(size_px=96, noise_um=NOISE_UM), folds=5)
     twin = Twin.bare(base_model())
     predictions = [twin.height(scan) for scan in study.scans]
@@ -36,7 +36,7 @@ def scene() -> tuple[Study, list[np.ndarray], Learner]:
 
 @pytest.fixture(scope="module")
 def rest_without(scene) -> Callable[[Change | None], Rest]:
-    """Return what the learner finds if the predictions lack this change, or no change."""
+    """Return a function that runs the learner on predictions that lack a change, or none."""
     study, predictions, learner = scene
 
     @functools.cache
@@ -47,17 +47,17 @@ def rest_without(scene) -> Callable[[Change | None], Rest]:
 
 
 def changed(study: Study, predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
-    """Return predictions that lack a change."""
+    """Return the predictions without a change that the scans contain."""
     return [p - change(f, p).astype(np.float32) for f, p in zip(study.scans, predictions, strict=True)]
 
 
 def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return a bead of some nanometres on slopes along x, which grows with the height of the print."""
+    """Return a bead of a few nanometres on slopes along x that is proportional to the height."""
     return 0.02 * prediction * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=1))
 
 
 def later(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return a loss of height on slopes along y, in the second half of the run only."""
+    """Return a change proportional to slopes along y, in the second half of the scans only."""
     return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=0))
 
 
@@ -68,7 +68,7 @@ def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
 
 
 def displaced(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return a loss of 0.1 µm at the upper right that fades towards the other sides."""
+    """Return the change due to a displacement along y of 0.1 µm at the upper right, fading elsewhere."""
     ny, nx = prediction.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     return 0.1 * np.exp(-2 * (y + 0.4) ** 2 - 2 * (x - 0.4) ** 2) * np.gradient(prediction, 0.1, axis=0)
@@ -86,13 +86,13 @@ def test_the_learner_measures_the_size_of_changes_by_layout_order_or_place(rest_
     there = float((rest.squares_nm2 - true.squares_nm2).mean())
     assert rest.matters
     assert rest.ci95_nm2[0] <= rest.mean_nm2 <= rest.ci95_nm2[1]
-    # A fifth allows for the scatter of 200 coefficients from 64,000 pixels and for the ridge.
+    # Allow a fifth for the scatter of 200 coefficients from 64,000 pixels and for the ridge.
     assert 0.8 * there < rest.mean_nm2 < 1.05 * there
 
 
 def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene, rest_without) -> None:
     study, predictions, learner = scene
-    # Only one scan has this pattern, so nothing can be learned about it from the others.
+    # Only one scan has this pattern, so the other scans cannot teach anything about it.
     alone = list(predictions)
     alone[0] = alone[0] - bead(study.scans[0], alone[0])
     found = learner.rest(alone)
@@ -100,7 +100,7 @@ def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene, rest_without) -
 
 
 def test_two_folds_are_enough(scene, rest_without) -> None:
-    """With two folds the weight of the ridge is chosen on single scans of the other fold."""
+    """Check two folds, where the weight of the ridge is chosen on single scans of the other fold."""
     study, predictions, _ = scene
     halves = Learner(replace(study, fold_of=np.arange(10) % 2), predictions)
     lacking = changed(study, predictions, bead)
@@ -108,14 +108,14 @@ def test_two_folds_are_enough(scene, rest_without) -> None:
 
 
 def test_only_height_slopes_and_surroundings_may_depend_on_the_order(scene) -> None:
-    """The learner identifies these features by their index among those of a default model."""
+    """Check these features, because the learner finds them by their index in a default model."""
     scan = scene[0].scans[0]
     rows = feature_rows(build_model("features"), scan.stored, scan.sample)
     layout, pitch = scan.stored.layout_um / 1.2, scan.stored.pitch_um
     height, near = (gaussian_filter(layout, sigma / pitch, mode="nearest") for sigma in (0.3, 1.6))
     slopes = [np.abs(slope) for slope in np.gradient(height, pitch)]
     for number, expected in zip(module._VARYING, (height, *slopes, near), strict=True):
-        # float32, and a Gaussian cut at four standard deviations.
+        # Features are in float32, with a Gaussian truncated at four standard deviations.
         np.testing.assert_allclose(rows[number], scan.at_sample(expected), rtol=0, atol=1e-3)
 
 
@@ -126,7 +126,7 @@ def test_rows_are_thinned_where_they_would_not_fit(scene, rest_without, monkeypa
     monkeypatch.setattr(module, "_KEPT_BYTES", 4 * 320 * pixels // 2)
     thinned = Learner(study, predictions)
     assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 320 * pixels // 2
-    # Half of the pixels give nearly the same result.
+    # With half of the pixels, the result is nearly the same.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(rest_without(bead).mean_nm2, rel=0.15)
 
 
@@ -154,7 +154,7 @@ def test_the_error_of_the_form_is_the_upper_end_of_what_could_be_learned() -> No
     assert some.ci95_nm2 is not None
     assert math.sqrt(10.0) < some.most_nm == pytest.approx(math.sqrt(some.ci95_nm2[1]))
     assert Rest(-gains, np.full(6, 100.0)).most_nm == 0.0
-    # With too few scans for an interval the mean is used.
+    # With too few scans for a confidence interval, the mean is used.
     assert Rest(gains[:2], np.full(2, 100.0)).most_nm == pytest.approx(3.0)
 
 

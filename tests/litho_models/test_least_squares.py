@@ -1,4 +1,4 @@
-"""Check the algebra of least squares on numbers with a known answer."""
+"""Check the linear algebra of least squares on problems with known solutions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_damped_solution_is_exact_without_damping_and_indifferent_to_units() -> 
 
 
 def test_a_step_in_a_box_is_the_best_one_in_it() -> None:
-    """Karush-Kuhn-Tucker: the slope is zero inside the box, and points out of the box on a bound."""
+    """Check the Karush-Kuhn-Tucker conditions: zero slope inside the box, an outward slope at its bounds."""
     rng = np.random.default_rng(6)
     a = rng.normal(size=(20, 4)) @ np.diag([1.0, 30.0, 0.03, 5.0])
     normal, right = a.T @ a, a.T @ rng.normal(size=20)
@@ -47,14 +47,14 @@ def test_a_step_in_a_box_is_the_best_one_in_it() -> None:
     step = solve_damped(normal, right, 0.0, (lowest, highest))
     assert ((step >= lowest) & (step <= highest)).all()
     slope = (normal @ step - right) / np.sqrt(np.diag(normal))
-    # lsq_linear stops at a relative tolerance of 1e-10, and the factor is regularised by 1e-10 too.
+    # lsq_linear stops at a relative tolerance of 1e-10, and the factorisation is regularised by 1e-10.
     size = 1e-6 * np.abs(right / np.sqrt(np.diag(normal))).max()
     inside = (step > lowest + 1e-9) & (step < highest - 1e-9)
     assert inside[3]
     assert np.allclose(slope[inside], 0, atol=size)
     assert (slope[step <= lowest + 1e-9] >= -size).all()
     assert (slope[step >= highest - 1e-9] <= size).all()
-    # Clipping the unconstrained step is worse, as the other numbers are not adjusted.
+    # Clipping the unconstrained step is worse, because it does not adjust the other numbers.
     cut = np.clip(free, lowest, highest)
     assert _quadratic(normal, right, step) < _quadratic(normal, right, cut)
 

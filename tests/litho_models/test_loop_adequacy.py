@@ -1,4 +1,4 @@
-"""A name that only resembles the cause is refused by the shape of what it leaves."""
+"""Check that the loop refuses the name of an effect that only resembles the true cause."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def values_of(name: str) -> dict[str, float]:
 
 
 def share(planted_name: str, fitted_name: str, beside: tuple[str, ...] = (), seed: int = 0) -> float:
-    """What the fitted change takes in other shapes, of its own gain; ``beside``: printed, but not fitted."""
+    """Return the further gain of the fitted effect in other shapes, divided by its own gain.
+
+    The effects ``beside`` act on the print but are not fitted.
+    """
     effects = [(name, ALL, {"": values_of(name)}) for name in (planted_name, *beside)]
     study = study_of(planted(effects, seed=seed))
     without = bare_state(study)
@@ -42,16 +45,16 @@ def test_the_formula_of_the_cause_leaves_nothing_of_its_shape(name: str) -> None
 
 
 def test_a_mimic_is_refused() -> None:
-    """A loss on slopes that grows with the height is taken for a loss on curvature."""
+    """Check that curvature is refused as the name of a loss on slopes that grows with the height."""
     assert share("height-times-slope-size-x", "curvature-x") > FORM_SHARE
 
 
-def test_a_cause_that_is_missing_beside_it_does_not_refuse_a_name() -> None:
+def test_another_missing_cause_does_not_refuse_a_name() -> None:
     assert share("slope-thinning", "slope-thinning", beside=("write-order-memory",)) < FORM_SHARE
 
 
 def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() -> None:
-    """On a film of nanometres they are what they are on a print of micrometres; slopes are per length."""
+    """Check that the shapes do not depend on the pitch, except for slopes, which are per length."""
     rng = np.random.default_rng(0)
     change, prediction, layout = rng.random((3, 48, 40))
 
@@ -65,7 +68,7 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
 
 
 def squared(squares_nm2: float) -> dict[str, object]:
-    """Residuals of one pixel with this square in each of ten scans."""
+    """Return residuals of one pixel, with this square, for each of ten scans."""
     return {
         "freed_um": [np.array([1e-3 * squares_nm2**0.5])] * 10,
         "freed_nm2": np.full(10, float(squares_nm2)),
@@ -73,23 +76,23 @@ def squared(squares_nm2: float) -> dict[str, object]:
 
 
 def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -> SimpleNamespace:
-    """A fitted model of which these parameters lie on a limit."""
+    """Return a fitted model with these parameters at a limit of their range."""
     return SimpleNamespace(exhausts=lambda name: exhausts, outgrows=lambda name: outgrows, slots=())
 
 
 @pytest.mark.parametrize(
     ("reshaped_nm2", "left_nm2", "limits", "said"),
     [
-        (1.4, 0.0, {}, ""),  # 14 % of its gain in other shapes
-        (1.6, 5.0, {}, "gain another 16 %"),
-        (1.6, 5.4, {}, ""),  # more than twice as much again is left for causes that are missing
-        (1.6, 5.4, {"exhausts": ["fraction"]}, "exceeds the largest possible one: fraction"),
+        (1.4, 0.0, {}, ""),  # the gain in other shapes is 14 %
+        (1.6, 5.0, {}, "would add 16 % to its gain"),
+        (1.6, 5.4, {}, ""),  # missing causes could explain more than three times as much
+        (1.6, 5.4, {"exhausts": ["fraction"]}, "exceeds the largest possible value: fraction"),
         (1.4, 0.0, {"exhausts": ["fraction"]}, ""),
-        # A range at its limit is another effect, however well the form fits.
+        # A length at the limit of its range means another effect, however well the form fits.
         (0.0, 0.0, {"outgrows": ["length_px"]}, "outside the range of this effect: length_px"),
     ],
 )
-def test_the_limits_of_a_name_are_those_that_are_written(
+def test_a_name_is_refused_at_the_stated_limits(
     reshaped_nm2: float,
     left_nm2: float,
     limits: dict[str, list[str]],
@@ -115,12 +118,12 @@ STUDY = Study((), np.empty(0))
 
 
 def gaining(name: str, gain_nm2: float) -> Cause:
-    """A cause that takes so much of 100 nm² in each of ten scans."""
+    """Return a cause that reduces 100 nm² by this gain in each of ten scans."""
     return Cause(name, ALL, (), judge(np.full(10, 100.0), np.full(10, 100.0 - gain_nm2), STUDY), 0.01, None)
 
 
 def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
-    """A model that leaves so much in each of ten scans, and without any of its effects so much."""
+    """Return a model with this squared error in ten scans, or ``without_nm2`` without any of its effects."""
     return SimpleNamespace(
         **squared(squares_nm2),
         twin=twin_at_limits(),
@@ -132,7 +135,7 @@ def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
 @pytest.mark.parametrize(
     ("before_nm2", "law", "falls"), [(21, True, True), (19, True, False), (21, False, False)]
 )
-def test_a_name_falls_if_laws_beside_it_take_more_than_half_of_its_gain(
+def test_a_name_is_refused_if_laws_halve_its_gain(
     before_nm2: float, law: bool, falls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 0.0)
@@ -144,7 +147,7 @@ def test_a_name_falls_if_laws_beside_it_take_more_than_half_of_its_gain(
 @pytest.mark.parametrize(
     ("table_nm2", "beside_nm2", "falls"), [(21, 70, True), (21, 80, False), (19, 70, False)]
 )
-def test_a_name_falls_if_a_table_takes_twice_as_much_in_its_place_and_leaves_it_nothing(
+def test_a_name_is_refused_if_a_table_gains_twice_as_much_without_it(
     table_nm2: float, beside_nm2: float, falls: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checking, "describe", lambda *state: [gaining("level-table", table_nm2)])
@@ -155,7 +158,7 @@ def test_a_name_falls_if_a_table_takes_twice_as_much_in_its_place_and_leaves_it_
 
 
 def with_base(own: int, effects: int = 0, mse_nm2: float = 100.0) -> SimpleNamespace:
-    """A model whose base has so many numbers, its effects so many more."""
+    """Return a model whose base has ``own`` fitted numbers, plus ``effects`` numbers of its effects."""
     return SimpleNamespace(twin=SimpleNamespace(own=own, vector=np.zeros(own + effects)), mse_nm2=mse_nm2)
 
 
@@ -167,10 +170,10 @@ def with_base(own: int, effects: int = 0, mse_nm2: float = 100.0) -> SimpleNames
         (["blur-table"], "description"),
     ],
 )
-def test_a_cause_that_a_base_as_small_does_not_need_is_described(
+def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
     found_on: list[str], knowledge: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A base with more numbers than the one that was taken may have the cause in them."""
+    """Check that only a base with more numbers than the chosen one may do without the cause."""
     monkeypatch.setattr(results, "_strengths", lambda closed, name: {})
     cause = gaining("dose-exponent", 10)
     rivals = {
@@ -190,13 +193,13 @@ def test_a_cause_that_a_base_as_small_does_not_need_is_described(
     [
         (98.1, "hatch-ripple", "physics"),  # less than 2 % better
         (97.9, "hatch-ripple", "blur-table"),
-        (100.0, "slope-thinning", "affine-mtf"),  # all causes shared: fewer numbers
+        (100.0, "slope-thinning", "affine-mtf"),  # all causes are shared, so the base with fewer numbers wins
     ],
 )
-def test_of_bases_that_do_as_well_the_one_is_taken_whose_causes_the_others_share(
+def test_of_equally_good_bases_the_one_whose_causes_others_share_is_chosen(
     better_nm2: float, own: str, chosen: str
 ) -> None:
-    """A cause that only one base needs is the price of that base."""
+    """Check that a base whose causes other bases need too is preferred to one with causes of its own."""
     shared = gaining("slope-thinning", 10)
     found = {
         "affine-mtf": Found(with_base(7, 1), [replace(shared, name=own), shared]),
@@ -213,10 +216,10 @@ def test_of_bases_that_do_as_well_the_one_is_taken_whose_causes_the_others_share
         ("field-curvature", {"tilt_x_um": 0.02}, ""),
     ],
 )
-def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
+def test_a_small_cause_that_a_large_one_explains_in_another_shape_only_corrects_it(
     small: str, values: dict[str, float], corrected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A loss times the height is the loss in another shape, a tilt of the field is not."""
+    """Check a small cause that is a large one in another shape (times the height), and an unrelated tilt."""
     loss = get_effect("slope-x-power").with_values({"strength": 0.06})
     strengths = {"slope-x-power": loss, small: get_effect(small).with_values(values)}
     study = study_of(planted([(name, ALL, {"": own}) for name, own in strengths.items()]))
@@ -232,7 +235,7 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
     large, minor = causes
     assert 0 < minor.judgement.gain_nm2 < 0.1 * large.judgement.gain_nm2
     check = Check(state, causes, [], [], 0.0, None)
-    # Beside a law without a name even a tilt is suspect.
+    # If the larger effect is a law, even a tilt may only correct it.
     assert check._larger(minor, without[small]) == "slope-x-power"
     monkeypatch.setattr(checking, "get_effect", lambda name: get_effect("slope-thinning"))
     assert check._larger(minor, without[small]) == corrected
@@ -240,7 +243,7 @@ def test_a_small_cause_that_a_large_one_takes_in_another_shape_only_corrects_it(
 
 
 def test_a_cause_does_not_correct_its_own_formula(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside the other causes it may gain less than a tenth of what it gained before they were added."""
+    """Check that a cause whose gain shrank to a tenth when others were added does not correct itself."""
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 100.0)
     cause = gaining("slope-thinning", 60)
     assert not Check(leaving(95), [cause], [], [], 1000.0, None).of(cause).corrects

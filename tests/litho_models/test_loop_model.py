@@ -1,4 +1,4 @@
-"""The twin: its numbers by group, its derivatives, and fits in which no scan predicts itself."""
+"""Test the twin: its numbers by group, its derivatives, and fits in which no scan predicts itself."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, st
     np.testing.assert_allclose(twin.height(elsewhere), one.height(elsewhere), atol=1e-6)
 
 
-def test_a_group_behind_which_there_is_no_scan_has_the_mean_of_the_others(twin: Twin, study) -> None:
+def test_a_group_without_scans_has_the_mean_of_the_others(twin: Twin, study) -> None:
     first = [scan for scan in study.scans if scan.stored.groups["field"] == "1"]
     known = twin.known_from(first)
     assert known.values({"field": "2"}) == known.values({"field": "1"}) == {THINNING: thinning(0.1)}
@@ -128,7 +128,7 @@ def test_moving_the_twin_does_not_move_its_base(twin: Twin, study) -> None:
 
 
 def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin, study) -> None:
-    """Also where a number is of another group, or acts on the height so that the base is not run again."""
+    """Check all derivatives, also of numbers of other groups and of effects for which the base is not run."""
     twin = twin.with_effect("long-range-proximity", ALL, {"": _typical("long-range-proximity")})
     steps = twin.steps()
     linear = TwinProblem(twin, study.windows).linearise(twin.vector)
@@ -139,7 +139,7 @@ def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin
             moved = twin.vector.copy()
             moved[at] += step
             there = window.at_sample(twin.at(moved).height(window))
-            # Heights are float32: two of them, over the step.
+            # The tolerance is the float32 rounding of two heights, divided by the step.
             np.testing.assert_allclose(part.jacobian[at], (there - here) / step, atol=4e-7 / abs(step))
 
 
@@ -157,13 +157,13 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert highest[2] == lowest[3] == 0
     assert list(ends.free()[2:4]) == [False, False]
     assert ends.free()[:2].all()
-    # Both groups and the axis that is off stand on a bound of the same name.
+    # Both groups are at a bound, and so is the other axis, which is off.
     assert set(ends.at_bounds()) == {f"{THINNING}: along_x_um", f"{THINNING}: along_y_um"}
-    # An amplitude at its null asks for nothing.
+    # An amplitude at its null does not count as a limit.
     assert ends.exhausts(THINNING) == ["along_x_um"]
     vector[3] = facts["along_x_um"].upper
     assert twin.at(vector).exhausts(THINNING) == ["along_x_um"]
-    # The exponent is no length.
+    # The exponent is not a length, so it cannot outgrow the effect.
     vector[-1] = facts["exponent"].upper
     assert twin.at(vector).outgrows(THINNING) == []
 
@@ -184,7 +184,7 @@ def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
     wanted = [0.9, 0.03, 0.1, 0.2, 0.0, 0.0, 1.0]
     for at in (2, 3, 6):
         assert state.twin.vector[at] == pytest.approx(wanted[at], abs=5 * sd[at] + 0.01 * wanted[at])
-    # White noise of 4 nm, seven terms and an affine shift a scan taken out.
+    # The residual is white noise of 4 nm. Seven terms and an affine displacement per scan are removed.
     assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.05)
 
 
@@ -201,7 +201,7 @@ def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> N
 
 @pytest.mark.parametrize("by", [ALL, "field", "print"])
 def test_a_scan_says_nothing_about_its_own_prediction(by: str) -> None:
-    """Prints are whole folds here: a strength of a print has then nothing behind it but the other prints."""
+    """Check folds of whole prints, where the strength of a held-out print comes from the other prints."""
     law = "height-power-2"
     scans = planted()
     changed = [
@@ -216,7 +216,7 @@ def test_a_scan_says_nothing_about_its_own_prediction(by: str) -> None:
         values = {label: {"strength": 0.0} for label in labels}
         state = fit_state(Twin.bare(base_model()).with_effect(law, by, values), study)
         found.append(np.stack([state.per_fold[1].height(scan) for scan in study.scans[2:4]]))
-    # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left.
+    # A fit without a fold starts at the common fit, and stops when a step reduces the error by 1e-4.
     assert np.abs(found[1] - found[0]).max() < 1e-3 * 0.3
 
 
@@ -232,7 +232,7 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
 
 
 def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
-    """A drift goes on as it began: scans are not spread over the order anew."""
+    """Check that new scans get places in the known order, so that a drift continues."""
     stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
     found = prepared_among(stored, study.scans)
     assert [one.context.order for one in found] == [
@@ -254,13 +254,13 @@ def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
         y, x = (v.numpy() for v in scan.window.context.centred_um())
         row, column = scan.window.context.origin_px
         full_y, full_x = (v.numpy() for v in scan.context.centred_um())
-        # Centres are computed in float32 µm: 2e-6 relative.
+        # Centres are computed in float32 µm, with a relative error of 2e-6.
         assert np.allclose(y[:, 0], full_y[row : row + len(y), 0], atol=1e-4)
         assert np.allclose(x[0], full_x[0, column : column + x.shape[1]], atol=1e-4)
 
 
-def test_two_blurs_are_known_together_only(study) -> None:
-    """What the resist and the microscope blur one after the other: their sum is known, not the parts."""
+def test_of_two_blurs_only_the_sum_is_known(study) -> None:
+    """Check that of two successive blurs, by resist and microscope, only the sum is determined."""
     blurs = [(name, {"variance_um2": 0.02}) for name in ("diffusion-blur", "resampling-blur")]
     alike = study_of(planted([(name, ALL, {"": values}) for name, values in blurs]))
     twin = Twin.bare(base_model())
@@ -269,7 +269,7 @@ def test_two_blurs_are_known_together_only(study) -> None:
     pairs = {frozenset(pair): value for *pair, value in confounded(fit_state(twin, alike))}
     assert set(pairs) == {frozenset(f"{name} variance_um2" for name, _ in blurs)}
     assert -1 <= min(pairs.values()) < -0.95
-    # A blur and a loss on slopes are told apart, and so are gain and offset of the base.
+    # A blur can be told from a loss on slopes, and the gain of the base from its offset.
     (name, values), _ = blurs
     apart = Twin.bare(base_model()).with_effect(name, ALL, {"": values})
     assert confounded(fit_state(apart.with_effect(THINNING, ALL, {"": thinning(0.15)}), study)) == []
@@ -281,8 +281,8 @@ def test_without_fitted_numbers_nothing_is_confounded(study) -> None:
 
 
 @pytest.mark.parametrize("depth_um", [0.1, 0.25])
-def test_what_the_base_took_of_an_effect_does_not_keep_a_fit_from_it(depth_um: float) -> None:
-    """From one of the two starts the fit ends at 24 nm with the fresh base, at 8 nm with the fitted one."""
+def test_an_effect_that_the_base_partly_absorbed_can_be_fitted(depth_um: float) -> None:
+    """Check two starts. From one, a fit of only one base would end at 24 nm (fresh) or 8 nm (fitted)."""
     effect = get_effect("interface-offset")
     deep = effect.with_values({"depth_um": 0.6, "shrinkage": 0.4, "substrate_um": 0.05})
     made = build_model(
@@ -292,11 +292,11 @@ def test_what_the_base_took_of_an_effect_does_not_keep_a_fit_from_it(depth_um: f
     fitted = fit_state(Twin.bare(build_model("physics")), study)
     shallow = effect.with_values({"depth_um": depth_um})
     state = fit_state(fitted.twin.with_effect(effect.name, ALL, {"": shallow}), study)
-    # White noise of 4 nm is left.
+    # The residual is the white noise of 4 nm.
     assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.08)
 
 
-def test_effects_know_of_a_scan_what_its_record_says() -> None:
+def test_effects_use_what_the_record_of_a_scan_states() -> None:
     facts = {"field_y_um": -4.0, "field_x_um": 3.0, "direction": -1, "tip": 2, "pixel_size": 2.0, "dose": 1.5}
     write = {"field_um": 100.0, "slow_axis": "x"}
     (known,) = (one.context for one in prepare_scans([blank_scan(0, 24, write=write, **facts)]))

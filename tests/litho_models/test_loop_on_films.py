@@ -1,4 +1,4 @@
-"""On micrographs of films the loop finds which effect that moves edges a bare printer lacks."""
+"""Check that the loop finds, on micrographs of films, which edge effect a bare printer lacks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _context(layout_um: torch.Tensor) -> FieldContext:
 
 
 def _film(distance_px: np.ndarray) -> torch.Tensor:
-    """Return a film (1, 1, y, x), µm, with its edge where a signed distance is zero."""
+    """Return the heights (1, 1, y, x) in µm of a film whose edge is where the signed distance is zero."""
     return torch.from_numpy(FILM_UM / (1 + np.exp(-4 * distance_px)))[None, None]
 
 
@@ -45,14 +45,14 @@ def _radius_px(film: torch.Tensor) -> float:
 def test_a_bias_moves_every_edge_by_itself(bias_px: float) -> None:
     film = _film(_disc(25))
     moved = get_effect("etch-bias")(film, {"bias_px": bias_px}, _context(film))
-    # Cubic interpolation of a rim one pixel wide is off by some hundredths of a pixel.
+    # Cubic interpolation of a rim one pixel wide has an error of some hundredths of a pixel.
     assert _radius_px(moved) - _radius_px(film) == pytest.approx(bias_px, abs=0.03)
 
 
 def test_diffusion_leaves_straight_edges_and_shrinks_a_disc_by_its_curvature() -> None:
     values, disc = {"variance_px2": 3**2}, _film(_disc(20))
     spread = get_effect("resist-diffusion")
-    # A disc blurred by s is one half at a radius smaller by s² / 2R, to second order in s / R.
+    # A disc blurred by s reaches half height at a radius smaller by s² / 2R, to second order in s / R.
     shrunk_px = _radius_px(disc) - _radius_px(spread(disc, values, _context(disc)))
     assert shrunk_px == pytest.approx(3**2 / (2 * 20), rel=0.05)
     straight = _film(np.tile(np.arange(97) - 48.3, (97, 1)))
@@ -63,11 +63,11 @@ def test_a_shift_by_density_leaves_straight_edges_and_shrinks_a_disc_by_its_curv
     values, law = {"bias_px": 5.0, "length_px": 10.0}, get_effect("edge-shift-by-density")
     disc = _film(_disc(40, 129))
     # The Gaussian mean (sd L) at the edge of a disc is 1/2 - L / (2R sqrt(2 pi)), to first order in L / R,
-    # and falls by 1 / (L sqrt(2 pi)) per pixel outwards. The moved edge is where shift and distance agree.
+    # and falls by 1 / (L sqrt(2 pi)) per pixel outwards. The new edge is where shift and distance agree.
     falling = 2 / (10 * np.sqrt(2 * np.pi))
     wanted_px = 5 * falling * 10**2 / (2 * 40) / (1 + 5 * falling)
     shrunk_px = _radius_px(disc) - _radius_px(law(disc, values, _context(disc)))
-    # Cubic interpolation of a rim one pixel wide is off by some hundredths of a pixel.
+    # Cubic interpolation of a rim one pixel wide has an error of some hundredths of a pixel.
     assert shrunk_px == pytest.approx(wanted_px, abs=0.03)
     straight = _film(np.tile(np.arange(129) - 64.0, (129, 1)))
     assert torch.allclose(law(straight, values, _context(straight)), straight, atol=0.08 * FILM_UM)
@@ -85,13 +85,13 @@ def test_a_constant_shift_is_the_bias_without_its_cause() -> None:
 def test_electrons_come_back_where_something_is_written() -> None:
     layout = _film(_disc(20))
     dose = get_effect("electron-backscatter")(layout, {"weight": 0.5, "length_px": 8.0}, _context(layout))
-    # Electrons are spread and not lost, except those beyond the field, four of their lengths away.
+    # Electrons are spread, not lost, except those that leave the field, four lengths away.
     assert float(dose.sum()) == pytest.approx(float(layout.sum()), rel=1e-3)
     assert 0 < float(dose[0, 0, 48, 48 + 26]) < FILM_UM / 3
 
 
 def _prints(count: int, bias_px: float) -> list[PrintedScan]:
-    """Return random films made by a spot, a threshold and a shift of edges, with noise of the coverage."""
+    """Return random films made by a spot, a threshold and an edge bias, with noise."""
     numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_px}
     printer = build_model("e-beam", **(BARE | numbers), **GEOMETRY)
     scans = []
@@ -118,7 +118,7 @@ def test_the_loop_names_the_bias_that_a_bare_printer_lacks(tmp_path: Path) -> No
     result = close_loop(store, tmp_path / "loop", base="e-beam", base_settings=BARE, folds=2)
     assert [one.name for one in result.effects] == ["etch-bias"]
     (found,) = result.effects[0].strengths["bias_px"]
-    # The refitted threshold and spot take some of the bias, but do not change its sign.
+    # The refitted threshold and spot absorb part of the bias, but do not change its sign.
     assert -4.5 < found.value < -1
     before, after = result.error("base"), result.error("all")
     assert before is not None

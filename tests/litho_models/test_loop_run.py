@@ -41,12 +41,12 @@ from litho_models.scoring.statistics import over_units
 from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
 from tests.litho_models.prints import make_scans, write_store
 
-# These tests draw the figures of the loop's report.
+# These tests draw the figures of the loop's report in full.
 pytestmark = pytest.mark.pictures
 COUNT, SIZE_PX = 12, 48
 BASE = "affine-mtf"
 CAUSES = ("write-order-memory", "slope-thinning", "vertical-shrinkage")
-# Surfaces that scans share have their own tests.
+# Most surfaces that scans share have their own tests, so offer only one here.
 FEW_OFFERS = (("background", 2, False),)
 SOME_LAWS, TABLE = ("height-power-2", "height-times-slope-size-x"), "level-table"
 TABLES = ("errors", "candidates", "explained", "single_scans", "planted")
@@ -54,7 +54,7 @@ TABLES = ("errors", "candidates", "explained", "single_scans", "planted")
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write surfaces of the fab on the layout's grid, as fields this small cannot be registered."""
+    """Write a store of fab surfaces on the layout's grid, because such small fields cannot be registered."""
     folder = tmp_path_factory.mktemp("fab")
     knobs = ("write-order-memory=0.25",)
     litho_data.simulate(
@@ -73,7 +73,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
-    """Return result, folder and messages of a loop with few candidates, which opens the locked scans."""
+    """Run a loop with few candidates that opens the lock box; return its result, folder and messages."""
     said: list[str] = []
     out = store.parent / "loop"
     with pytest.MonkeyPatch.context() as patch:
@@ -81,9 +81,9 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
         patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
         patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
         patch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
-        # Make each second of the first fits count as hours, so that the time left is told.
+        # Make each second of the first fits count as hours, so that the remaining time is announced.
         patch.setattr(closing, "_OVER_FIRST_FITS", 1e5)
-        # A base of one blur and two numbers.
+        # The base has one blur and two fitted numbers.
         patch.setattr(bases, "build_model", lambda *name, **facts: base_model())
         result = close_loop(store, out, base=BASE, folds=2, open_lock_box=True, report=said.append)
     return result, out, said
@@ -130,7 +130,7 @@ def test_every_candidate_has_a_verdict_once(closed) -> None:
     names = [one.name for one in (*result.effects, *result.candidates)]
     assert len(names) == len(set(names))
     assert all(one.reason for one in result.candidates)
-    # Every scan has a separate gain.
+    # Each scan has its own gain.
     shrunk = next(one for one in result.candidates if one.name == "vertical-shrinkage")
     assert shrunk.verdict == "not-testable"
 
@@ -182,8 +182,8 @@ def test_the_page_holds_the_answer_and_nothing_from_elsewhere(closed) -> None:
     assert f"{before.mae_nm:.2f}" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert said[0].startswith("fitting affine-mtf to 10 scans")
-    (estimate,) = (at for at, one in enumerate(said) if one.startswith("estimate: the loop takes about"))
-    assert said[estimate + 1] == "looking for what affine-mtf lacks"
+    (estimate,) = (at for at, one in enumerate(said) if one.startswith("estimate: the loop will take about"))
+    assert said[estimate + 1] == "searching for effects that affine-mtf lacks"
 
 
 def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) -> None:
@@ -194,7 +194,7 @@ def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) 
 
     height = model(torch.from_numpy(scan.layout_um)[None, None], pitch_um=scan.pitch_um)[0, 0].numpy()
     left = 1e3 * (scan.height_um - height)[scan.usable]
-    # Levelling, background and datums belong to the microscope, so the print alone is less close.
+    # The print alone lacks levelling, background and datums of the microscope, so its error is larger.
     own = result.error("all", held_out="locked")
     assert own is not None
     assert np.abs(left - np.median(left)).mean() < 3 * own.by_scan_nm[scan.id]
@@ -241,7 +241,7 @@ def test_texts_follow_the_verdict(closed) -> None:
         assert one.name in said("effect", one)
 
 
-# Tests of the parts, without the fab.
+# Tests of single parts, without the fab
 
 
 def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
@@ -257,7 +257,7 @@ def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
     assert verdict("description") == "described"
     assert verdict() == "nothing-missing"
     assert verdict(matters=True) == verdict(refused=True) == "unexplained"
-    # Too few scans to confirm anything, so a refusal means nothing.
+    # There are too few scans to confirm anything, so a refusal means nothing.
     assert verdict(count=7, refused=True) == "too-few-scans"
 
 
@@ -277,19 +277,19 @@ def test_error_rows_count_the_terms_of_each_scan() -> None:
 
 
 def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
-    """Compare the sandwich error by scans with the scatter of fits to different draws of the noise."""
+    """Compare the sandwich standard error, clustered by scan, with the scatter of fits to other noise."""
     fitted, sds = [], []
     for seed in range(12):
         study = study_of(planted(seed=seed))
         state = bare_state(study)
         fitted.append(state.twin.vector[0])
         sds.append(np.sqrt(clustered_covariance(state.linear, [scan.id for scan in study.scans])[0, 0]))
-    # The scatter of 12 draws has a relative error of a fifth. Twice that is allowed.
+    # The scatter of 12 draws has a relative error of a fifth. Allow twice that.
     assert np.std(fitted, ddof=1) == pytest.approx(np.mean(sds), rel=0.45)
 
 
 def test_a_scan_is_freed_by_what_the_others_say() -> None:
-    """What is subtracted from a scan does not depend on its own heights."""
+    """Check that what is subtracted from a scan does not depend on its own heights."""
     scans = planted(count=8)
     bows = [0.03 * _bow(s.shape) * (s.groups["field"] == "2") for s in scans]
     bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
@@ -297,7 +297,7 @@ def test_a_scan_is_freed_by_what_the_others_say() -> None:
     state = bare_state(study)
     freed = freed_scans(state)
     taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
-    # Each field has half of the difference between the fields, shrunk.
+    # Each field gets half of the difference between the fields, reduced by shrinkage.
     for scan, own in zip(bowed, taken, strict=True):
         sign = 1 if scan.groups["field"] == "2" else -1
         assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
@@ -322,7 +322,7 @@ def test_folds_hold_every_scan_out_once() -> None:
     assert np.array_equal(study.fold_of, Study.dealt(scans, 5).fold_of)
 
 
-def test_a_base_is_asked_for_by_name_or_the_smallest_of_those_that_do_as_well_is_taken(
+def test_a_base_is_chosen_by_name_or_as_the_smallest_good_one(
     quick: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = study_of(planted(count=4))
@@ -332,7 +332,7 @@ def test_a_base_is_asked_for_by_name_or_the_smallest_of_those_that_do_as_well_is
         return closed.base_name, [*closed.rivals]
 
     assert chosen("affine") == ("affine", [])
-    # Every scan may have a gain and a datum of its own.
+    # Every scan may have its own gain and datum, so identity does as well as affine.
     monkeypatch.setattr(bases, "_COMPETING", ("affine", "identity"))
     assert chosen(bases.AUTO) == ("identity", ["affine"])
     with pytest.raises(InputError):
@@ -348,7 +348,7 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search no cause, law or table, and little that scans share, to save time."""
+    """Save time: search no cause, law or table, and only few terms that scans share."""
     for name in ("LAWS", "TABLES"):
         monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
@@ -368,7 +368,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
 ) -> None:
     scans = make_scans(6, 48)
     locked = locked_ids(scans)
-    # Almost no pixel of the locked scan is measured, so the scan is dropped.
+    # Almost no pixel of the locked scan is valid, so the scan is dropped.
     corner = np.zeros(scans[0].shape, bool)
     corner[:4, :4] = True
     empty = [replace(s, valid=corner) if s.id in locked else s for s in scans]
@@ -379,7 +379,7 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
         assert train(path, "identity", tmp_path / f"run{number}").lock_box == locked
         assert len(found.run.dropped) == number
         assert found.run.n_scans == len(scans) - len(locked)
-        # Design uses the level shares of the fitted layouts to flag a layout unlike them.
+        # Designs use the level shares of the fitted layouts to warn about a layout unlike them.
         used = np.concatenate([s.mask_level.ravel() for s in scans if s.id not in locked])
         shares = ModelCard.read(out / "model").training_level_share
         assert shares == pytest.approx(np.bincount(used, minlength=len(shares)) / used.size, abs=1e-12)
@@ -409,14 +409,14 @@ def test_nothing_is_chosen_on_the_print_that_it_is_judged_on(
     scans = [replace(scan, print_id=str(number // 4)) for number, scan in enumerate(made)]
     rows, often = run._nested(study_of(scans), "prints", watched)
     assert seen == [{"1", "2"}, {"0", "2"}, {"0", "1"}]
-    # Every selection chooses the law, and its gain remains on the held-out print.
+    # Every selection chooses the law, which also reduces the error on the held-out print.
     assert often == {law: 3}
     before, after = (
         next(row for row in rows if (row.model, row.policy) == (model, "offset")) for model in ("base", "all")
     )
     assert {row.held_out for row in rows} == {"nested prints"}
     assert [*after.by_scan_nm] == [scan.id for scan in scans]
-    # White noise of 4 nm: E|n| = 0.8 sd.
+    # The residual is white noise of 4 nm, with E|n| = 0.8 sd.
     assert after.mae_nm == pytest.approx(4 * np.sqrt(2 / np.pi), rel=0.1)
     assert after.mae_nm < 0.8 * before.mae_nm
 

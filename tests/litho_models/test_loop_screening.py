@@ -1,4 +1,4 @@
-"""Screening predicts the gain of a later fit, with one strength or one strength per group."""
+"""Check that screening predicts the gain of a later fit, with one strength or one strength per group."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_linear_candidate_promises_what_its_fit_gains(in_half, by: str) -> Non
     one = found[LAW, by]
     fitted = fit_state(state.twin.with_effect(LAW, by, one.start()), study)
     gains = state.freed_nm2 - fitted.freed_nm2
-    # By group the prediction is rough, as the base's part is removed for all scans together.
+    # By group, the prediction is rough, because the base is refitted for all scans together.
     np.testing.assert_allclose(one.gain_nm2, gains.mean(), rtol=0.05 if by == ALL else 0.3)
     assert np.corrcoef(one.gains_nm2, gains)[0, 1] > 0.95
 
@@ -59,7 +59,7 @@ def test_a_strength_in_half_of_the_scans_is_found_with_its_grouping(in_half) -> 
     strengths = {label: values["strength"] for label, values in one.start().items()}
     assert strengths["2"] == pytest.approx(0.04, rel=0.05)
     assert abs(strengths["1"]) < 0.1 * 0.04
-    # Of 252 ways to choose five of ten scans, the two that equal the fields are not counted.
+    # Of the 252 ways to choose five of ten scans, the two that equal the fields are not counted.
     (standing,) = [one for one in screening.standing() if one.name == LAW]
     assert standing.by == "field"
     assert standing.group_p is not None
@@ -70,7 +70,7 @@ def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
     _, _, found, screening = in_all
     one = found[LAW, ALL]
     assert one.start()[""]["strength"] == pytest.approx(0.04, rel=0.05)
-    # Of 2^10 sets of signs only the observed set has all signs alike.
+    # Of the 2^10 sets of signs, only the observed set has all signs alike.
     assert one.family_p <= 4 / 2**10
     for (name, by), other in found.items():
         if name == LAW and by != ALL:
@@ -92,14 +92,14 @@ def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
 
 
 def test_a_change_that_the_base_can_make_is_no_candidate(in_all) -> None:
-    """The base already has a common gain, and each scan may have a gain of its own."""
+    """Check vertical shrinkage, which the gains of the base and of each scan can already imitate."""
     _, state, _, _ = in_all
     found = Screening(state, [get_effect("vertical-shrinkage")]).common
     assert found["vertical-shrinkage"].retained < 1e-5
 
 
 def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
-    """The slopes along both axes lack height, where a blunt tip would have added some."""
+    """Check a loss of height on slopes along both axes, where a blunt tip would add height."""
     name = "slope-thinning"
     thinned = get_effect(name).with_values({"along_x_um": 0.1, "along_y_um": 0.1})
     study = study_of(planted([(name, ALL, {"": thinned})]))
@@ -144,9 +144,9 @@ def test_multiples_count_from_the_null_and_stay_in_range() -> None:
     trial = Trial(_effect(), _effect().trials[:2])
     assert trial.steps(np.array([2.0, 3.0])) == pytest.approx([0.2, 0.6])
     assert trial.reach(np.array([2.0, 3.0])) == 1
-    # a would be 2, twice its upper bound.
+    # Here a would be 2, which is twice its upper bound.
     assert trial.reach(np.array([20.0, 1.0])) == pytest.approx(0.5)
-    # b would be 3, and its upper bound is 2.
+    # Here b would be 3, but its upper bound is 2.
     assert trial.reach(np.array([1.0, 10.0])) == pytest.approx(0.5)
 
 
@@ -155,7 +155,7 @@ def test_an_impossible_sign_is_allowed_only_for_a_relatively_small_strength() ->
     assert trial.allowed(np.array([1.0, 1.0]))
     assert not trial.allowed(np.array([-1.0, 0.0]))
     assert not trial.allowed(np.array([-1.0, 1.0]))
-    # A wrong sign is noise if another group has ten times the strength.
+    # A wrong sign counts as noise if another group has ten times the strength.
     assert trial.allowed(np.array([[-1.0, 0.0], [10.0, 0.0]]))
     assert trial.allowed(np.array([-0.1, 1.0]))
     # b may have either sign.

@@ -1,4 +1,4 @@
-"""The search finds every planted effect with its grouping, and no other effect."""
+"""Check that the search finds every planted effect with its grouping, and no other effect."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     found = found_in((THINNING, "field", {"1": thinning(0.0), "2": thinning(0.2)}))
     assert added(found) == {THINNING: "field"}
     cause = found.causes[0]
-    # Half of the scans have nothing to gain. That does not refuse a cause whose labels say which gain.
+    # Half of the scans gain nothing. The cause is not refused, because its labels tell which scans gain.
     assert cause.group_p is not None
     assert cause.group_p < 0.05
     assert cause.judgement.improved[0] >= 5
@@ -67,7 +67,7 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
 
 @pytest.mark.parametrize("needed", [True, False])
 def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
-    """Another base lacked a loss on slopes; this one lacks a memory and perhaps the loss."""
+    """Check a start from a cause that another base lacked, whether or not this base lacks it too."""
     seed = found_in((THINNING, ALL, {"": thinning(0.2)}))
     assert added(seed) == {THINNING: ALL}
     lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
@@ -78,7 +78,7 @@ def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
 
 
 def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
-    """This also holds for a cause that was not added last."""
+    """Check a grouping that shows only beside another cause, for a cause that was not added last."""
     values = {"1": thinning(0.1), "2": thinning(0.2)}
     study = study_of(planted([(THINNING, "field", values), (MEMORY, ALL, {"": memory(0.3)})]))
     twin = bare_state(study).twin.with_effect(THINNING, ALL, {"": thinning(0.15)})
@@ -102,7 +102,7 @@ def test_a_loss_along_a_diagonal_is_the_cause_with_its_direction() -> None:
     found = found_in((THINNING, ALL, {"": {**thinning(0.2), "turn_deg": 35.0}}))
     assert added(found) == {THINNING: ALL}
     values = found.state.twin.values({})[THINNING]
-    # A frame turned by 35 degrees equals one turned by -55 degrees with its axes exchanged.
+    # A frame rotated by 35° equals one rotated by -55° with its axes swapped.
     assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
     assert values["turn_deg"] == pytest.approx(35, abs=3)
 
@@ -141,31 +141,31 @@ def test_nothing_is_found_in_noise(seed: int) -> None:
 def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
     found = found_in((THINNING, ALL, {"": thinning(0.2)}), count=FEWEST_SCANS - 2)
     assert found.names == []
-    assert found.refused[THINNING].startswith(f"{FEWEST_SCANS - 2} scans, at least {FEWEST_SCANS}")
+    assert found.refused[THINNING].startswith(f"{FEWEST_SCANS - 2} scans are too few")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "values", "beside"),
     [
-        # One diagonal is 0.3 µm wider in quadrature. More than half of this is plain blur.
+        # One diagonal is 0.3 µm wider, in quadrature. More than half of this is plain blur.
         ("elliptical-psf", {"shear_um2": 0.09}, ["diffusion-blur", "galvo-lag"]),
-        # Height lost at the foot lowers every print by the same amount, unlike shrinkage.
+        # Unlike shrinkage, a loss of height at the foot lowers every place by the same amount.
         ("interface-offset", {"depth_um": 0.25}, ["vertical-shrinkage", "height-saturation"]),
-        # Every scan may have its own offsets of rows, which could hide the cause.
+        # Each scan may have its own row offsets, which could hide the cause.
         (
             "hatch-ripple",
             {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31},
             ["slope-thinning"],
         ),
-        # Bare places are not tilted with the print. This separates the cause from a tilt of the microscope.
+        # Bare places are not tilted with the print. A tilt of the microscope would tilt them too.
         ("field-curvature", {"tilt_x_um": 0.06, "tilt_y_um": -0.04}, ["vignetting"]),
     ],
 )
 def test_a_cause_that_another_resembles_is_found(
     name: str, values: dict[str, float], beside: list[str]
 ) -> None:
-    """The base is a Physics model, whose blur, gain and saturation are fitted together with the cause."""
+    """Check causes on a Physics base, whose blur, gain and saturation are fitted together with the cause."""
     base = build_model("physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4)
     effect = get_effect(name)
     scans = planted(
@@ -195,7 +195,7 @@ def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:
     assert same_change(bare, other, one) is same_change(bare, one, other) is False
 
 
-# The judgement of single causes, in numbers.
+# The judgement of single causes, tested with given numbers
 
 STUDY = Study((), np.empty(0))
 
@@ -204,7 +204,7 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
     before = np.full(10, 100.0)
     assert judge(before, np.full(10, 90.0), STUDY).passed()
     half = judge(before, before - 20.0 * (np.arange(10) % 2), STUDY)
-    # All five gains must be positive: one of 2^5 arrangements of signs.
+    # All five gains are positive, which is one of 2^5 arrangements of signs.
     assert half.p == pytest.approx(2**-5)
     assert not half.passed()
     assert half.passed(grouped=True)
@@ -212,7 +212,7 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
 
 
 def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -> None:
-    """Three of ten scans have 0.4 of the strength: the mean strength makes them worse, yet all have it."""
+    """Check a cause in all scans, of which three have 0.4 of the strength and get worse with the mean."""
     strengths = np.where(np.arange(10) < 3, 0.4, 1.0)
     noise = np.random.default_rng(0).normal(size=(10, 50_000))
     change = np.random.default_rng(1).normal(size=50_000)
@@ -225,7 +225,7 @@ def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -
     assert judged.improved == (7, 10)
     assert one_sided_flip_p(judged.gains_nm2) > CONFIRM_P
     assert judged.p == pytest.approx(2**-10)
-    # <c, (s - m) c + n> for the mean strength m and a scan's strength s.
+    # The gain of a scan is s² - (s - m)² for its strength s and the mean strength m, plus noise.
     gains = strengths**2 - (strengths - strengths.mean()) ** 2
     np.testing.assert_allclose(judged.gains_nm2, gains, atol=4 * 2 / 50_000**0.5)
     assert judged.passed()
@@ -234,14 +234,15 @@ def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -
 def test_the_reason_says_what_is_missing() -> None:
     before = np.full(10, 100.0)
     signs = np.where(np.arange(10) % 2, 1.0, -1.0)
-    assert judge(before[:7], before[:7] - 50, STUDY).reason().startswith("7 scans, at least 8")
-    assert judge(before, before - 10 * signs, STUDY).reason().startswith("better in only 5 of 10")
-    assert judge(before, before - 0.1, STUDY).reason() == "gain of 0.10 % is too small to matter"
+    assert judge(before[:7], before[:7] - 50, STUDY).reason().startswith("7 scans are too few: at least 8")
+    assert judge(before, before - 10 * signs, STUDY).reason().startswith("only 5 of 10 held-out")
+    assert judge(before, before - 0.1, STUDY).reason() == "the gain of 0.10 % is too small to matter"
     assert judge(before, before - 10, STUDY).reason() == ""
-    # Five scans gain 36 and five lose 10: the mean gain is 13, with a standard error of 7.
+    # Five scans gain 36 and five lose 10, so the mean gain is 13 with a standard error of 7.
     torn = judge(before, before - np.array([36.0, -10.0] * 5), STUDY)
     assert torn.low_nm2 < 0 < torn.gain_nm2
-    assert replace(torn, p=0.0).reason() == "the interval of the held-out gain includes zero"
+    includes_zero = "the confidence interval of the gain on held-out scans includes zero"
+    assert replace(torn, p=0.0).reason() == includes_zero
 
 
 def test_a_gain_matters_from_two_percent_of_the_squared_error() -> None:
@@ -280,7 +281,7 @@ def test_the_radius_of_the_tip_is_that_of_the_first_scan_that_knows_it() -> None
     assert study_of(known).tip_radius_um == 0.13
 
 
-def test_the_experiment_that_parts_a_set_is_named_once() -> None:
+def test_an_experiment_that_separates_a_set_is_named_once() -> None:
     text = get_effect(THINNING).separating
     assert separating([THINNING, THINNING]) == text
     assert separating([THINNING, MEMORY]) == f"{text}; {get_effect(MEMORY).separating}"

@@ -1,4 +1,4 @@
-"""Marks that are found in raw files and scans without a model."""
+"""Test the marks that are found in raw files and scans without a model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from litho_models.loop.record import ScanFinding
 from tests.litho_models.loop_scans import blank_scans, with_heights
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
-# The transform of a scan that is turned by 90 degrees: its lines lie along y.
+# The transform of a scan that is rotated by 90°, so that its lines lie along y.
 TURNED = np.array([[0.0, -1.0, 19.2], [1.0, 0.0, 0.0], [0, 0, 1]])
 
 
@@ -33,7 +33,7 @@ def found_in(
 @pytest.mark.parametrize("step_um", [0.001, 0.0268])
 def test_the_step_of_rounded_heights_is_read_off(step_um: float) -> None:
     rounded = (np.floor(HEIGHTS / step_um) * step_um + 0.0123).astype(np.float32)
-    # Single precision at 1 µm is 6e-8 µm, so the step of 1 nm is known to 1e-4 or better.
+    # A float32 of 1 µm is exact to 6e-8 µm, so a step of 1 nm is known to 1e-4 or better.
     assert rounding_step_um(rounded) == pytest.approx(step_um, rel=1e-3)
 
 
@@ -70,7 +70,7 @@ def test_scars_are_told_from_marks_across_the_lines(along: bool, turned: bool) -
         scans = [replace(scan, scan_to_layout=TURNED) for scan in scans]
     one = found_in(with_heights(scans, [grain] * 10))["scars-and-spikes"]
     assert one.seen is along
-    assert ("30 outliers elongated along the lines and 0 across" in one.evidence) is along
+    assert ("30 outliers are elongated along the scan lines and 0 " in one.evidence) is along
 
 
 def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_lines() -> None:
@@ -84,12 +84,12 @@ def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_line
 
     long = seen(lines)
     assert long.seen
-    # A mean of 15 pixels has a correlation of 1 - lag/15: 3 to 8 pixels apart 0.63 of 400 nm² remain. The
-    # means of whole lines take a tenth of this at most (15 of 192 pixels). Across the lines there is none.
+    # A mean of 15 pixels has a correlation of 1 - lag/15, so at lags of 3 to 8 pixels it is 0.63 of 400 nm².
+    # Subtracting line means reduces this by at most a tenth (15 of 192 pixels). Across lines it is zero.
     shared = float(long.evidence.split("share ")[1].split(" nm²")[0])
     assert 0.9 * 0.63 * 400 * 0.9 < shared < 0.63 * 400 * 1.1
     assert not seen([one.T for one in lines]).seen
-    # Offsets of whole lines, alone and with added grain, which hides their exact values.
+    # Test offsets of whole lines alone, and with grain that hides their exact values.
     offsets = [np.broadcast_to(one[:, :1], one.shape) for one in white]
     assert not seen(offsets).seen
     assert not seen([one.T + own for one, own in zip(white, offsets, strict=True)]).seen
@@ -110,8 +110,8 @@ def test_what_registration_straightened_is_told() -> None:
     assert not found_in(scans)["registration-residual"].seen
     one = found_in([replace(scans[0], bend_um=bend), *scans[1:]])["registration-residual"]
     assert one.seen
-    # Along x, 0.3 (u² - 1/3) is largest at u = 1: two thirds of 0.3.
-    assert "1 of 3 scans, bent by up to 0.20 µm" in one.evidence
+    # Along x, 0.3 (u² - 1/3) is largest at u = 1, where it is two thirds of 0.3.
+    assert "1 of 3 scans, which were bent by up to 0.20 µm" in one.evidence
 
 
 def test_a_name_that_is_both_a_term_and_a_mark_is_there_if_either_says_so() -> None:

@@ -1,4 +1,4 @@
-"""The model of what scans share besides their prints finds what was planted, and nothing else."""
+"""Check that the measurement model finds what was planted in all scans, and nothing else."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCANS = blank_scans(COUNT, SIZE_PX)
 def relief(
     number: int, shift_x_um: np.ndarray | float = 0.0, shift_y_um: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Return a print (ny, nx), µm, as a sum of waves, which is known at displaced places too."""
+    """Return a print (ny, nx) in µm, a sum of waves that can be evaluated at displaced positions."""
     rng = np.random.default_rng([11, number])
     x = (np.arange(SIZE_PX) * PITCH_UM)[None, :] + shift_x_um
     y = (np.arange(SIZE_PX) * PITCH_UM)[:, None] + shift_y_um
@@ -41,7 +41,7 @@ PRINTS = [relief(number) for number in range(COUNT)]
 def measured(
     seen: Callable[[int], np.ndarray], *, noise_um: float = NOISE_UM, seed: int = 0
 ) -> list[PrintedScan]:
-    """Return scans of ``seen(number)`` (ny, nx), µm, each with its own datum and white noise."""
+    """Return scans of the heights ``seen(number)`` (ny, nx) in µm, with a datum and white noise each."""
     rng = np.random.default_rng(seed)
     noise = rng.normal(0, noise_um, (COUNT, SIZE_PX, SIZE_PX)) + rng.normal(0, 0.05, (COUNT, 1, 1))
     return with_heights(SCANS, [seen(number) + noise[number] for number in range(COUNT)])
@@ -58,14 +58,14 @@ def part_of(model: MeasurementModel, what: str, by: str) -> SharedPart:
 def left_nm(
     scans: Sequence[PrintedScan], model: MeasurementModel, prints: Sequence[np.ndarray] = PRINTS
 ) -> float:
-    """Return the rms of the residual, without each scan's datum, nm."""
+    """Return the rms of the residual in nm, after subtracting each scan's datum."""
     left = [scan.height_um - model.expected_um(scan, own) for scan, own in zip(scans, prints, strict=True)]
-    # Leave out the edge, where a displaced print would be needed beyond the field.
+    # Exclude the edge, where a displaced print would have to be known beyond the field.
     return 1e3 * float(np.sqrt(np.mean([one[2:-2, 2:-2].var() for one in left])))
 
 
 def levelled(field_um: np.ndarray, levelling: str) -> np.ndarray:
-    """Subtract the plane (or twist, or bow) that fits best, but keep the mean."""
+    """Subtract the best-fitting surface of a levelling, such as a plane, but keep the mean."""
     powers = {1: X, 2: Y, 3: X**2, 4: X * Y, 5: Y**2}
     shapes = np.stack([np.ones_like(X), *(powers[k] for k in LEVELLED[levelling])]).reshape(  # type: ignore[index]
         1 + len(LEVELLED[levelling]),
@@ -80,7 +80,7 @@ def test_predictions_are_levelled_as_the_files_were(levelling: str) -> None:
     scans = measured(lambda number: levelled(PRINTS[number], levelling))
     learned = learn_measurement(scans, PRINTS)
     assert learned.levelling == levelling
-    # The residual is white noise. A surface learned from this noise adds less than a percent.
+    # The residual is white noise. A surface learned from this noise adds less than one per cent.
     assert left_nm(scans, learned) == pytest.approx(1e3 * NOISE_UM, rel=0.02)
 
 
@@ -91,7 +91,7 @@ def test_a_levelled_prediction_has_none_of_the_surface_and_keeps_its_mean() -> N
 
 
 def background(number: int) -> np.ndarray:
-    """Return a bow along x and a twist for field 2, and zero for field 1, µm."""
+    """Return the background in µm: a bow along x and a twist for field 2, zero for field 1."""
     return (0.03 * legendre.legval(X, [0, 0, 1]) + 0.02 * X * Y) * in_field(number, "2")
 
 
@@ -108,11 +108,11 @@ def learned(with_background: list[PrintedScan]) -> MeasurementModel:
 def test_a_background_by_field_is_found_to_within_its_noise(
     with_background: list[PrintedScan], learned: MeasurementModel
 ) -> None:
-    # Shrinking loses at most shrinking / (k + shrinking) of the background of k scans of a field, however
-    # often the fit is repeated. Half of the background may go to all scans, the rest to the field.
+    # Shrinkage loses at most shrinking / (k + shrinking) of the background that k scans of a field share,
+    # however often the fit is repeated. Half of it may be attributed to all scans, the rest to the field.
     shrinking = part_of(learned, "background", "field").shrinking
     lost = shrinking / (COUNT / 2 + shrinking) * background(1).std()
-    # A part of p numbers takes up the noise of p pixels in each field.
+    # A part with p numbers fits the noise of p pixels in each field.
     noise = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
     for number in range(COUNT):
         assert (learned.background_um(SCANS[number]) - background(number)).std() < lost + 2 * noise
@@ -130,7 +130,7 @@ def test_what_one_group_has_leaves_every_other_scan_untouched(learned: Measureme
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_displacement_in_one_field_is_found(axis: str) -> None:
-    """A shift below one pixel, S-shaped along x: at x the scan shows the print at x + shift."""
+    """Check a shift of less than a pixel, S-shaped along x, by which a scan shows the print at x + shift."""
     size_um = 0.08
     shift = size_um * legendre.legval(X, [0, 0, 0, 1])
 
@@ -140,7 +140,7 @@ def test_a_displacement_in_one_field_is_found(axis: str) -> None:
 
     scans = measured(seen)
     learned = learn_measurement(scans, PRINTS)
-    # Half of the shift may go to all scans, the rest to the difference. Only the sum is compared.
+    # Half of the shift may be attributed to all scans, the rest to the fields. Only the sum is compared.
     parts = [part for part in learned.parts if part.what == f"shift-{axis}"]
     assert "field" in {part.by for part in parts}
     kept = min(COUNT / 2 / (COUNT / 2 + part.shrinking) for part in parts)
@@ -149,7 +149,7 @@ def test_a_displacement_in_one_field_is_found(axis: str) -> None:
         # The shapes are 1, x, y, P2(x), x y, P2(y), P3(x). The last one was planted.
         return np.sum([part.coefficients.get(field, part.coefficients.get("")) for part in parts], axis=0)
 
-    # Slopes vary over the field, so the shapes are not quite independent: a twentieth is allowed.
+    # Slopes vary over the field, so the shapes are not quite independent. Allow a twentieth.
     assert total("2")[6] == pytest.approx(size_um, rel=0.05 + 1 - kept)
     assert np.abs(total("1")).max() < (0.05 + 1 - kept) * size_um
     assert left_nm(scans, learned) < 1e3 * NOISE_UM * 1.15 < 0.6 * left_nm(scans, made())
@@ -160,7 +160,7 @@ def test_a_gain_by_print_is_found() -> None:
     scans = measured(lambda number: PRINTS[number] * (1 + gains[SCANS[number].print_id]))
     part = part_of(learn_measurement(scans, PRINTS), "gain", "print")
     kept = 2 / (2 + part.shrinking)
-    # Shrinking uses the mean size of all reliefs, whose sizes differ: a fifth is allowed.
+    # Shrinkage uses the mean size of all reliefs, whose sizes differ. Allow a fifth.
     for label, gain in gains.items():
         assert part.coefficients[label][0] == pytest.approx(gain * kept, abs=0.2 * 0.05)
 
@@ -170,15 +170,15 @@ def test_next_to_nothing_is_learned_from_noise(seed: int) -> None:
     scans = measured(lambda number: PRINTS[number], seed=seed)
     learned = learn_measurement(scans, PRINTS, seed=seed)
     added = [learned.expected_um(scan, own) - own for scan, own in zip(scans, PRINTS, strict=True)]
-    # p numbers fit the white noise of p pixels. The largest part has 35 numbers in each of 2 fields.
+    # A part with p numbers fits the noise of p pixels. The largest has 35 numbers in each of 2 fields.
     limit_um = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
     assert np.sqrt(np.mean([one.var() for one in added])) < 2 * limit_um
-    # One of all parts that are tried may pass by chance.
+    # One of the parts that are tried may pass by chance.
     assert len(learned.parts) <= 1
 
 
 def test_scans_that_did_not_take_part_are_freed_too(with_background: list[PrintedScan]) -> None:
-    """The background of a field is learned on three prints and predicts the fourth."""
+    """Check that the background of a field that is learned on three prints predicts the fourth."""
     scans, prints = with_background[6:], PRINTS[6:]
     learned = learn_measurement(with_background[:6], PRINTS[:6])
     assert left_nm(scans, learned, prints) < 0.6 * left_nm(scans, made(), prints)

@@ -1,4 +1,4 @@
-"""Error figures follow closed forms; intervals have their coverage, sign-flip p values are exact."""
+"""Check errors against closed forms, the coverage of confidence intervals, and exact sign-flip p values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def scored(height, prediction, policy="offset"):
 def test_constant_error_is_bias_and_vanishes_when_the_datum_is_free():
     prediction = np.random.default_rng(0).uniform(0, 1, VALID.shape)
     score = scored(prediction - 0.052, prediction)
-    # The bias is measured minus predicted, so a print lower than predicted has a negative bias.
+    # The bias is measured minus predicted, so it is negative if the print is lower than predicted.
     assert score.bias_nm == pytest.approx(-52)
     assert score.mae_abs_nm == pytest.approx(52)
     assert score.mae_datum_free_nm < 1e-9
@@ -37,7 +37,7 @@ def test_gaussian_noise_has_a_mean_absolute_error_of_0_798_sigma():
     random = np.random.default_rng(1)
     noise = random.normal(0, 0.01596, VALID.shape)
     score = scored(noise, np.zeros(VALID.shape), "none")
-    # The mean |n| of 65,536 pixels has a relative standard error of 0.756/256 = 0.3 %; three are allowed.
+    # From 65,536 pixels, the mean |n| has a relative standard error of 0.756/256 = 0.3 %. Allow three.
     assert score.mae_datum_free_nm == pytest.approx(15.96 * np.sqrt(2 / np.pi), rel=0.009)
     assert score.rmse_datum_free_nm == pytest.approx(15.96, rel=0.009)
     assert score.median_abs_datum_free_nm == pytest.approx(15.96 * 0.67449, rel=0.015)
@@ -59,14 +59,14 @@ def test_the_error_of_the_gain_is_that_of_repeated_prints():
     prediction = 0.6 + 0.2 * gaussian_filter(random.normal(size=VALID.shape), 4) * 14
     found = []
     for _ in range(300):
-        # The residual is correlated over 7 px, as on measured prints, and rougher where the print is high.
+        # As on measured prints, the residual is correlated over 7 px, and rougher where the print is high.
         noise = 0.1 * gaussian_filter(random.normal(size=VALID.shape), 3) * (0.5 + prediction)
         found.append(print_gain(0.9 * prediction + 0.03 + noise, prediction, VALID))
     slopes = np.array([line.slope for line in found])
-    # The standard deviation of 300 repeats is known to 4 %, that of 64 blocks to 9 % each time. Correlation
-    # between neighbouring blocks lowers it by a few per cent.
+    # The standard deviation of 300 repeats is known to 4 %, that of 64 blocks to 9 % in each repeat. The
+    # correlation of neighbouring blocks lowers the latter by a few per cent.
     assert np.mean([line.slope_error for line in found]) == pytest.approx(slopes.std(), rel=0.15)
-    # If the pixels were taken as independent, the stated error would be several times too small.
+    # If the pixels were assumed to be independent, the stated error would be several times too small.
     naive = noise.std() / (prediction.std() * np.sqrt(VALID.size))
     assert slopes.std() > 3 * naive
 
@@ -77,7 +77,7 @@ def test_interval_over_scans_covers_the_mean_about_as_often_as_promised():
     for _ in range(200):
         low, high = bootstrap_interval(random.normal(21, 2, 20).tolist(), draws=500)
         hits += low <= 21 <= high
-    # The percentile interval of 20 values covers about 93 %; 200 trials have a standard error of 1.8 %.
+    # The percentile interval of 20 values covers about 93 %. For 200 trials, the standard error is 1.8 %.
     assert 0.87 <= hits / 200 <= 0.985
 
 
@@ -102,12 +102,12 @@ def test_prints_are_resampled_and_flipped_whole():
     groups = [print_ for print_ in "abcdef" for _ in range(scans_of_each)]
     better = over_units([1.0] * len(groups), groups)
     assert (better.count, better.positive) == (prints, prints)
-    # Twenty-four scans agree, yet p is no smaller than six prints allow.
+    # Although 24 scans agree, p is no smaller than six prints allow.
     assert better.p == smallest_flip_p(prints) == 1 / 32
-    # With one scan per group the result is that of the scans.
+    # With one scan per group, the result is the same as for scans.
     values = np.random.default_rng(5).normal(size=8).tolist()
     assert over_units(values) == over_units(values, list("abcdefgh"))
-    # If only prints differ, the half-width is that for the mean of prints, sd / sqrt(6). Independent scans
+    # If only prints differ, the standard error is that of the mean of prints, sd / sqrt(6). Independent scans
     # would give sd / sqrt(24). Percentiles of 6 values are right within a third.
     shifts = np.random.default_rng(6).normal(size=prints)
     values = np.repeat(shifts, scans_of_each).tolist()
@@ -118,7 +118,7 @@ def test_prints_are_resampled_and_flipped_whole():
 
 
 def test_prints_of_unequal_size_count_by_their_scans():
-    # Three scans at 0, one at 4: the mean over scans is 1, over prints 2. Every draw lies in 0 ... 4.
+    # With three scans at 0 and one at 4, the mean is 1 over scans and 2 over prints. Draws are in 0 ... 4.
     low, high = bootstrap_interval([0.0, 0.0, 0.0, 4.0], groups=list("aaab"))
     assert (low, high) == (0.0, 4.0)
 
@@ -132,7 +132,7 @@ def test_sampled_and_exact_p_agree():
     difference = random.normal(0.6, 1.0, 14)
     exact = over_units(difference.tolist()).p
     sampled = over_units([*difference.tolist(), 0.0]).p
-    # A scan without difference only makes p be sampled. 9,999 draws; three standard errors are allowed.
+    # The added scan has no difference, so p is only sampled, by 9,999 draws. Allow three standard errors.
     assert sampled == pytest.approx(exact, abs=3 * np.sqrt(exact * (1 - exact) / 9999) + 1e-4)
 
 

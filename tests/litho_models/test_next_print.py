@@ -1,4 +1,4 @@
-"""The next print: an open question becomes an experiment, whose result decides it."""
+"""Test the next print: an open question becomes an experiment, whose result decides the question."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning a
 NOISE_NM = 10.0
 DOCS = Path(__file__).parents[2] / "docs"
 TURNED = (Way(), Way(turned_deg=90))
-# Turns a scan of a print of 6.4 µm by 90 degrees.
+# This transform rotates a scan of a print of 6.4 µm by 90°.
 QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def model(effects: dict[str, dict[str, float]]) -> Twin:
-    """Return the base of ``loop_scans`` with effects."""
+    """Return the base model of ``loop_scans`` with these effects."""
     twin = Twin.bare(base_model())
     for name, values in effects.items():
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values(values)})
@@ -143,18 +143,18 @@ def first_layout(limits: Limits, size_px: int = 96) -> np.ndarray:
     return next(starts(size_px, limits, 3))[1]
 
 
-# --- what a scan shows when it is turned, recorded backwards, or made with another tip
+# --- scans that are rotated, recorded backwards, or made with another tip
 
 
 @pytest.mark.parametrize("turned_deg", [90.0, 180.0, 270.0])
 def test_the_fab_and_the_models_agree_on_what_turning_does(turned_deg: float) -> None:
-    """A scan without noise and warp is ``rot90`` of the print, by the quarter turns of its transform."""
+    """Check that a scan without noise and warp is ``rot90`` of the print, as its transform says."""
     level = np.random.default_rng(1).integers(0, 13, (40, 40)).astype(np.uint8)
     fab = Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard([], 0), 0)
     plain, turned = (scan_job(fab, Job("a", level, turned_deg=deg)) for deg in (0.0, turned_deg))
     along = turned.frame.scan_to_layout[:2, 0]
     quarters = round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
-    # Cubic interpolation at whole positions gives the same pixels but for rounding.
+    # At integer positions, cubic interpolation gives the same pixels up to rounding.
     assert np.abs(np.rot90(plain.height_um, quarters) - turned.height_um).max() < 1e-9
     assert quarters == turned_deg // 90
 
@@ -183,7 +183,7 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
 
 
 def test_the_position_of_a_window_turns_with_the_scan() -> None:
-    """The scan coordinates of a part of a field equal those of that part in the whole turned field."""
+    """Check that the scan coordinates of a part of a field equal those in the whole rotated field."""
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(14.0), indexing="ij")
     part = FieldContext(torch.zeros(1, 1, 8, 6), 0.1, 1.2, scan_shape=(20, 14), origin_px=(5, 3))
     for turns in range(4):
@@ -211,18 +211,18 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
     heights = [scan.layout_um + scale * own for scan, own in zip(blank, noise, strict=True)]
     scans = prepare_scans(with_heights(blank, heights))
     spectrum = noise_spectrum([left_nm(scan, scan.stored.layout_um) for scan in scans])
-    # The terms of each scan take some of the slow noise, and four scans give only few tiles.
+    # The terms of each scan absorb some of the slow noise, and four scans give only few tiles.
     assert np.sqrt(np.mean(spectrum.power_nm2)) == pytest.approx(10.0, rel=0.1)
     for sigma in ((0, 2), (2, 0)):
         change = gaussian_filter(random.normal(size=(80, 80)), sigma, mode="wrap")
         draws = [1e3 * scale * np.sum(change * rough()) for _ in range(400)]
-        # The standard deviation of 400 draws is known to 3.5 %, the spectrum to about 10 %.
+        # The standard deviation of 400 draws is known to 3.5 %, and the spectrum to about 10 %.
         assert spectrum.along(change) == pytest.approx(np.std(draws) / np.linalg.norm(change), rel=0.2)
 
 
 @pytest.mark.parametrize("scans", [1, 2])
 def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rivalry, limits: Limits) -> None:
-    """Scans of one print share the noise, so it is larger along their sum than along one scan."""
+    """Check that noise is larger along the sum of scans of one print, because they share its noise."""
     prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
     plain = model({}).chain().requires_grad_(False)
     found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
@@ -232,7 +232,7 @@ def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rival
 
 def test_only_a_turned_scan_separates_printer_from_microscope(rivalry: Rivalry, limits: Limits) -> None:
     level = first_layout(limits)
-    # In scans that are not turned both models are equal, so only the refit's rounding differs.
+    # In scans that are not rotated, both models are equal, except for rounding in the refit.
     assert score(rivalry, level, (Way(),)) < 1e-3
     assert score(rivalry, level, TURNED) > 5
 
@@ -243,13 +243,13 @@ def test_the_linearised_refit_comes_near_the_full_one(rivalry: Rivalry, limits: 
         rivalry.contrasts(prints, rivalry.refitted(prints, rounds=rounds))[0].rms_nm for rounds in (1, 6)
     )
     plain = rivalry.contrasts(prints, [rivalry.chains[b] for _, b in rivalry.pairs])[0].rms_nm
-    # The refit explains a good part of the difference, and its first step finds nearly all of this part.
+    # The refit explains much of the difference, and its first step finds nearly all of this.
     assert full < 0.9 * plain
     assert one == pytest.approx(full, rel=0.1)
 
 
 def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rivalry, limits: Limits) -> None:
-    """The gain of each scan scales the refitted model. Scaling the true print would explain everything."""
+    """Check that each scan's gain scales the refitted model; scaling the true print would explain all."""
     prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
     twin = rivalry.twins[0]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
@@ -264,7 +264,7 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
 
 
 def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: Limits) -> None:
-    """Equal losses along both axes look the same turned. A difference within its error decides little."""
+    """Check a question that rests on the small difference between the losses along both axes."""
     nearly_equal = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.18, "exponent": 2.0}}
     prints = [PlannedPrint(as_tensor(first_layout(limits)), TURNED)]
 
@@ -273,7 +273,7 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
         for owner in ("printer", "microscope"):
             own = rival("slope-thinning", nearly_equal, owner)
             covariance = np.zeros((len(own.vector),) * 2)
-            # This is the loss along y. The exponent and the direction are the last two numbers.
+            # The third number from the end is the loss along y. The exponent and the direction follow it.
             covariance[-3, -3] = sd_um**2
             rivals.append(own.model_copy(update={"covariance": covariance.tolist()}))
         asked = slope_question(rivals=rivals)
@@ -282,7 +282,7 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
 
     sure, unsure = powers(0.0), powers(0.02)
     count = next(n for n, power_ in enumerate(sure) if power_ > 0.99)
-    # With an error of 0.02 µm, a difference of 0.02 µm may also be zero.
+    # With an error of 0.02 µm, the difference of 0.02 µm may as well be zero.
     assert unsure[count] < answers.ENOUGH
     assert unsure[0] > 0.1
 
@@ -319,7 +319,7 @@ def test_the_power_of_repeats_is_that_of_draws() -> None:
         between = scans * data.mean(axis=2).var(axis=1, ddof=1)
         ratio = between / data.var(axis=2, ddof=1).mean(axis=1)
         found.append(np.mean(ratio > bar) if share else np.mean(ratio < low))
-    # The standard error of 4000 draws is 0.8 % at most.
+    # The standard error of 4000 draws is at most 0.8 %.
     assert answers.of_repeats(prints, scans) == pytest.approx(min(found), abs=0.025)
     assert answers.of_repeats(1, 2) == answers.of_repeats(4, 1) == 0.0
 
@@ -334,7 +334,7 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
 
     def killed(message: str) -> None:
         told.append(message)
-        if message.startswith("tile 2"):
+        if message.startswith("optimising tile 2"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -348,18 +348,18 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     plan = next_print(loop, tmp_path / "plan", report=told.append, **settings)
     assert plan is not None
     assert "1 of 2 tiles are kept" in told[0]
-    assert not any(text.startswith("tile 1") for text in told)
+    assert not any(text.startswith("optimising tile 1") for text in told)
     assert NextPrint.read(tmp_path / "plan") == plan
     middle = {"questions.csv": {"power": "", "random_power": ""}}
     require_tables_equal_record(tmp_path / "plan", NextPrint.FILE_NAME, middle)
-    # The long table is in a folded part of the page.
+    # The long table is in a collapsed section of the page.
     assert '<summary class="section">Scans<' in (tmp_path / "plan" / "report.html").read_text("utf-8")
-    with pytest.raises(InputError, match=r"seed = 0, but now 99 is asked for"):
+    with pytest.raises(InputError, match=r"seed = 0, but now 99 is requested"):
         next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]
     assert question.status == "decides"
-    named = [f"it is {name}" for name in question.rivals]
-    assert [one.rpartition(": ")[2] for one in question.outcomes[: len(named)]] == named
+    named = [f"if {name} fits the scans better" for name in question.rivals]
+    assert [one.partition(" than ")[0] for one in question.outcomes[: len(named)]] == named
     assert question.power[0] <= question.power[1]
     assert load_card(tmp_path / "plan" / "card.toml").plan is not None
     jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}
@@ -381,7 +381,7 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     truths = [Truth.read(tmp_path / name / "truth") for name in ("fab", "fab-2")]
     assert truths[0].knobs == truths[1].knobs
     turned = np.array(next(s.scan_to_layout for s in truths[1].scans if s.id == "N1F2"))
-    # The microscope turns every scan by up to 0.6 degrees.
+    # The microscope rotates every scan by up to 0.6°.
     assert abs(math.degrees(math.atan2(turned[1, 0], turned[0, 0])) - 90) < 1
     rows = read_table(card.parent / "scans.csv")
     assert rows["N1F2"]["turned_deg"] == 90
@@ -417,7 +417,7 @@ def test_the_plan_for_the_measured_prints_is_ready_and_of_their_dataset() -> Non
 def second_round(
     seed: int, effects: dict[str, dict[str, float]] = SLOPE, owner: Owner | None = None
 ) -> list[PrintedScan]:
-    """Return scans of two prints at 0 and 90 degrees, with an effect of the printer or the microscope."""
+    """Return scans of two prints at 0° and 90°, with an effect of the printer or the microscope."""
     random = np.random.default_rng(seed)
     [name] = effects
     chain = rival(name, effects, owner).twin(model({})).chain()
@@ -436,7 +436,7 @@ def second_round(
 
 
 def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Judge:
-    """Return a judge for four scans of the first round with these effects, and for new scans."""
+    """Return a judge that knows four scans of the first round with these effects, and new scans."""
     first = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=4, size_px=64)
     return Judge(model(effects), study_of(first), prepare_scans(new))
 
@@ -445,7 +445,7 @@ EARLY, LATE = (get_effect("slope-thinning").with_values({"along_x_um": size}) fo
 
 
 def by_order() -> list[PrintedScan]:
-    """Return scans, three to a print, with a loss on slopes that is stronger in the early ones."""
+    """Return scans, three of each print, with a loss on slopes that is stronger in the early scans."""
     made = planted([("slope-thinning", "order 5-6", {"before": EARLY, "from there on": LATE})], count=12)
     return [replace(scan, print_id=str(scan.order // 3)) for scan in made]
 
@@ -455,7 +455,7 @@ def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect("slope-thinning")])
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "TABLES", {})
-    # Other terms that scans share have their own tests.
+    # Other terms that scans share have their own tests, so offer only a background.
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
 
 
@@ -464,7 +464,7 @@ def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_stores_become_a_result_a_model_and_a_plan(
     one_cause: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Known differences between groups of scans do not make later prints contradict each other."""
+    """Check two rounds of a loop whose groups of scans are known to differ in strength."""
     monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
     first = write_store(tmp_path / "first.zarr", by_order())
     second = write_store(tmp_path / "second.zarr", second_round(5, SLOPE, "microscope"))
@@ -474,7 +474,7 @@ def test_two_stores_become_a_result_a_model_and_a_plan(
     question = next(one for one in asked if one.name == "slope-thinning")
     assert (question.kind, [one.name for one in question.rivals]) == ("role", [AS_PRINTER, AS_MICROSCOPE])
     assert question.rivals[0].effects["slope-thinning"]["along_x_um"] == pytest.approx(0.2, abs=0.06)
-    # Multiples such as 0.75 and 1.25 would be a spread of half or more.
+    # Multiples such as 0.75 and 1.25 would give a spread of half or more.
     assert question.spread < 0.2
     assert [one.left for one in result.decisions] == [[AS_MICROSCOPE]]
     assert [(one.name, one.role) for one in result.effects] == [("slope-thinning", "measurement")]
@@ -499,7 +499,7 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(owner: Owner) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("owner", ["printer", "microscope"])
 def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(owner: Owner) -> None:
-    """In one orientation a print with raised flanks along one axis looks the same as an asymmetric tip."""
+    """Check an asymmetric tip, which in one orientation looks like a print with raised flanks."""
     effects = {TIP: {"radius_um": 0.6, "along": 1.0, "across": 0.25}}
     assert _owners(TIP, effects[TIP]) == ["printer", "microscope"]
     assert _owners(TIP, {**effects[TIP], "across": 1.0}) == [None]
@@ -511,7 +511,7 @@ def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(owner: Owner) ->
 
 
 def single_scans(name: str, heights_um: Callable[[PreparedScan, int], np.ndarray]) -> Decision:
-    """Return the decision on a scan term from six prints, each scanned at 0 and 90 degrees."""
+    """Return the decision about a scan term from six prints, each scanned at 0° and 90°."""
     base, random = model({}), np.random.default_rng(8)
     scans = []
     for number, blank in enumerate(blank_scans(12, 64)[::2]):
@@ -551,7 +551,7 @@ def test_repeats_say_whose_a_datum_is(owner: str) -> None:
 def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
     share: float, verdict: str
 ) -> None:
-    """Errors that no rival describes may be as large. ``b`` has the errors of ``a``, enlarged."""
+    """Check rivals of which ``b`` has the errors of ``a``, enlarged. Undescribed errors may be as large."""
     scans = prepare_scans(blank_scans(4, 64)[::2])
     random = np.random.default_rng(3)
     errors = [random.normal(0, 10, scan.usable.shape) for scan in scans]
@@ -566,7 +566,7 @@ def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
 
 
 def judged(form_nm: float | None, difference_nm: float, error_nm: float) -> Decision:
-    """Return the decision if ``a`` is true, but for an error of its form in the direction of ``b``."""
+    """Return the decision if ``a`` is true except for an error of its form in the direction of ``b``."""
     scans = prepare_scans(blank_scans(4, 128)[::2])
     random = np.random.default_rng(4)
     left: dict[str, list[np.ndarray]] = {"a": [], "b": [], NONE: []}
@@ -581,11 +581,11 @@ def judged(form_nm: float | None, difference_nm: float, error_nm: float) -> Deci
 
 
 def test_an_error_of_the_form_decides_nothing_below_its_bound() -> None:
-    """An error of 4.5 nm along a difference of 5 nm favours the wrong rival by (2 · 4.5 / 5 - 1) · 25 nm²."""
+    """Check an error of the form that favours the wrong rival by (2 · 4.5 / 5 - 1) · 25 nm²."""
     assert judged(None, 5.0, 4.5).left == ["b"]
     counted = judged(4.5, 5.0, 4.5)
     assert counted.verdict == "still open"
-    assert "own error is 4.5 nm at most" in counted.evidence
+    assert "own error is at most 4.5 nm" in counted.evidence
     between = next(one for one in counted.comparisons if (one.better, one.worse) == ("b", "a"))
     assert between.difference_nm == pytest.approx(5.0, rel=0.01)
     assert between.gain_nm2 == pytest.approx(20.0, rel=0.2)
@@ -596,13 +596,13 @@ def test_an_error_of_the_form_decides_nothing_below_its_bound() -> None:
 
 
 def test_a_gain_counts_only_beyond_what_an_error_of_the_form_can_cause() -> None:
-    # Without an error of the form, and for a gain as large as the difference: the gain over its noise.
+    # With no error of the form and a gain as large as the difference, the result is gain over noise.
     assert surely_better(30.0, 30.0, 2.0, 0.0) == 15.0
     assert surely_better(-30.0, 30.0, 2.0, 0.0) == -15.0
-    # An error of the form may cause 2 · √(30 · 1.2) = 12 of the gain.
+    # An error of the form may account for 2 · √(30 · 1.2) = 12 of the gain.
     assert surely_better(30.0, 30.0, 2.0, 1.2) == pytest.approx(9.0)
     assert surely_better(30.0, 30.0, 2.0, 30.0) == 0.0
-    # Prints halfway between the rivals favour one of them by noise only. The gain has to exceed half.
+    # Prints halfway between the rivals favour one of them only by noise, so the gain has to exceed half.
     assert surely_better(14.0, 30.0, 0.1, 0.0) < Z_DECIDED < surely_better(16.0, 30.0, 0.1, 0.0)
 
 
@@ -618,7 +618,7 @@ def test_the_power_counts_the_form_as_the_decision_does() -> None:
     today = [norm.cdf(math.sqrt(prints) * squares / sd - Z_DECIDED) for prints in (1, 4, 100)]
     assert powers(None) == pytest.approx(today)
     assert powers(0.0) == pytest.approx(today)
-    # With an error half as large as the difference no number of prints decides, except 0.5 % by chance.
+    # With an error half as large as the difference, no number of prints decides, except 0.5 % by chance.
     assert max(powers(2.5)) <= 0.005 + 1e-12
     assert powers(1.0)[1] == pytest.approx(norm.cdf(2 * (1 - 2 / 5) * squares / sd - Z_DECIDED))
 
@@ -638,12 +638,12 @@ def test_a_question_below_the_models_own_error_is_declared_before_printing(
     told = asked(plain.difference_nm)
     assert told.status == "no experiment separates"
     assert told.form_nm == plain.difference_nm == told.difference_nm
-    said = f"own error is {told.form_nm:.1f} nm at most, the two differ by {told.form_nm:.1f} nm"
+    said = f"own error is at most {told.form_nm:.1f} nm, and the two rivals differ by {told.form_nm:.1f} nm"
     assert f"the model's {said}; no experiment of this plan separates them" in told.why
 
 
 def test_two_names_of_one_model_end_in_one_optimum() -> None:
-    """One fit starts with an almost straight projection, from which it would end elsewhere if alone."""
+    """Check two fits of the same model, one of which has a start that alone would lead elsewhere."""
     base = build_model(
         "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
     )
@@ -684,7 +684,7 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
             study=SimpleNamespace(windows=study, scans=scans), report=lambda message: None
         )
         known += [np.trace(_Asking._rivals(cast(Any, asking), [name], [model(SLOPE)])[0].information)]
-    # A quarter of the pixels, drawn evenly, gives a quarter of the sum, which is scaled up.
+    # An evenly drawn quarter of the pixels gives a quarter of the sum, which is then scaled up.
     assert known[1] == pytest.approx(known[0], rel=0.1)
 
 
@@ -715,22 +715,22 @@ def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: 
 
     first = open_store(write_store(tmp_path / "first.zarr", blank_scans(2, 64)))
     turned = [replace(scan, turned_deg=None) for scan in second_round(5)]
-    with pytest.raises(InputError, match=r"N0F1.*turned by 90° on its layout, 0° in its card"):
+    with pytest.raises(InputError, match=r"N0F1.*rotated by 90° on its layout, but 0° in its card"):
         new_scans(first, open_store(write_store(tmp_path / "second.zarr", turned)))
     coarser = [replace(scan, pitch_um=0.2) for scan in blank_scans(2, 64)]
     with pytest.raises(InputError, match=r"pitch_um.*0\.2.*0\.1"):
         new_scans(first, open_store(write_store(tmp_path / "coarse.zarr", coarser)))
     store = open_store(write_store(tmp_path / "foreign.zarr", blank_scans(2, 64)))
     store.__dict__["manifest"] = {"card": {"plan": {"dataset_sha256": "a" * 64}}}
-    with pytest.raises(InputError, match="plan for dataset aaaaaaaaaaaa"):
+    with pytest.raises(InputError, match="planned for dataset aaaaaaaaaaaa"):
         new_scans(first, store)
 
 
 def test_a_question_is_put_in_words() -> None:
     names = ["diffusion-blur", "resampling-blur"]
     titles = [get_effect(name).title for name in names]
-    assert _question("set", names).text == f"which is at work, {titles[0]} or {titles[1]}"
-    said = "height missing on slopes: the printer's or the microscope's"
+    assert _question("set", names).text == f"which effect is present: {titles[0]} or {titles[1]}"
+    said = "height lost on slopes: caused by the printer or by the microscope"
     assert _question("role", ["slope-thinning"]).text == said
     assert _question("fact", ["vignetting"], text="no place").text.endswith(": no place")
 
@@ -761,7 +761,7 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         assert told["counts"]
         assert told["right"] is right
         assert told["wrong"] is not right
-    # If names were asked for, a name that was not planted is wrong. A role of it is neither right nor wrong.
+    # If the question is a name, a name that was not planted is wrong. Its role is neither right nor wrong.
     other = Decision.model_validate({**answer, "declared": ["a", "b"], "left": ["a"]})
     for kind, wrong in (("set", True), ("suspects", True), ("role", False)):
         told = two_rounds.judged(other.model_copy(update={"kind": kind}), planned, "slope-thinning-x")
@@ -775,7 +775,7 @@ def test_the_page_quotes_a_board_of_two_rounds() -> None:
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
-    """New prints have the same knobs but other roughness, which scans of one print share."""
+    """Check that new prints have the same knobs but other roughness, which scans of one print share."""
     level = np.full((40, 40), 6, np.uint8)
     fab = Fab(
         Printer(), Microscope.aligned(), Noise(), KnobBoard([KnobSetting("tip-dilation", 0.5, 3)], 9), 9
@@ -787,7 +787,7 @@ def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
     def agreement(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
 
-    # Roughness is 15.9 nm, noise of lines and pixels 1 nm. Two prints are correlated only by chance.
+    # The roughness is 15.9 nm, and line and pixel noise 1 nm. Two prints correlate only by chance.
     assert agreement(first.height_um, again.height_um) > 0.98
     assert abs(agreement(first.height_um, other.height_um)) < 0.6
     sharp = scan_job(fab, Job("N1F3", level, index=13, print_index=12, tip=2.0))

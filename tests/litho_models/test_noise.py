@@ -1,4 +1,4 @@
-"""Planted noise is found, closed forms hold, and nothing is judged on the data that it was fitted to."""
+"""Check that planted noise is found, closed forms hold, and nothing is judged on its own fit data."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 @pytest.fixture
 def random():
-    """Return a new random generator for every test, so that earlier tests do not matter."""
+    """Return a new random generator for each test, so that tests do not depend on each other."""
     return np.random.default_rng(0)
 
 
 def drawn(freedom, size, random):
-    """Draw from Student's t, also with infinite degrees of freedom, which NumPy does not offer."""
+    """Draw from Student's t. Unlike NumPy, this accepts infinite degrees of freedom."""
     return random.normal(size=size) if np.isinf(freedom) else random.standard_t(freedom, size)
 
 
@@ -58,7 +58,7 @@ def drawn(freedom, size, random):
 def test_crps_is_the_integral_that_defines_it(residual, sigma, freedom):
     below, _ = quad(lambda x: student.cdf(x / sigma, freedom) ** 2, -np.inf, residual, limit=200)
     above, _ = quad(lambda x: student.sf(x / sigma, freedom) ** 2, residual, np.inf, limit=200)
-    # The quadrature is accurate to 1e-8.
+    # The numerical integration is accurate to 1e-8.
     assert float(Tails(freedom).crps(np.array(residual), sigma)) == pytest.approx(below + above, abs=1e-6)
 
 
@@ -89,16 +89,16 @@ def test_coverage_of_the_right_shape_is_its_level(level, freedom, random):
 
 def test_ence_is_the_relative_error_of_sigma(random):
     sigma = np.repeat([1.0, 2.0, 5.0, 9.0], 1000)
-    # Residuals of ± σ have the rms σ in every bin.
+    # Residuals of ± σ have an rms of σ in every bin.
     residual = sigma * random.choice([-1.0, 1.0], sigma.size)
     assert normalised_calibration_error(residual, sigma) == pytest.approx(0, abs=1e-12)
     assert normalised_calibration_error(residual, 2 * sigma) == pytest.approx(0.5)
     assert normalised_calibration_error(residual, sigma / 2) == pytest.approx(1.0)
-    # The mean of the four values of σ is right for none of them. A constant σ has one bin, which hides this.
+    # The rms of the four values of σ is wrong for each of them, but a constant σ has only one bin.
     constant = np.full(sigma.size, np.sqrt(np.mean(sigma**2)))
     assert normalised_calibration_error(residual, constant) == pytest.approx(0, abs=1e-12)
-    # The rms of n Gaussian pixels has the relative sd 1/√(2n), so its mean deviation is 1/√(πn). Ten bins of
-    # 4,000 pixels give this to a quarter.
+    # The rms of n Gaussian pixels has a relative sd of 1/√(2n), so its mean deviation is 1/√(πn). Ten bins
+    # of 4,000 pixels give this to a quarter.
     steady = random.uniform(1, 9, 40_000)
     gaussian = steady * random.normal(0, 1, steady.size)
     assert normalised_calibration_error(gaussian, steady) == pytest.approx(
@@ -110,12 +110,13 @@ def test_ause_of_uniform_errors_has_closed_forms(random):
     error = (np.arange(10_000) + 0.5) / 10_000
     residual = random.permutation(error) * random.choice([-1.0, 1.0], error.size)
     size = np.abs(residual)
-    # For errors uniform on 0 ... 1 the lowest share q has a mean of q times the whole, the highest of 2 − q
-    # times. The areas are 1/2 and 3/2, and 1 for equal σ. Sums over 10,000 pixels replace the integrals.
+    # For errors uniform on 0 ... 1, the mean of the lowest share q is q times the whole mean, and that of the
+    # highest share 2 − q times. The areas are 1/2 and 3/2, and 1 for equal σ. The integrals are replaced by
+    # sums over 10,000 pixels.
     assert sparsification_error(residual, size) == 0
     assert sparsification_error(residual, np.full(error.size, 3.0)) == pytest.approx(0.5, abs=2e-4)
     assert sparsification_error(residual, 1 / size) == pytest.approx(1.0, abs=2e-4)
-    # The unit of σ, and any increasing function of it, do not matter.
+    # The result is the same for another unit of σ or any increasing function of it.
     assert sparsification_error(1e3 * residual, size**2) == pytest.approx(0, abs=1e-12)
 
 
@@ -138,12 +139,13 @@ def test_planted_roughness_comes_back_in_quadrature(correlation_px):
     below = surface_noise("substrate", substrate, "offset")
     above = surface_noise("flat", flat, "offset")
     found = print_noise(above, [below])
-    # Fields are scaled to their sample sd, so only their chance correlation remains, 1/√n_eff.
+    # Fields are scaled to their sample sd, so only a chance correlation of 1/√n_eff remains.
     chance = 2 * 15.9 * 1.25 / np.sqrt(above.independent_heights) / 15.9
     assert found.print_nm == pytest.approx(15.9, abs=3 * chance + 1e-6)
     assert above.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * above.sigma_nm, rel=0.05)
-    # In white noise every pixel is independent. Blurred by s, ρ = exp(−r²/4s²), so Σρ² = 2πs² pixels count
-    # as one height. Chance correlations at the summed lags, a quarter of the pixels, add up to a third.
+    # In white noise, every pixel is independent. Noise blurred by s has ρ = exp(−r²/4s²), so Σρ² = 2πs²
+    # pixels count as one height. The summed lags are a quarter of the pixels, whose chance correlations add
+    # up to a third.
     wanted = 2 * np.pi * correlation_px**2 if correlation_px else 1.0
     assert 0.95 * wanted < flat.size / above.independent_heights < 1.4 * wanted
 
@@ -197,7 +199,7 @@ def staircase(sigma_um, step_um=0.08, axis="x", tilt_um=0.0, seed=4):
 def test_the_treads_of_a_staircase_are_found(axis):
     found, edges = find_edges(staircase(0.01, axis=axis), 0.1)
     assert found == axis
-    # The blur of 2.5 px shifts the edge by no more than its width.
+    # The blur of 2.5 px displaces the edge by less than this width.
     assert np.abs(np.array(edges) - [50, 100, 150, 200]).max() <= 2
 
 
@@ -216,7 +218,7 @@ def test_step_heights_readability_and_misreading_follow_from_the_noise():
     for step in found.steps:
         assert step.height_nm == pytest.approx(80, abs=4 * step.uncertainty_nm + 0.5)
         assert step.readability == pytest.approx(5, rel=0.05)
-        # Φ(−2.5) = 0.6 % of some 7,000 pixels has a standard deviation of 0.1 %.
+        # From some 7,000 pixels, the share Φ(−2.5) = 0.6 % has a standard deviation of 0.1 %.
         assert step.misread == pytest.approx(norm.cdf(-2.5), abs=0.004)
 
 
@@ -229,7 +231,7 @@ def test_a_flat_surface_has_no_steps():
 
 
 def ladder(dose, sigma_um=0.006, seed=0):
-    """Height grows with dose. Below 0.8 the low levels print nothing, above 1.2 the high ones saturate."""
+    """Return a ladder at a dose. Below 0.8 the low levels print nothing; above 1.2 the high ones saturate."""
     scan = make_scans(1, size_px=60)[0]
     level = np.broadcast_to(np.repeat(np.arange(9), 40), (60, 360)).astype(np.uint8)
     nominal = level * 0.1
@@ -253,13 +255,13 @@ def test_the_dose_matrix_sees_height_roughness_and_lost_steps():
     assert notes == []
     assert [row.dose for row in found.rows] == doses
     under, low, nominal, high, over = found.rows
-    # Levels 0, 1 and 2 have one height, so two steps are lost. 0.75 µm is reached below level 6 (0.78 µm).
+    # Levels 0, 1 and 2 have the same height, so two steps are lost. Level 6 would exceed 0.75 µm (0.78 µm).
     assert (under.lost_low, under.lost_high) == (2, 0)
     assert (over.lost_low, over.lost_high) == (0, 2)
     for row in (low, nominal, high):
         assert (row.lost_low, row.lost_high) == (0, 0)
-        # The tilt along the ladder follows only from the slopes within 9 treads of 20 x 40 px. The x of a
-        # tread spreads by 20/√12 of 360 px, so noise of 6 nm leaves 4.4 nm over the field, 0.6 % of 800 nm.
+        # The tilt along the ladder is known only from the slopes within 9 treads of 20 x 40 px, where x has a
+        # spread of 20/√12 of 360 px. Noise of 6 nm causes an error of 4.4 nm over the field: 0.6 % of 800 nm.
         assert row.height_gain == pytest.approx(row.dose, abs=0.02)
         assert row.roughness_nm == pytest.approx(6 * (1 + 2 * abs(row.dose - 1)), rel=0.03)
     assert found.recommended_dose == 1.0
@@ -273,7 +275,7 @@ def test_shrinkage_alone_is_no_wrong_exposure_and_the_nearest_height_wins():
     ]
     found, _ = dose_matrix(shrunk)
     assert not any(row.lost_low or row.lost_high for row in found.rows)
-    # 0.6 · 1.15 = 0.69 is the value nearest to 1.
+    # The gain nearest to 1 is 0.6 · 1.15 = 0.69.
     assert found.recommended_dose == 1.15
 
 
@@ -326,7 +328,7 @@ def test_repeated_prints_give_their_noise():
     ]
     found = repeated_prints([*repeats, make_scans(2, size_px=128)[1]])
     assert found.scans == 3
-    # Three pairs of 16,384 white pixels have an error of 0.3 %.
+    # From three pairs of 16,384 white pixels, σ has an error of 0.3 %.
     assert found.sigma_nm == pytest.approx(12, rel=0.02)
     assert found.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * 12, rel=0.02)
 
@@ -344,13 +346,14 @@ def heights_um(scans):
 
 
 def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
-    """A model with half the gain leaves an error as large as the noise, which the floor does not count."""
+    """Check that the floor excludes the error of a model with a wrong gain, which exceeds the noise."""
     scans = make_scans(12, size_px=128, noise_um=0.020, datum_um=0.03, bow_um=0.02)
     wrong = [0.85 * height for height in heights_um(scans)]
     found = estimated_floor("made", scans, wrong)
     assert np.std([1e3 * (scan.height_um - height) for scan, height in zip(scans, wrong, strict=True)]) > 40
-    # With 3,000 pixels of each of 12 scans σ² is known to √(2/36,000) · a few, for shared partners: below
-    # 2 %. The bow y² of every scan adds 20 nm · √(4/45), 6 nm in quadrature, as partners lie elsewhere.
+    # With 3,000 pixels of each of 12 scans, σ² is known to a few times √(2/36,000), because partners are
+    # shared: below 2 %. Partners lie elsewhere in the field, so the bow adds 20 nm · √(4/45) = 6 nm in
+    # quadrature.
     bowed = float(np.hypot(20, 20 * np.sqrt(4 / 45)))
     for policy, sigma in (("offset", bowed), ("full", 20.0)):
         row = found.at(policy)
@@ -358,12 +361,12 @@ def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
         assert row.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * sigma, rel=0.05)
         assert row.rmse_ci95_nm[0] < row.rmse_nm < row.rmse_ci95_nm[1]
     assert (found.mae_at("offset"), found.mae_at("none")) == (found.mae_nm, found.at("none").mae_nm)
-    # The datum of ±30 nm counts as noise where no scan term takes it up.
+    # The datum of ±30 nm counts as noise if no scan term absorbs it.
     assert found.at("none").rmse_nm == pytest.approx(np.hypot(bowed, 30), rel=0.05)
 
 
 def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
-    """Half the squared difference would be too small, as rare rough places have smooth partners."""
+    """Check rare rough places with smooth partners, for which half the squared difference is too small."""
     scans = make_scans(4, size_px=96)
     rough_places = [scan.mask_level >= 9 for scan in scans]
     residuals = [
@@ -386,7 +389,7 @@ def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
 
 @pytest.mark.parametrize("draw", ["normal", "laplace", "uniform"])
 def test_the_mean_absolute_noise_needs_no_gaussian(draw, random):
-    """A factor √2 between differences and noise would be 6 % wrong for Laplace and for uniform noise."""
+    """Check other noise than Gaussian, for which a factor √2 between differences and noise is 6 % wrong."""
     scans = make_scans(5, size_px=96, noise_um=0.0, datum_um=0.0)
     noise = [1e-3 * getattr(random, draw)(-10 if draw == "uniform" else 0, 10, scan.shape) for scan in scans]
     noisy = [
@@ -394,12 +397,12 @@ def test_the_mean_absolute_noise_needs_no_gaussian(draw, random):
         for scan, own in zip(scans, noise, strict=True)
     ]
     found = estimated_floor("made", noisy, heights_um(scans)).at("offset")
-    # 15,000 pixels with four partners each have an error below 2 %.
+    # From 15,000 pixels with four partners each, the error is below 2 %.
     assert found.mae_nm == pytest.approx(1e3 * np.mean(np.abs(noise)), rel=0.025)
     assert found.rmse_nm == pytest.approx(1e3 * np.std(noise), rel=0.025)
 
 
-def test_what_a_dose_changes_is_no_noise_of_like_layouts():
+def test_changes_by_a_dose_do_not_count_as_noise_of_similar_layouts():
     plain = make_scans(10, size_px=128, noise_um=0.010, datum_um=0.0)
     dosed = [
         replace(
@@ -410,11 +413,11 @@ def test_what_a_dose_changes_is_no_noise_of_like_layouts():
         for scan, dose in zip(plain, (0.9, 1.1) * 5, strict=True)
     ]
     found = estimated_floor("made", dosed, heights_um(dosed)).at("offset")
-    # The gain that all prints of one dose lack is a function of the layout, so it is no noise. It remains
-    # only as far as the surroundings of partners are similar but not equal.
+    # All prints of one dose lack the same gain. This is a function of the layout, so it is not noise. Little
+    # of it remains, because the surroundings of partners are similar but not equal.
     assert found.rmse_nm == pytest.approx(10, rel=0.15)
     one_dose = [replace(scan, dose=None) for scan in dosed]
-    # Taken as one dose, the doses would add noise: 10 % of about 110 nm rms, besides the 10 nm.
+    # If the doses were ignored, they would add noise of 10 % of about 110 nm rms to the 10 nm.
     assert estimated_floor("made", one_dose, heights_um(dosed)).at("offset").rmse_nm > 14
 
 
@@ -435,7 +438,7 @@ def test_flat_places_show_the_roughness_of_their_level(random):
     found = noise_budget(Residuals("made", scans, heights_um(scans), [], True))
     assert len(found.flat_levels) > 3
     for row in found.flat_levels:
-        # A thousand pixels give σ to 2 %. Terms estimated on the other half add to this error.
+        # From a thousand pixels, σ is known to 2 %. Terms estimated on the other half add to this error.
         assert row.sigma_nm == pytest.approx(10 + 2 * row.level, rel=0.08)
 
 
@@ -453,13 +456,13 @@ def test_a_planted_scale_is_found_by_maximum_likelihood(freedom, random):
     assert (np.abs(found - truth) < 4 * error).all()
     z2 = residual**2 / scale_nm(found, design) ** 2
     assert np.abs(design.T @ (tails.weight(z2) * z2 - 1)).max() < 1e-5 * len(residual)
-    # The shape is the one of the grid. For a Gaussian it may be one that 60,000 pixels cannot distinguish.
+    # The shape is a value of the grid. For a Gaussian, it may be a value that 60,000 pixels cannot rule out.
     shape = fit_spread(design, residual)[1].freedom
     assert shape >= 30 if np.isinf(freedom) else shape == freedom
 
 
 def planted_residuals(count=10, size_px=96, seed=0, freedom=np.inf):
-    """Return residuals whose σ grows with slope and level."""
+    """Return scans, residuals whose σ grows with slope and level, and these σ."""
     scans = make_scans(count, size_px=size_px)
     beta = np.zeros(len(COVARIATES))
     knots = [number for number, name in enumerate(COVARIATES) if name.startswith("level")]
@@ -483,21 +486,21 @@ def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not(freedo
     assert by_covariates.crps_nm < constant.crps_nm
     assert by_covariates.ause < constant.ause
     for level, share in zip(by_covariates.levels, by_covariates.coverage, strict=True):
-        # 110,000 pixels have an error of 0.2 %. The fit to ten scans of 5,000 pixels adds as much.
+        # From 110,000 pixels, the error is 0.2 %. The fit to ten scans of 5,000 pixels adds as much.
         assert share == pytest.approx(level, abs=0.01)
-    # For the right shape the PIT is flat, with 1/20 per bin.
+    # For the right shape, the PIT histogram is flat, with 1/20 per bin.
     assert np.abs(np.array(by_covariates.pit) - 0.05).max() < 0.004
     everything, *groups = found.bins
     assert everything.coverage_68_ci95 == pytest.approx((0.68, 0.68), abs=0.015)
     assert {row.covariate for row in groups} == {"level", "slope", "edge distance", "radius²"}
     for row in (row for row in groups if row.pixels > 5000):
-        # The sd √(p(1 − p)/5000) is 0.7 % and 0.3 %. Three are allowed, plus the error of the fit.
+        # The sd √(p(1 − p)/5000) is 0.7 % or 0.3 %. Allow three of them, plus the error of the fit.
         assert row.coverage_68 == pytest.approx(0.68, abs=0.03)
         assert row.coverage_95 == pytest.approx(0.95, abs=0.015)
         assert row.predicted_nm == pytest.approx(row.rms_nm, rel=0.08)
 
 
-def test_errors_half_as_large_again_as_stated_are_so_for_all_groups_and_scans(random):
+def test_errors_larger_than_stated_are_found_in_all_groups_and_scans(random):
     scans, _, sigmas = planted_residuals(count=3)
     errors = [1.5 * sigma * random.choice([-1, 1], sigma.shape) for sigma in sigmas]
     stated = [Stated(sigma, GAUSSIAN) for sigma in sigmas]
@@ -518,7 +521,7 @@ def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():
     loud = [100 * residuals[0], 100 * residuals[1], *residuals[2:]]
     quiet = analyse_spread(Residuals("made", scans, [], residuals, True)).calibrations[1]
     alarmed = analyse_spread(Residuals("made", scans, [], loud, True)).calibrations[1]
-    # The residuals of a scan and of its print do not influence the σ with which this scan is judged.
+    # The σ with which a scan is judged does not depend on residuals of this scan or its print.
     assert alarmed.scans[0].standardised_rms == pytest.approx(100 * quiet.scans[0].standardised_rms, rel=1e-9)
     assert alarmed.scans[2].standardised_rms < quiet.scans[2].standardised_rms
 
@@ -541,10 +544,10 @@ def test_a_store_without_references_has_the_floor_that_residuals_show(store, tmp
     scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=2)
     result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "b")
     assert NoiseAnalysis.read(tmp_path / "out") == result
-    # Planted: 4 nm of white noise.
+    # The planted white noise is 4 nm.
     assert result.noise_floor.kind == "upper-estimate"
     assert result.noise_floor.rmse_nm == pytest.approx(4, rel=0.1)
-    # A benchmark computes the same floor from its best model, and shows it under its errors.
+    # A benchmark computes the same floor from its best model and shows it below its errors.
     assert scored.noise_floor == result.noise_floor == result.budget.floor
     assert result.budget.model == "linear"
     error = next(score for score in scored.scores if score.model == "linear").mae_datum_free_nm
@@ -579,7 +582,7 @@ def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
     result = analyse_noise(write_store(tmp_path / "doses.zarr", prints), tmp_path / "out")
     (locked,) = locked_ids(prints)
     assert [row.scans for row in result.dose.rows] == [[scan.id] for scan in prints]
-    assert result.run.dropped == [f"{locked}: lock box, in the dose matrix only"]
+    assert result.run.dropped == [f"{locked}: lock box, used only in the dose matrix"]
     assert any(note.endswith(f"no model: {locked}.") for note in result.notes)
     assert result.run.n_scans == 4
     assert locked in (tmp_path / "out" / "report.html").read_text()
@@ -627,7 +630,7 @@ def test_residuals_of_a_frozen_model_state_which_scans_it_was_trained_on(store, 
     result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "run" / "model")
     spread = result.spread
     assert not spread.held_out
-    # The residual of scans that the model was fitted to is no estimate of the noise.
+    # Residuals of scans that the model was fitted to do not estimate the noise.
     assert (result.budget, result.noise_floor.kind) == (None, "unknown")
     assert len(spread.calibrations[0].scans) == 7
     with pytest.raises(InputError, match="with a frozen model"):
@@ -691,7 +694,7 @@ def test_the_command_takes_single_files(tmp_path):
     assert outcome.exit_code == 0, outcome.output
     found = NoiseAnalysis.read(tmp_path / "out")
     assert found.noise_floor.kind == "measured"
-    # The print adds √(16² − 1.25²).
+    # The roughness of the print alone is √(16² − 1.25²).
     offset = next(one for one in found.references.print_noise if one.background == "offset")
     assert offset.print_nm == pytest.approx(np.sqrt(16**2 - 1.25**2), rel=1e-3)
     assert found.references.steps[0].resolvable_step_nm == pytest.approx(READABLE_AT * 16, rel=0.02)

@@ -1,4 +1,4 @@
-"""The page on noise quotes the committed results of virtual prints, which agree with what was planted."""
+"""Check that the page on noise quotes the committed results of virtual prints, and that these are right."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_doses_and_roughness_agree_with_what_was_planted():
     gains = [row.height_gain for row in doses.dose.rows]
     assert gains == sorted(gains)
     found = NoiseAnalysis.read(virtual_noise.FOLDER / virtual_noise.REFERENCES)
-    # 30,000 pixels give σ to 1 %. The model error of `features` adds as little.
+    # From 30,000 pixels, σ is known to 1 %. The model error of `features` adds about as much.
     assert found.budget.floor.at("full").rmse_nm == pytest.approx(Noise().roughness_nm, rel=0.02)
 
 

@@ -1,4 +1,4 @@
-"""The null calibration plants no cause, and the page quotes its result."""
+"""Check the calibration of false alarms, in which no cause is planted, and that the page quotes it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_page_quotes_the_committed_calibration() -> None:
 
 
 def test_five_of_40_are_consistent_with_the_rate_and_six_are_not() -> None:
-    # At the stated rate six or more of 40 have a probability of 0.014, five or more of 0.048.
+    # At the stated rate, six or more of 40 have a probability of 0.014, and five or more one of 0.048.
     assert null_calibration.most_at_the_rate(40) == 5
 
 
@@ -30,8 +30,8 @@ def test_scans_of_one_store_share_the_model_and_nothing_else() -> None:
     scans = null_calibration.null_scans(1)
     assert len(scans) == null_calibration.SCANS
     heights = np.stack([scan.height_um for scan in scans]).astype(np.float64)
-    # The roughness of 16 nm is correlated over less than 1 µm. Two scans share only the layout's statistics,
-    # so their maps correlate by no more than a few times 1 / sqrt(places of 2 µm in 19 µm).
+    # The roughness of 16 nm is correlated over less than 1 µm. Two scans have only the layout's statistics in
+    # common, so their maps correlate by at most a few times 1 / sqrt(number of 2 µm places in 19 µm).
     maps = heights - heights.mean(axis=(1, 2), keepdims=True)
     cosine = np.corrcoef(maps.reshape(len(maps), -1))
     assert np.abs(cosine - np.eye(len(maps))).max() < 5 / np.sqrt(9.6**2)

@@ -1,4 +1,4 @@
-"""Effects from a user's file are registered by public names, and are candidates like all others."""
+"""Check that effects from a user's file are registered and become candidates like all others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.litho_models.prints import write_store
 
 @pytest.fixture
 def catalogues() -> Iterator[None]:
-    """Restore the catalogues afterwards, with their order."""
+    """Restore the catalogues and their order after each test."""
     before = [(own, dict(own)) for own in (CATALOGUE, SCAN_TERMS)]
     yield
     for own, entries in before:
@@ -39,7 +39,7 @@ def test_the_example_finds_the_effects_that_it_registers(
         added = 0.03 * random.normal() * x**3 - 0.04 * np.exp(-scan.layout_um / own_effect.SINKING_DEPTH_UM)
         scans.append(replace(scan, height_um=(scan.height_um + added).astype(np.float32)))
     store, out = write_store(tmp_path / "s.zarr", scans), tmp_path / "loop"
-    # Only two effects of the catalogue: the others take time and have their own tests.
+    # Use only two effects of the catalogue, because the others take time and have their own tests.
     names = ("vignetting", "sinking-layers")
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: list(map(get_effect, names)))
     monkeypatch.setattr(closing, "LAWS", {})

@@ -1,4 +1,4 @@
-"""A user's own model can be trained, frozen and loaded by its name."""
+"""Check that a user's own model can be trained, frozen and loaded by its name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_example_trains_freezes_and_loads_its_model_by_name(tmp_path, monkey
     own_simulator.main()
     assert "two-spots is frozen" in capsys.readouterr().out
     model = load_frozen(tmp_path / "model").simulator
-    # The scans were made with one spot of 0.25 µm and saturation, which the model describes by wider spots.
+    # The scans were made with a spot of 0.25 µm and saturation, which the model imitates with wider spots.
     narrow = model.ranges["narrow"].value(model.narrow).item()
     assert narrow == pytest.approx(0.25, rel=0.3)
     with pytest.raises(InputError, match="not taken"):

@@ -1,4 +1,4 @@
-"""Printers made of parts: imaging compared with Hopkins' sum, resists, parameters set or fixed."""
+"""Test printers made of parts: imaging against Hopkins' sum, resists, and fixed or fitted parameters."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def printer(name: str, **fields: Any) -> Printer:
 
 
 def image(mask: np.ndarray, lens: Optics, pitch_um: float = PITCH_UM) -> np.ndarray:
-    """Return the intensity (y, x) of a periodic mask, with all kernels."""
+    """Return the image intensity (y, x) of a periodic mask, using all kernels."""
     spectra = torch.from_numpy(transfer_functions(lens, pitch_um, mask.shape))
     return imaged(torch.from_numpy(mask)[None, None], spectra)[0, 0].numpy()
 
 
 def hopkins_sum(mask: np.ndarray, lens: Optics) -> np.ndarray:
-    """Return Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with C summed over all source points."""
+    """Return Hopkins' sum Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with C summed over the source."""
     n = len(mask)
     f = np.stack(np.meshgrid(*2 * [np.fft.fftfreq(n, PITCH_UM)], indexing="ij"), -1).reshape(-1, 2)
     spectrum = np.fft.fft2(mask).ravel() / mask.size
@@ -55,7 +55,7 @@ def hopkins_sum(mask: np.ndarray, lens: Optics) -> np.ndarray:
         path_um = lens.defocus_um * (np.sqrt(np.where(passed, 1 - sine2, 1)) - 1)
         return passed * np.exp(2j * np.pi * path_um / lens.wavelength_um)
 
-    # Nine source points along each side of a cell, each moved to the middle of the cell.
+    # A cell has nine source points along each side, which are all moved to the centre of the cell.
     fine = np.arange(-9 * n // 2, 9 * n // 2)
     y, x = (one.ravel() / (9 * n * PITCH_UM) for one in np.meshgrid(fine, fine, indexing="ij"))
     radius = np.hypot(y, x) / CUTOFF
@@ -77,7 +77,7 @@ def test_the_kernels_give_the_sum_of_hopkins() -> None:
 
 
 def test_a_source_is_as_bright_as_its_area() -> None:
-    """Compare the image of a source on the kernels' coarse grid with that of some thousand points."""
+    """Compare the image of a source on the coarse grid of the kernels with that of a thousand points."""
     pitch_um, side = 0.06, 96
     lens = Optics(0.365, 0.5, 0.6, 0.0, 0.0, 400)
     mask = (fftconvolve(np.random.default_rng(0).random((side, side)), np.ones((9, 9)), "same") > 40).astype(
@@ -93,13 +93,13 @@ def test_a_source_is_as_bright_as_its_area() -> None:
     reach = kernel_reach_px(lens, pitch_um)
     padded = torch.from_numpy(np.pad(mask, reach, mode="wrap"))[None, None]
     seen = intensity(padded, lens, pitch_um)[0, 0].numpy()
-    # Counting only whole grid points would give 1.1 %.
+    # If only whole grid points counted, the error would be 1.1 %.
     assert np.sqrt(np.mean((seen - total / count) ** 2)) < 0.006
 
 
 @pytest.mark.parametrize("waves", [1, 3])
 def test_a_point_source_images_the_amplitude_that_passes(waves: int) -> None:
-    """t = (1 + cos 2πfx) / 2 is imaged as t²; defocus delays its waves; beyond the pupil it is 1/4."""
+    """Check images of t = (1 + cos 2πfx) / 2: t² in focus, delayed if defocused, 1/4 beyond the pupil."""
     lens = Optics(0.365, 0.6, 0.0, 0.0, 0.3, 400)
     x = np.arange(SIZE_PX) / SIZE_PX
     f = waves / (SIZE_PX * PITCH_UM)
@@ -114,7 +114,7 @@ def test_a_point_source_images_the_amplitude_that_passes(waves: int) -> None:
 def test_a_wide_source_images_the_intensity_by_the_transfer_function_of_a_circular_pupil() -> None:
     size, waves = 64, 5
     f = waves / (size * PITCH_UM)
-    # The source is wider than all that the mask diffracts, so the image is incoherent.
+    # The source is wider than the diffracted light of the mask, so the image is incoherent.
     lens = Optics(0.365, 0.6, 1 + f / CUTOFF, 0.0, 0.0, 10**6)
     x = np.arange(size) / size
     mask = np.tile(np.cos(np.pi * waves * x) ** 2, (size, 1))
@@ -123,7 +123,7 @@ def test_a_wide_source_images_the_intensity_by_the_transfer_function_of_a_circul
     ν = f / (2 * CUTOFF)
     wanted = 2 / np.pi * (np.arccos(ν) - ν * np.sqrt(1 - ν**2))
     found = np.abs(np.fft.fft(seen))
-    # The pupil's area is a count of frequencies. At a width of 8 it is right to 1 / 8², except at the rim.
+    # The pupil's area is a count of frequencies. With a width of 8, it is right to 1 / 8², except at the rim.
     assert found[waves] / found[0] == pytest.approx(wanted * squared[waves] / squared[0], rel=0.03)
 
 
@@ -214,7 +214,7 @@ def test_one_batch_of_kernels_is_faster_than_one_convolution_after_the_other() -
 def test_a_contrast_curve_is_a_line_in_the_logarithm_between_nothing_and_all() -> None:
     dose = torch.tensor([0.05, 0.4, 0.6, 2.0])
     depth = contrast_curve(dose, torch.tensor(1.5), torch.tensor(0.9))
-    # Corners of the curve are rounded by 1 / 20 of the depth.
+    # The corners of the curve are rounded over 1 / 20 of the depth.
     wanted = [0.0, 1 + 1.5 * np.log10(0.4 / 0.9), 1 + 1.5 * np.log10(0.6 / 0.9), 1.0]
     assert depth.tolist() == pytest.approx(wanted, abs=0.01)
 
@@ -272,7 +272,7 @@ def test_a_contrast_curve_of_256_levels_is_fitted_by_33_heights() -> None:
         random_layout((64, 64), levels=256, cutoff_per_um=0.5, seed=9) * np.float32(1.2 / 255)
     )
     off = (table(held_out[None, None]) - true(held_out[None, None])).detach().abs()
-    # Lines between 33 heights cut the curve's corners, which are rounded over a twentieth of the range.
+    # Lines between 33 heights cut off the curve's corners, which are rounded over a twentieth of the range.
     assert float(off.mean()) < 0.004 * 1.2
 
 
@@ -311,7 +311,7 @@ def test_numbers_of_a_model_are_set_and_fixed_on_the_command_line(
 
 @pytest.mark.parametrize("name", [name for name, one in MODELS.items() if issubclass(one, Printer)])
 def test_a_preset_is_built_for_its_own_pitch_and_says_what_it_does_not_know(name: str) -> None:
-    with pytest.raises(InputError, match="not a number of these parts"):
+    with pytest.raises(InputError, match="not a parameter of these parts"):
         printer(name, **{"spot.width_um": 1.0})
     with pytest.raises(InputError, match="part of a printer"):
         build_model(name, parts=("lamp",))

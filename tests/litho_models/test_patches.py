@@ -1,4 +1,4 @@
-"""Patches are pieces of a store's scans, at the stated positions, and never of locked scans."""
+"""Check that patches are parts of scans at the stated positions, and never parts of locked scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The spot of Physics is given, fitted as a circle, or fitted with one width per axis."""
+"""Test the spot of Physics, which is given, fitted as a circle, or fitted with one width per axis."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WIDTHS = {"round": ("spot",), "elliptical": ("spot_y", "spot_x")}
 
 
 def model_of(kind: str, **widths_um: float) -> Simulator:
-    """Return Physics with a short diffusion and the widths ``spot`` or ``spot_y``, ``spot_x``, in float64."""
+    """Return Physics in float64, with a short diffusion and the widths ``spot`` or ``spot_y``, ``spot_x``."""
     model = build_model(
         "physics", pitch_um=PITCH_UM, level_height_um=0.1, levels=13, spot=kind, sigma_diffusion_init_um=0.3
     ).double()
@@ -25,7 +25,7 @@ def model_of(kind: str, **widths_um: float) -> Simulator:
 
 
 def layout(seed: int = 0) -> torch.Tensor:
-    """Return blocks of random levels, (1, 1, 40, 48) µm."""
+    """Return a layout (1, 1, 40, 48) in µm with blocks of random levels."""
     coarse = (
         torch.randint(0, 13, (1, 1, 10, 12), generator=torch.Generator().manual_seed(seed)).double() * 0.1
     )
@@ -42,7 +42,7 @@ def test_a_spot_has_as_many_numbers_as_it_has_widths(spot: str, count: int) -> N
     model = model_of(spot)
     assert len(list(model.parameters())) == len(list(model_of("given").parameters())) + count
     widths = {name: float(value) for name, value in model.values.items() if "spot" in name}
-    # Before a fit the widths are the given ones.
+    # Before a fit, the widths are the given ones.
     assert list(widths.values()) == pytest.approx([0.2] * count)
 
 
@@ -70,14 +70,14 @@ def test_an_edge_is_blurred_by_the_width_across_it(axis: str) -> None:
         printed(model_of("elliptical", **{f"spot_{axis}": own, f"spot_{other}": its}), field)
         for own, its in ((0.15, 0.1), (0.15, 0.4), (0.3, 0.1))
     )
-    # Both kernels end where the wider one does, after 4 sigma. This cuts 6e-5 of a step.
+    # Both kernels are truncated at 4 sigma of the wider one, which loses 6e-5 of a step.
     torch.testing.assert_close(wide, narrow, rtol=0, atol=6e-5)
     assert (across - narrow).abs().max() > 0.02
 
 
 @pytest.mark.parametrize("spot", ["round", "elliptical"])
 def test_derivatives_by_the_widths_are_difference_quotients(spot: str) -> None:
-    # The kernel ends at a whole pixel. Here the widths change without moving this end.
+    # The kernel ends at a whole pixel, which does not change at these widths.
     model, field = model_of(spot, **dict.fromkeys(WIDTHS[spot], 0.21)), layout()
     weight = torch.linspace(-1, 1, field.numel(), dtype=torch.float64).reshape(field.shape)
     (model(field) * weight).sum().backward()
@@ -90,7 +90,7 @@ def test_derivatives_by_the_widths_are_difference_quotients(spot: str) -> None:
                 values.append(float((printed(model, field) * weight).sum()))
                 parameter.data -= sign * step
             assert parameter.grad is not None
-            # Central differences are off by step² times the third derivative of a sum of hundreds of terms.
+            # Central differences err by step² times the third derivative of a sum of hundreds of terms.
             assert float(parameter.grad) == pytest.approx((values[0] - values[1]) / (2 * step), abs=1e-5)
 
 

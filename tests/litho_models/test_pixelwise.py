@@ -1,4 +1,4 @@
-"""A function of single pixels has the same values and gradients in blocks as for all pixels at once."""
+"""Check that a function of single pixels gives the same values and gradients in blocks as at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.numerics
 
 @pytest.mark.parametrize("learns", [False, True])
 def test_blocks_change_neither_values_nor_gradients(learns, monkeypatch):
-    # 7 blocks, the last one not full.
+    # There are 7 blocks, of which the last is not full.
     monkeypatch.setattr(pixelwise, "_PIXELS_AT_ONCE", 16)
     torch.manual_seed(0)
     weight = torch.randn(5, dtype=torch.float64, requires_grad=learns)
@@ -33,7 +33,7 @@ def test_blocks_change_neither_values_nor_gradients(learns, monkeypatch):
     assert max(seen) == 16
     assert sum(seen) == 100
     assert torch.equal(found.detach(), wanted.detach())
-    # Sums of a hundred products of order one, in double precision.
+    # The sums have a hundred products of order one, in double precision.
     for slope, expected in zip(
         torch.autograd.grad(found @ pull, inputs), torch.autograd.grad(wanted @ pull, inputs), strict=True
     ):

@@ -1,4 +1,4 @@
-"""Effects planted in copies of the data show how small an effect would be found. The data do not change."""
+"""Test planting effects in copies of the data, which shows how small an effect would be found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAW = "height-times-slope-size-x"
 
 
 def closed_on(scans: Sequence[PrintedScan]) -> Closed:
-    """Run only the loop's search, among two laws."""
+    """Run only the search of the loop, with two laws as candidates."""
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
     found = search(base, [get_effect(LAW), get_effect("height-power-2")])

@@ -1,4 +1,4 @@
-"""A frozen model predicts in the chosen precision, with a warning if that is slower on this processor."""
+"""Check that a frozen model predicts in the chosen precision, and warns if that is slower here."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.numerics
 
 LAYOUT_UM = 0.1 * torch.randint(0, 13, (1, 1, 96, 96), generator=torch.Generator().manual_seed(0))
 SHRINKAGE = {"vertical-shrinkage": {"fraction": 0.1}}
-WARNING = "in bfloat16: float32 is faster on this processor, which has no bfloat16 unit"
+WARNING = "run in bfloat16, but this processor has no bfloat16 unit: float32 is faster"
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_precision_holds_inside_the_block_and_nowhere_else(effects, pbl, tmp_pat
     with pytest.raises(KeyError), frozen.at_precision("bfloat16"):
         raise KeyError
     assert max(off_by(a, b) for a, b in zip(printed(), before, strict=True)) < 1e-6
-    # bfloat16 rounds the products of five layers by up to 2^-9. The part that bypasses them is exact.
+    # bfloat16 rounds the products of five layers by up to 2^-9. What bypasses these layers is exact.
     assert 1e-5 < off_by(reduced[1], before[1]) < 0.03
     assert 1e-5 < off_by(reduced[0], before[0]) < 0.01
 

@@ -1,4 +1,4 @@
-"""Layouts as any kind of array, or as a file, give the heights that the model predicts."""
+"""Check that predictions accept layouts as any kind of array or as a file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LEVELS = np.random.default_rng(4).integers(0, 13, (2, 3, 40, 52))
 def test_every_kind_and_shape_gives_what_forward_gives(model):
     layout = (LEVELS * 0.1).astype(np.float32)
     wanted = model(torch.from_numpy(layout).reshape(6, 1, 40, 52)).reshape(2, 3, 40, 52).numpy()
-    # A batch sums in another order than single fields: a few float32 roundings of about 1 µm.
+    # A batch sums in another order than single fields, which changes a few float32 roundings at about 1 µm.
     near = {"rtol": 0, "atol": 2e-6}
     np.testing.assert_allclose(model.predict(layout), wanted, **near)
     np.testing.assert_allclose(model.predict(layout.astype(np.float64))[1, 2], wanted[1, 2], **near)
@@ -59,7 +59,7 @@ def test_gradients_flow_through_a_tensor(model):
 @pytest.mark.parametrize(
     ("layout", "said"),
     [
-        (LEVELS[0, 0], r"wanted heights in µm; levels \* 0.1 are heights"),
+        (LEVELS[0, 0], r"wanted heights in µm; multiply levels by 0.1 to get heights"),
         (np.zeros(5, np.float32), r"shape \(5,\)"),
         (np.zeros((0, 5), np.float32), "all larger than 0"),
         ([[0.1]], "got a list"),
@@ -84,7 +84,7 @@ def test_a_file_of_levels_becomes_a_height_map_that_can_be_read_again(folder, mo
     assert "40 x 52 px" in said.output
     scan = read_scan(out)
     wanted = model.predict(levels * np.float32(0.1))
-    # The file has metres in float32, which keep 1 µm to 1e-7 of its value.
+    # The file has metres in float32, with a relative error of 1e-7.
     np.testing.assert_allclose(scan.height_um, wanted, rtol=0, atol=1e-6)
     assert scan.pitch_um == pytest.approx((0.1, 0.1))
 

@@ -1,4 +1,4 @@
-"""Scan terms remove only errors within their span, and no pixel is scored by its own calibration."""
+"""Check that scan terms remove only errors in their span, and that no pixel calibrates its own score."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_lines_are_estimated_beyond_a_gap_on_the_other_side(axes):
     for cell in cells:
         for axis, other in cell.other_side.items():
             scored, used = place[axis][cell.score], place[axis][other]
-            # Along a line every calibration pixel is at least 32 px away from every scored pixel.
+            # Along a line, every calibration pixel is at least 32 px from every scored pixel.
             assert min(abs(int(used.min()) - scored.max()), abs(int(used.max()) - scored.min())) > 32 - 1
             assert other.any()
 
@@ -73,7 +73,7 @@ def test_the_catalogue_is_complete_and_consistent():
     assert np.allclose(term_maps(TermPixels(pixels.prediction_um, at=some), SCAN_TERMS), everything[:, some])
     for term in chosen_terms(SCAN_TERMS):
         assert (term.maps is None) != (term.lines is None)
-        # No term except the datum has a mean. Displacement terms are proportional to the slopes.
+        # Only the datum has a mean, except for displacement terms, which are proportional to the slopes.
         if term.maps is not None and term.unit != "px" and term.name != "offset":
             assert np.abs(term.maps(pixels).mean(axis=1)).max() < 1e-12
 
@@ -121,7 +121,7 @@ def test_terms_of_the_policy_vanish_exactly(scan, policy):
     basis = term_maps(TermPixels(prediction), POLICIES[policy])
     added = (np.linspace(0.02, -0.03, len(basis)) @ basis).reshape(SHAPE)
     free = cross_fit(prediction + added, prediction, valid, POLICIES[policy])
-    # A few terms of order one, in double precision.
+    # The sum has a few terms of order one, in double precision.
     assert np.nanmax(np.abs(free.residual_um)) < 1e-12
 
 
@@ -138,7 +138,7 @@ def test_offset_of_one_half_is_estimated_on_the_other(scan):
     first, second = checkerboard(SHAPE, Blocks())
     height = prediction + np.where(first.score, 0.1, 0.0)
     free = cross_fit(height, prediction, valid, POLICIES["offset"])
-    # The offset of one half is subtracted from the other, so the difference shows twice and never cancels.
+    # The offset of each half is subtracted from the other half, so the difference appears in both.
     assert np.allclose(free.residual_um[first.score], 0.1)
     assert np.allclose(free.residual_um[second.score], -0.1)
 
@@ -161,9 +161,9 @@ def test_line_offsets_are_recovered_and_shrunk():
     prediction = random.uniform(0.2, 0.8, shape)
     height = prediction + offsets[:, None] + random.normal(0, noise, shape)
     free = cross_fit(height, prediction, np.ones(shape, bool), POLICIES["full+rows"])
-    # The standard deviation of 512 offsets is known to 1/sqrt(2*512) = 3 %. Three times this is allowed.
+    # The standard deviation of 512 offsets is known to 1/sqrt(2*512) = 3 %. Allow three times this.
     assert free.line_sd_um == pytest.approx(sd, rel=0.1)
-    # An offset from 224 pixels beyond the gap has an error of 16/15 = 1.1 nm: sqrt(16² + 1.1²) = 16.04 nm.
+    # From 224 pixels beyond the gap, an offset has an error of 16/15 = 1.1 nm: sqrt(16² + 1.1²) = 16.04 nm.
     assert np.nanstd(free.residual_um) == pytest.approx(np.hypot(noise, noise / 15), rel=0.01)
     assert 300 < free.degrees_of_freedom - 7 < 512
 
@@ -176,7 +176,7 @@ def test_shrinkage_is_the_best_linear_prediction():
     lines = np.broadcast_to(np.arange(shape[0])[:, None], shape)
     offsets, weight, variance = shrunk_line_offsets(residual, np.ones(shape, bool), lines, 32)
     noise = 0.03**2 / shape[1]
-    # v/(v + noise) = 0.82; both variances are known to about 10 % from 400 lines.
+    # v/(v + noise) is 0.82. From 400 lines, both variances are known to about 10 %.
     assert weight.mean() == pytest.approx(0.004**2 / (0.004**2 + noise), abs=0.05)
     assert variance == pytest.approx(0.004**2, rel=0.25)
     plain = residual.mean(axis=1)
@@ -187,8 +187,8 @@ def test_scan_lines_of_a_rotated_scan_are_tilted_rows():
     angle = np.deg2rad(0.5)
     rotate = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     line = scan_line_index((512, 512), rotate, 0.1)
-    # A scan line turned by +0.5° descends tan(0.5°) * 511 = 4.46 px from left to right (y down), so
-    # along one layout row the index falls by that.
+    # A scan line rotated by +0.5° descends by tan(0.5°) * 511 = 4.46 px from left to right (y is down), so
+    # the line index decreases by that along a layout row.
     assert line[256, 0] - line[256, -1] in (4, 5)
     assert scan_line_index((8, 8), np.eye(3), 0.1).tolist() == [[row] * 8 for row in range(8)]
 
@@ -197,15 +197,15 @@ def test_scan_lines_of_a_bent_scan_are_the_lines_it_was_scanned_in():
     shape, pitch_um = (120, 140), (0.1, 0.1)
     bend = Bend.of_scan(np.array([[0.1, -0.05, 0.1], [0.15, 0.1, -0.2]]), shape, pitch_um)
     line = scan_line_index(shape, np.eye(3), 0.1, bend)
-    # A registered scan whose height is the position across the lines, in pixels. A spline reproduces a ramp
-    # except near its mirrored ends. Their effect decays by 0.27 per pixel to 1e-5 after 9, as float32 has.
+    # The height of this registered scan is the position across the lines in pixels. A spline reproduces a
+    # ramp except near its mirrored ends, whose effect decays by 0.27 per pixel, to 1e-5 after 9 px.
     ramp = np.broadcast_to(np.arange(shape[0])[:, None] + 0.5, shape)
     height, valid = resample_to_layout(
         ramp, np.eye(3), shape, scan_pitch_um=pitch_um, layout_pitch_um=0.1, bend_um=bend
     )
     clear = valid & (np.abs(height - np.rint(height)) > 1e-4) & (height > 9) & (height < shape[0] - 9)
     assert np.ptp(np.floor(height[clear]) - line[clear]) == 0
-    # Without the bend the lines would be rows. The bend moves positions by up to 0.4 µm.
+    # Without the bend, lines would be rows. The bend displaces positions by up to 0.4 µm.
     assert np.ptp(line - np.arange(shape[0])[:, None]) > 2
 
 
@@ -214,20 +214,20 @@ def test_what_a_bent_scan_does_not_show_is_in_its_first_or_last_line():
     # The layout begins 10 px above the scan's first line and ends 10 px below its last.
     ten_px_down = np.array([[1, 0, 0], [0, 1, 1.0], [0, 0, 1]])
     line = scan_line_index((60, 40), ten_px_down, 0.1, bend)
-    # A position between two lines may round to either, so only the number of lines is exact.
+    # A position between two lines may be rounded to either, so only the number of lines is exact.
     assert line.max() == 39
     assert (line[:10] == 0).all()
     assert (line[50:] == 39).all()
 
 
 def test_roughness_beside_the_scored_pixels_is_not_taken_for_an_offset_of_the_line():
-    """Roughness correlated over 20 px along x looks like an offset next to it, but not across the gap."""
+    """Check roughness correlated over 20 px along x, which looks like an offset only near scored pixels."""
     random = np.random.default_rng(6)
     shape = (128, 256)
     rough = gaussian_filter(random.normal(size=shape), (0, 15.0))
     rough *= 0.01 / rough.std()
     prediction, valid = np.zeros(shape), np.ones(shape, bool)
-    # With a gap of 1 px the pixels next to the split are scored by their neighbours.
+    # With a gap of 1 px, pixels next to the split would be calibrated by their neighbours.
     near, far = (
         cross_fit(rough, prediction, valid, frozenset({"offset", "layout-rows"}), Blocks(line_gap_px=gap))
         for gap in (0, 32)

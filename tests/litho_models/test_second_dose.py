@@ -1,4 +1,4 @@
-"""With a second dose the exposure is level times dose, in the fab, in the models and in a plan."""
+"""Check that the exposure is level times dose in the fab, in the models and in a plan."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def test_in_the_fab_half_the_dose_prints_half_the_levels() -> None:
     level = _even_levels().astype(np.uint8)
     half_dose = scan_job(fab, Job("a", level, dose=0.5)).height_um
     half_levels = scan_job(fab, Job("a", level // 2)).height_um
-    # Only the rounding of filters differs.
+    # The results differ only by rounding in filters.
     assert np.abs(half_dose - half_levels).max() < 1e-9
     assert np.ptp(half_dose) > 0.1
 
 
 def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None:
-    """If slices are exposed one by one, half the dose differs from half the levels, in fab and model."""
+    """Check that with slices exposed one by one, half the dose differs from half the levels."""
     knobs = KnobBoard([KnobSetting("layer-stacking", 0.8, 1)], 0)
     fab = Fab(Printer(), Microscope.aligned(), Noise.off(), knobs, 0)
     level = _even_levels().astype(np.uint8)
@@ -58,7 +58,7 @@ def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None
         middle = float(Printing(0.1, 0.1, 12).predict(chain, wide, Way())[20, 20])
     low, high, at = (1 / (1 + np.exp(-8 * (dose - 0.6))) for dose in (0.0, 1.0, 0.5))
     step = (at - low) / (high - low)
-    # In the middle of a wide block all twelve slices have half the dose, in float32.
+    # In the middle of a wide block, all twelve slices have half the dose (in float32).
     assert middle == pytest.approx(0.6 + 0.8 * 1.2 * (step - 0.5), abs=1e-5)
 
 
@@ -93,7 +93,7 @@ def test_a_plan_takes_a_second_dose_where_it_separates(
     plan = next_print(loop, tmp_path / "plan", prints=2, field_um=9.6, steps=0, layouts="random")
     assert plan is not None
     assert (1.0, SECOND_DOSE) in asked
-    assert f"the second of them at {SECOND_DOSE:g} of the dose" in plan.questions[0].why
+    assert f"the second at {SECOND_DOSE:g} of the dose" in plan.questions[0].why
     table = read_table(tmp_path / "plan" / "scans.csv")
     assert {row["dose"] for row in table.values()} == doses
     for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=0):

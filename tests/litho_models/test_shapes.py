@@ -1,4 +1,4 @@
-"""Check closed forms of edge, similarity and phase errors, and their crops."""
+"""Check edge, similarity and phase errors against closed forms, also with unscored pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEIGHTS_UM = mid_step_heights_um(13, 0.1)
 
 
 def ramp(shift_px=0.0, degrees=0.0, shape=(120, 140)):
-    """Return a plane that rises 1.2 µm over 100 px in the given direction, displaced in this direction."""
+    """Return a plane that rises by 1.2 µm over 100 px in a direction and is displaced in this direction."""
     y, x = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
     angle = np.deg2rad(degrees)
     return 0.012 * (x * np.cos(angle) + y * np.sin(angle) - 10 - shift_px)
@@ -34,7 +34,7 @@ def ramp(shift_px=0.0, degrees=0.0, shape=(120, 140)):
 
 def test_contours_lie_half_way_between_the_levels():
     assert mid_step_heights_um(4, 0.2) == pytest.approx([0.1, 0.3, 0.5])
-    # Of a thousand steps of 1 nm, those at every 24th part of the height have a contour.
+    # With a thousand steps of 1 nm, only 24 evenly spaced heights have a contour.
     many = mid_step_heights_um(1001, 0.001)
     assert many[[0, 1, -1]] == pytest.approx([1 / 48, 3 / 48, 47 / 48])
 
@@ -43,7 +43,7 @@ def test_contours_lie_half_way_between_the_levels():
 @pytest.mark.parametrize("degrees", [0, 90])
 def test_the_displacement_of_a_shifted_edge_is_the_shift(shift_px, degrees):
     found = edge_placement(ramp(shift_px, degrees), ramp(0, degrees), HEIGHTS_UM, PITCH_UM)
-    # A plane is interpolated exactly. Only heights of 1 µm are rounded, over a slope of 12 nm/px.
+    # A plane is interpolated exactly. Only heights of 1 µm are rounded, at a slope of 12 nm/px.
     assert found.mean_nm == pytest.approx(100 * abs(shift_px), abs=1e-6)
     assert found.p95_nm == pytest.approx(100 * abs(shift_px), abs=1e-6)
     assert found.matched > 10 * 100
@@ -52,8 +52,8 @@ def test_the_displacement_of_a_shifted_edge_is_the_shift(shift_px, degrees):
 
 def test_an_oblique_edge_is_measured_across_not_along_the_grid():
     found = edge_placement(ramp(1.5, 30), ramp(0, 30), HEIGHTS_UM, PITCH_UM)
-    # Along the grid the displacement would be 173 nm. Where a contour leaves the field, the nearest piece is
-    # its last one, which is farther away. This adds less than 1 % on average.
+    # Along the grid, the displacement would be 173 nm. Where a contour leaves the field, the nearest piece is
+    # its last one, which is farther away; this adds less than 1 % on average.
     assert 150 <= found.mean_nm < 151.5
     assert found.p95_nm == pytest.approx(150, abs=1e-6)
 
@@ -69,7 +69,7 @@ def test_the_other_side_of_a_line_is_no_partner():
     x = np.arange(60.0)
     profile = [np.clip(0.6 - 0.2 * np.abs(x - centre), 0, None) for centre in (30.0, 34.0)]
     measured, expected = (np.tile(p, (40, 1)) for p in profile)
-    # At 0.3 µm the measured line falls 0.5 px from where the expected one rises, 4 px from its partner.
+    # At 0.3 µm, the measured line falls near where the expected one rises, but 4 px from its partner.
     found = edge_placement(measured, expected, np.array([0.3]), PITCH_UM)
     assert found.mean_nm == pytest.approx(400)
 
@@ -91,7 +91,7 @@ def test_flat_maps_have_no_edges():
 def test_similarity_is_one_for_equal_maps_and_known_for_a_constant_offset():
     height = 0.6 + 0.2 * np.random.default_rng(0).standard_normal((64, 64))
     assert structural_similarity(height, height) == pytest.approx(1, abs=1e-12)
-    # For flat maps only the means count: (2ab + c)/(a² + b² + c), c = (0.01 · 1.2 µm)².
+    # For flat maps, only the means matter: (2ab + c)/(a² + b² + c) with c = (0.01 · 1.2 µm)².
     a, b, c = 0.5, 0.6, 0.012**2
     flat = structural_similarity(np.full((32, 32), a), np.full((32, 32), b))
     assert flat == pytest.approx((2 * a * b + c) / (a * a + b * b + c))
@@ -104,7 +104,7 @@ def test_similarity_does_not_look_at_pixels_that_are_not_scored():
     holed[:, 40:] = np.nan
     changed = expected.copy()
     changed[:, 40:] += 1.0
-    # Windows within the first 40 columns are equal in both maps.
+    # Windows within the first 40 columns are the same in both maps.
     assert structural_similarity(holed, changed) == structural_similarity(holed, expected)
     assert structural_similarity(np.full((64, 64), np.nan), expected) is None
     small = np.zeros((SSIM_WINDOW_PX, SSIM_WINDOW_PX))
@@ -119,7 +119,7 @@ def test_the_scores_of_the_truth_with_a_constant_error():
     scan = make_scan(0, 128, noise_um=0.0, datum_um=0.0)
     constant = Prediction(scan.height_um - np.float32(0.05))
     scores = score_model("truth", [scan], [constant], NuisanceProtocol.of_policy("none"))
-    # A wave is 50 nm here. Heights of 1 µm in float32 are accurate to 1e-4 nm.
+    # The error is 50 nm. Heights of 1 µm in float32 are accurate to 1e-4 nm.
     assert scores.phase_rms_waves == pytest.approx(0.05 * 0.548 / 0.6328, rel=1e-5)
     free = score_model("truth", [scan], [constant], NuisanceProtocol.of_policy("offset"))
     assert free.phase_rms_waves == pytest.approx(0, abs=1e-6)
@@ -133,7 +133,7 @@ def test_the_scores_of_the_truth_with_a_constant_error():
 
 @pytest.fixture
 def own_metrics(monkeypatch):
-    """Remove after the test the metrics that it registers."""
+    """Remove the metrics that a test has registered."""
     monkeypatch.setattr(metric_registry, "_MEASUREMENTS", [*metric_registry._MEASUREMENTS])
 
 

@@ -1,4 +1,4 @@
-"""Errors of single scans are recognised, and errors that all scans share are not attributed to them."""
+"""Check that errors of single scans are recognised, and told from errors that all scans share."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from litho_models.scan_terms import SCAN_TERMS
 from litho_models.scan_terms.measurement_fit import learn_measurement
 from tests.litho_models.loop_scans import base_model, planted, study_of, with_heights
 
-# Offsets of lines need two blocks of 32 px, with gaps as wide on both sides of the scored pixels.
+# Line offsets need two blocks of 32 px, with gaps of the same width on both sides of the scored pixels.
 SIZE_PX, SMALL_PX = 160, 64
 # A scan line crosses four rows of the layout.
 ANGLE = np.deg2rad(1.5)
 TURNED = np.array([[np.cos(ANGLE), -np.sin(ANGLE), 0], [np.sin(ANGLE), np.cos(ANGLE), 0], [0, 0, 1]])
-# Depend neither on the print nor on the field. Their standard deviation is 1.05.
+# These signs depend neither on the print nor on the field. Their standard deviation is 1.05.
 SIGNS = (1, -1, -1, 1, 1, 1, -1, 1, -1, -1)
 Change = Callable[[PreparedScan, np.random.Generator], np.ndarray]
 
@@ -35,9 +35,9 @@ def truths(scans: Sequence[PreparedScan]) -> list[np.ndarray]:
 def found_with(
     change: Change, size_px: int = SIZE_PX, *, turned: bool = False, shared_known: bool = False, seed: int = 0
 ) -> dict[str, ScanFinding]:
-    """Return what is found in ten scans with changed heights (y, x), µm, and a datum each.
+    """Return the findings in ten scans with a datum each, to whose heights in µm ``change`` is added.
 
-    ``shared_known``: whether the predicted maps already contain what all scans share.
+    If ``shared_known``, the predicted maps already contain what all scans share.
     """
     random = np.random.default_rng(seed)
     scans = planted(size_px=size_px, seed=seed)
@@ -62,7 +62,7 @@ def nothing(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
 
 
 def stripes(size_um: float, *, written: bool = False) -> Change:
-    """Return a function that adds an offset to each scan line, or to each row of the layout."""
+    """Return a function that draws an offset for each scan line, or for each row of the layout."""
 
     def change(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
         line = np.indices(scan.usable.shape)[0] if written else scan.line
@@ -77,7 +77,7 @@ def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect}
     spread = found["datum-offset"].spread["offset_um"]
     assert spread.ci95 is not None
-    # The datums as drawn. The base's offset is the same for all scans.
+    # Compute the drawn datums. The offset of the base is the same for all scans.
     scans = planted(size_px=SMALL_PX)
     drawn = [
         np.mean(scan.height_um - own) for scan, own in zip(scans, truths(prepare_scans(scans)), strict=True)
@@ -91,11 +91,11 @@ def test_stripes_are_told_from_columns_and_not_from_the_rows_that_they_lie_on() 
     found = found_with(stripes(0.004))
     one = found["scan-line-stripes"]
     assert one.seen
-    # No scan is turned, so the printer could also have written these lines.
+    # No scan is rotated, so the printer could also have written these lines.
     assert one.confusable_with == ["line-roughness"]
     assert "line-roughness" not in seen(found)
-    assert "cannot be told from scan-line-stripes" in found["line-roughness"].evidence
-    # The error of 1,600 lines with noise of 4 / sqrt(64) nm each, measured on the other side of the scan.
+    assert "cannot be distinguished from scan-line-stripes" in found["line-roughness"].evidence
+    # The sd is known from 1,600 lines with noise of 4 / sqrt(64) nm each, measured on the other side.
     assert one.spread["sd_um"].value == pytest.approx(0.004, rel=0.08)
     lines = stripes(0.004)
     both = found_with(lambda scan, random: lines(scan, random) + lines(scan, random).T)
@@ -109,7 +109,7 @@ def test_lines_of_the_print_are_told_from_lines_of_the_scan(written: bool) -> No
     assert right in seen(found)
     assert wrong not in seen(found)
     assert found[wrong].confusable_with == found[right].confusable_with == []
-    assert f"more closely: {right}" in found[wrong].evidence
+    assert f"more closely, which indicates {right}" in found[wrong].evidence
 
 
 def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None:
@@ -122,7 +122,7 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
     def bent(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
-        # A shift of 0.1 µm at the rim against the middle, with zero mean. Signs are equal, or they vary.
+        # The rim is displaced by 0.1 µm relative to the middle, with zero mean and equal or varying signs.
         size_um = 0.1 if shared else 0.1 * SIGNS[scan.stored.order]
         height = np.asarray(scan.stored.height_um, np.float64)
         rows, columns = np.indices(height.shape, dtype=float)
@@ -134,14 +134,14 @@ def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans
     assert found.seen is not shared
     spread = found.spread["x_by_xx_um"]
     assert spread.unit == "µm"
-    # A central difference gives sin(k) / k of a slope, 0.84 at a wavelength of 6 px, so the fitted
+    # A central difference gives sin(k) / k of a slope, which is 0.84 at a wavelength of 6 px. So the fitted
     # displacement is too large.
     assert (spread.value < 0.01) if shared else (0.105 < spread.value < 0.105 / 0.8)
 
 
 @pytest.mark.parametrize("of_prints", [True, False])
 def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints: bool) -> None:
-    """Five prints of two scans each have the same set of gains, either by print or mixed."""
+    """Check five prints of two scans each, whose gains either go with the print or are mixed."""
     gains = 0.02 * np.repeat([-2, -1, 0, 1, 2], 2)
     gains = gains if of_prints else np.roll(gains, 1)
 
@@ -155,7 +155,7 @@ def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints
     assert one.spread["gain"].value == pytest.approx(np.std(gains, ddof=1), rel=0.05)
 
 
-# Mains hum: lines that repeat every 1.3 µm, with another phase in each scan.
+# Mains hum: line offsets that repeat every 1.3 µm, with a different phase in each scan
 
 
 def humming(hum_um: float) -> Change:
@@ -171,10 +171,10 @@ def humming(hum_um: float) -> Change:
 def test_a_hum_is_found_with_its_period_and_its_share() -> None:
     said = found_with(humming(0.004), seed=1)["scan-line-stripes"].evidence
     period_um = float(said.split("repeat every ")[1].split(" µm")[0])
-    share = float(said.split("with ")[-1].split(" %")[0]) / 100
-    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide. The centre of mass is more accurate.
+    share = float(said.split("explains ")[-1].split(" %")[0]) / 100
+    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide. The centroid is more accurate.
     assert period_um == pytest.approx(1.3, abs=0.05)
-    # The hum has 4² / 2 = 8 nm², and the random part 3² = 9 nm².
+    # The hum has a variance of 4² / 2 = 8 nm², and the random part of 3² = 9 nm².
     assert share == pytest.approx(8 / 17, abs=0.15)
 
 
@@ -192,8 +192,8 @@ def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_t
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_the_lines_that_a_scan_is_held_against_are_of_other_folds(axis: int) -> None:
-    """Heights of a scan and of its fold do not change the shared lines with which the scan is compared."""
+def test_the_lines_to_which_a_scan_is_compared_are_of_other_folds(axis: int) -> None:
+    """Check that the shared lines to which a scan is compared do not depend on the heights of its fold."""
     scans = planted(count=6)
     study = study_of(scans)
     maps = truths(study.scans)

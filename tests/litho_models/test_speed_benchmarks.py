@@ -1,4 +1,4 @@
-"""The speed benchmark measures every model, and its page quotes the results."""
+"""Check that the speed benchmark measures every model, and that its page quotes the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Splits are disjoint, complete and reproducible, and only the paper's split divides scans."""
+"""Check that splits are disjoint, complete and reproducible, and only the paper's split divides scans."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_leave_one_print_out_holds_out_whole_prints():
 def test_paper_draw_is_72_against_24_and_leaky():
     held_out = paper_draw(MEASURED_IDS, 0)
     assert len(held_out) == 24
-    # 24 of 96 quadrants are drawn at random. Without a leak every scan would be wholly in or wholly out.
+    # The draw takes 24 of 96 quadrants at random. Without a leak, each scan would be completely in or out.
     split_scans = {crop.scan_id for crop in held_out} & {
         scan_id for scan_id in MEASURED_IDS if sum(c.scan_id == scan_id for c in held_out) < 4
     }

@@ -1,4 +1,4 @@
-"""Statistics of scans and prints: exact sign flips, the textbook F, and its p value by permutation."""
+"""Test the statistics of scans and prints: exact sign flips, the F statistic, and permutation p values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_f_is_that_of_a_one_way_analysis_and_p_close_to_its_own():
     wanted = f_oneway(*groups)
     assert found.f == pytest.approx(wanted.statistic)
     assert found.degrees == (3, 10)
-    # The standard error with 1,999 permutations is sqrt(p (1 - p) / 1999), at most 0.011.
+    # With 1,999 permutations, the standard error is sqrt(p (1 - p) / 1999), which is at most 0.011.
     assert found.p == pytest.approx(wanted.pvalue, abs=0.035)
 
 
@@ -34,7 +34,7 @@ def test_the_share_that_scans_of_one_print_have_in_common_is_recovered():
     random = np.random.default_rng(2)
     prints = np.repeat(np.arange(300), 4)
     values = random.normal(0, 2.0, 300)[prints] + random.normal(0, 1.0, 1200)
-    # The true share is 4 / (4 + 1). 300 prints give it to about 0.02.
+    # The true share is 4 / (4 + 1), which 300 prints give to about 0.02.
     assert by_print(values[:400], prints[:400]).icc == pytest.approx(0.8, abs=0.08)
     assert by_print(random.permutation(values)[:400], prints[:400]).icc < 0.1
 

@@ -1,4 +1,4 @@
-"""A single field on bare substrate has no ring of errors, with a rim of level 0 or without its border."""
+"""Check that an isolated field has no ring of errors, with a rim of level 0 or without its border."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOISE_UM, RIM_PX, AROUND_PX = 0.004, 2, 30
 
 
 def alone(number: int, surround: str) -> PrintedScan:
-    """Return a scan, as a build stores it, of a field whose blur reaches onto the bare substrate."""
+    """Return a stored scan of an isolated field, whose blur extends onto the bare substrate."""
     scan = make_scan(number)
     rim = RIM_PX if surround == "substrate" else 0
     dose = gaussian_filter(np.pad(scan.layout_um.astype(float), AROUND_PX), BLUR_UM / PITCH_UM, truncate=6)
@@ -44,7 +44,7 @@ def test_a_lone_field_has_no_ring_of_errors(surround: str) -> None:
     off = predict_scan(model, scans[0]) - scans[0].height_um
     valid = scans[0].valid
     ring = valid & ~binary_erosion(valid, iterations=RIM_PX)
-    # The features contain the truth, so the residual is noise. 700 pixels give its deviation to 3 %.
+    # The features contain the truth, so the residual is noise. From 700 pixels, its sd is known to 3 %.
     for part in (ring, valid & ~ring):
         assert np.std(off[part]) == pytest.approx(NOISE_UM, rel=0.12)
 

@@ -1,4 +1,4 @@
-"""Threads of the numerical libraries sleep while they wait."""
+"""Check that threads of the numerical libraries sleep while they wait."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ sys.meta_path.insert(0, Watch())
     ],
 )
 def test_threads_sleep_while_they_wait_unless_told_otherwise(use, given):
-    """Spinning threads take ten times as long beside one busy process. Torch reads the setting on loading."""
+    """Check the setting, because spinning threads are ten times slower beside one busy process."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
     words = [sys.executable, "-c", _LOADED + use]

@@ -1,4 +1,4 @@
-"""Fits recover known printers without leaks from scan terms, and a killed run continues as if unbroken."""
+"""Check that fits recover known printers in spite of scan terms, and that a killed run can be continued."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_gauss_newton_recovers_an_affine_printer_exactly():
     exact = [replace(scan, height_um=(0.8 * scan.layout_um - 0.05).astype(np.float32)) for scan in scans]
     model = build_model("affine")
     fit_small_model(model, exact, "none")
-    # Heights in float32 have an error of 6e-8 µm.
+    # Heights in float32 have errors of 6e-8 µm.
     assert float(model.gain.detach()) == pytest.approx(0.8, abs=1e-5)
     assert float(model.offset_um.detach()) == pytest.approx(-0.05, abs=1e-5)
 
@@ -53,7 +53,7 @@ def test_blur_table_finds_the_blur_and_the_saturation_through_datum_and_bow():
     scans = make_scans(4, size_px=96, bow_um=0.03)
     model = fit("blur-table", scans, TrainingConfig(nuisance="full")).model
     assert float(model.sigma_um.detach()) == pytest.approx(BLUR_UM, abs=0.01)
-    # An unseen scan without noise or datum. The table's chords of 0.1 µm are off by 0.5 nm.
+    # Score an unseen scan without noise or datum. The table's chords of 0.1 µm have errors of 0.5 nm.
     assert error_nm(model, make_scan(20, noise_um=0.0, datum_um=0.0)) < 1.0
 
 
@@ -62,7 +62,7 @@ def test_ignoring_the_datum_costs_what_freeing_it_saves():
     free = fit("linear", scans, TrainingConfig(nuisance="offset")).model
     blind = fit("linear", scans, TrainingConfig(nuisance="none")).model
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
-    # Five scans of ±40 nm have a mean of +8 nm. There the fit with free datums fixes its offset.
+    # Five datums of ±40 nm have a mean of +8 nm, which the fit with free datums takes as its offset.
     assert error_nm(free, unseen) == pytest.approx(8.0, abs=2.0)
     assert error_nm(blind, unseen) > error_nm(free, unseen)
 
@@ -88,7 +88,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
     model = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset")).model
     unseen = make_scan(20)
     difference = predict_scan(model, unseen) - predict_scan(printer, unseen)
-    # Noise of 4 nm on 9,000 pixels determines six parameters to well below 1 nm of height.
+    # With noise of 4 nm, 9,000 pixels determine six parameters to well below 1 nm of height.
     assert 1000 * np.abs(difference).mean() < 1.0
     assert model.at_bounds == {}
 
@@ -104,7 +104,7 @@ def test_a_fit_stops_at_a_bound_and_names_it():
 
 
 def printed_by(printer):
-    """Return four scans of a printer, with datums of zero mean and noise of 4 nm."""
+    """Return four scans of prints by a model, with datums of zero mean and noise of 4 nm."""
     scans = []
     for scan in make_scans(4, size_px=96):
         noise = np.random.default_rng(scan.order).normal(0, 0.004, scan.shape)
@@ -120,7 +120,7 @@ def test_training_nuisances_are_pinned_to_the_process():
     assert abs(np.mean([m.mean() for m in maps])) < 1e-6
     for scan, prediction, nuisance in zip(scans, predictions, maps, strict=True):
         rest = scan.height_um - prediction - nuisance
-        # Only float32 heights and maps are rounded.
+        # The only errors are due to rounding in float32.
         assert np.abs(rest).max() < 1e-6
 
 
@@ -175,7 +175,7 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def quick_run(tmp_path_factory):
-    """Return scans and the checkpoint of a small PBL trained on them."""
+    """Return scans, and the folder with the checkpoint of a small PBL trained on them."""
     scans, folder = make_scans(4, size_px=64), tmp_path_factory.mktemp("run")
     fit("pbl", scans, TrainingConfig(**QUICK, model=SMALL_NETS), checkpoint=folder)
     return scans, folder
@@ -265,7 +265,7 @@ def test_passes_change_the_memory_and_not_the_step(monkeypatch):
     monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     apart = trained()
     assert crops == [2] * 4 + [1] * 8
-    # The sums have another order, so only float32 rounding differs, a few 1e-6 after four steps.
+    # Another order of sums changes only float32 rounding, to a few 1e-6 after four steps.
     for name, value in together.model.state_dict().items():
         torch.testing.assert_close(apart.model.state_dict()[name], value, rtol=1e-4, atol=1e-4)
     assert apart.history[0].training_mae_nm == pytest.approx(together.history[0].training_mae_nm, rel=1e-4)
@@ -315,7 +315,7 @@ def test_reduced_precision_trains_as_full_precision_does(name, variant):
         fitted = fit(name, scans, config)
         errors.append([entry.training_mae_nm for entry in fitted.history])
     reduced, full = errors
-    # The features have 8 significant bits, and the errors are averaged over thousands of pixels.
+    # Features have 8 significant bits, but errors are averaged over thousands of pixels.
     assert reduced == pytest.approx(full, rel=0.02)
 
 
@@ -330,7 +330,7 @@ def test_the_paper_recipe_is_the_papers():
     for name, rate in PAPER_LEARNING_RATE.items():
         config = TrainingConfig.of_recipe("paper", name)
         assert (config.optimiser, config.batch, config.schedule) == ("adam", 4, "constant")
-        # 72 crops in batches of 4 are 18 steps per epoch, for 4,000 epochs.
+        # With 72 crops in batches of 4, an epoch has 18 steps. There are 4,000 epochs.
         assert config.steps == 72_000
         assert config.learning_rate == rate
         assert config.nuisance == "none"
@@ -343,7 +343,7 @@ def test_the_paper_recipe_trains_physics_with_adam_towards_the_printer():
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     assert [entry.step for entry in fitted.history] == [40, 80, 120]
     assert error_nm(fitted.model, unseen) < 0.7 * error_nm(build_model("physics"), unseen)
-    # A baseline that the paper does not train is fitted as in the other recipes.
+    # Baselines that the paper does not train are fitted as in the other recipes.
     assert not fit("affine", scans, TrainingConfig.of_recipe("paper", "affine")).history
 
 
@@ -353,7 +353,7 @@ def test_the_fast_recipe_takes_each_network_s_own_number_of_steps_unless_told():
     # The networks of a default PBL are fitted to pixels, so its chain takes fewer steps.
     assert FAST_CHAIN["steps"] < FAST_STEPS["pbl"]
     assert TrainingConfig.of_recipe("fast", "pbl", steps=7).steps == 7
-    # A cached fit is found by its settings, so a default must equal the same value given explicitly.
+    # Cached fits are found by their settings, so a default must equal the same value given explicitly.
     assert TrainingConfig.of_recipe("fast", "pbl") == TrainingConfig(**FAST_CHAIN)
     assert TrainingConfig.of_recipe("fast", "fno") == TrainingConfig.of_recipe("fast", "fno", steps=1000)
 
@@ -385,13 +385,13 @@ def test_bad_requests_are_refused(call):
 def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
     monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     scans = make_scans(3, size_px=64)
-    # The crops have unequal weights, so that a mean of means would differ.
+    # The crops have different weights, so that a mean of means would be wrong.
     scans[0].valid[:, :40] = False
     config = TrainingConfig(batch=4, crop_px=32)
     targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
 
     def of_process(rank, count):
-        """Return what one process adds to the sum over processes."""
+        """Return the contribution of one process to the sum over processes."""
         added = []
         monkeypatch.setattr(network, "joined", lambda: (rank, count))
         monkeypatch.setattr(
@@ -405,7 +405,7 @@ def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
 
     one = of_process(0, 1)
     many = sum(of_process(rank, count) for rank in range(count))
-    # Four crops are summed in another order. The tolerance is the float32 rounding of the largest term.
+    # The order of the sum over four crops differs. The tolerance is the float32 rounding of its largest term.
     torch.testing.assert_close(many, one, rtol=0, atol=1e-5 * float(one.abs().max()))
 
 
@@ -428,8 +428,8 @@ def test_several_processes_give_the_loss_curve_of_one(count, tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
     subprocess.run([*torchrun, script, tmp_path / "many"], check=True, env=environment)
     one, many = (TrainingRun.read(tmp_path / name).history for name in ("one", "many"))
-    # Gradients are summed in another order, which gives float32 rounding, a few 1e-6 after four steps. In the
-    # last round each process fits the feature networks to pixels in hundreds of steps, which add to it.
+    # Another order of sums changes the float32 rounding of gradients, to a few 1e-6 after four steps. In the
+    # last round, each process also fits the feature networks to pixels in hundreds of steps.
     for a, b, near in zip(one, many, (1e-4, 1e-4, 2e-2), strict=True):
         assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=near)
         assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=near)

@@ -1,4 +1,4 @@
-"""The zoo's cards, figures and weights come from the models of the benchmark's table, in one call."""
+"""Check that one call makes the zoo's cards, numbers and weights from the table of the benchmark."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def small_zoo(_small_zoo, monkeypatch):
 
 
 def check_model(name):
-    """Check that a zoo model loads, predicts finite heights near the nominal, and refuses another pitch."""
+    """Check that a zoo model loads, predicts plausible heights, and refuses another pitch."""
     frozen = load_frozen(zoo.folder(name))
     assert frozen.name == name
     layout = torch.full((1, 1, 90, 110), 0.6, requires_grad=True)
@@ -81,7 +81,7 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
     assert card.command == f"litho-models train neural-lithography.zarr --model={name} --out={name}"
     page = (zoo.folder(name) / "README.md").read_text(encoding="utf-8")
     assert page == card.page
-    # This comes before everything else that the card says of the model.
+    # The held-out error comes before everything else on the page.
     assert page.index(card.held_out.text) < page.index("## Use")
 
 
@@ -122,7 +122,7 @@ def test_the_weights_have_the_error_in_their_card(name, measured_scan):
     model = load_frozen(f"zoo:{name}")
     stated = next(row for row in model.card["baseline"] if row["scan"] == measured_scan.id)
     found = scan_figures(measured_scan, predict_frozen(model, measured_scan))
-    # Another order of sums changes heights by some 1e-6 µm. Other models' errors differ by over 0.1 nm.
+    # Another order of sums changes heights by some 1e-6 µm. The errors of other models differ by over 0.1 nm.
     assert found.error_nm == pytest.approx(stated["error_nm"], abs=0.01)
     assert found.gain == pytest.approx(stated["gain"], abs=1e-4)
 
@@ -188,7 +188,7 @@ def test_listing_the_zoo_loads_no_torch():
 
 @pytest.fixture(scope="module")
 def made(store, tmp_path_factory):
-    """Return a table of two models, the zoo made from this table, and its folder."""
+    """Return a table of two models, the folder in use, and the cards of the zoo made from the table."""
     from litho_models.evaluation.benchmark import benchmark
 
     folder = tmp_path_factory.mktemp("made")
@@ -208,7 +208,7 @@ def test_the_zoo_is_made_of_a_table_in_one_call(made, store):
             row.mae_datum_free_ci95_nm,
         )
         assert not set(card.training["scan_ids"]) & set(card.split["lock_box"])
-        # The card names the dataset, and no path on a machine.
+        # The card names the dataset, but contains no local path.
         assert str(folder) not in card.model_dump_json()
     before = (folder / "zoo" / "linear" / "model.safetensors").read_bytes()
     make_zoo(store, folder / "runs", scored, folder / "zoo", models=["linear"])
