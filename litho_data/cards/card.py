@@ -118,7 +118,7 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 class LayoutFiles(Record):
     """The layout files.
 
-    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as 255 /
+    ``grey_per_level`` is the grey-value step from level to level in layouts saved as pictures, such as 255 /
     (levels - 1) if white is the highest level. If ``average_px`` is set, the files are black-and-white
     pictures. Each square with this many pixels on a side becomes one pixel of the layout, whose level is the
     number of white pixels in the square.

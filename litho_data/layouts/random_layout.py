@@ -37,8 +37,8 @@ def random_layout(
         cutoff_per_um: highest spatial frequency that the filter passes, cycles/µm.
         pitch_um: pixel pitch, µm.
         seed: anything that `numpy.random.default_rng` accepts.
-        passband: ``square`` limits the frequency along each axis, ``round`` the length of the frequency
-            vector.
+        passband: ``square`` limits the frequency along each axis; ``round`` limits the length of the
+            frequency vector.
         quantiser: ``round``, as in the paper's equation, or ``floor``, with which only the largest value gets
             the highest level.
         field_px: side, in pixels, of a larger field from whose middle the layout is cut. Such a layout is not

@@ -31,9 +31,9 @@ def mark_scars(
 
     A streak may be up to ``max_width_px`` rows wide. In each column, it stands out by the height of its
     lowest pixel above the higher of the two pixels that bound it above and below. Negative streaks are found
-    in the same way in the negative map. The unit is rms = sqrt(sum of squared differences between rows /
-    number of pixels). A run along a row counts if it reaches ``high`` somewhere, never falls below ``low``
-    and is at least ``min_length_px`` long.
+    in the same way in the negative map. The unit is the rms difference, sqrt(sum of squared differences
+    between rows / number of pixels). A run along a row counts if it reaches ``high`` somewhere, never falls
+    below ``low`` and is at least ``min_length_px`` long.
 
     Returns:
         bool (ny, nx); only selected pixels are marked.

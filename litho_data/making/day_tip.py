@@ -23,7 +23,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
     tip = of_one_tip(found) if found else None
     radius_um = None if tip is None else tip.radius_um
     if tip is None or radius_um is None:
-        print("tip: no scan limits its radius, so no pixel is left out", file=sys.stderr)
+        print("tip: the scans set no limit on its radius, so no pixels are excluded", file=sys.stderr)
     elif tip.reason:
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:

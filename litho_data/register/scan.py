@@ -148,7 +148,7 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Return whether the bent fit passes and halves the error of the straight warp on held-out blocks."""
+    """Return whether the bent fit is accepted and has at most half the held-out error of the straight fit."""
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 

@@ -142,9 +142,9 @@ def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
     digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
     near_um = math.floor(near_um / digit_um) * digit_um
     return [
-        f"the strokes of the target are about {stroke_um:.2g} µm wide, but the finest detail that an element "
-        f"of {layout.size_um:.4g} µm can draw at {optics.distance_um:g} µm is λz/D = {finest_um:.2g} µm, so "
-        f"the image will be blurred; use --distance-um {near_um:.2g} or less, a larger --size-px, or "
+        f"the image will be blurred: the strokes of the target are about {stroke_um:.2g} µm wide, but an "
+        f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm draws no detail finer than "
+        f"λz/D = {finest_um:.2g} µm; use --distance-um {near_um:.2g} or less, a larger --size-px, or "
         "bolder strokes"
     ]
 

@@ -124,7 +124,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads whose draws, in the search or in the yield, cannot be propagated.
+    """Refuse spreads with draws that cannot be propagated, during the search or for the yield.
 
     Raises:
         InputError: a draw is below the sampling limit of the propagator between ``source`` and ``target``, or

@@ -82,7 +82,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         ]
         page.table(
             rows,
-            "The searched and the uncorrected layouts, as printed by every available model",
+            "The layout found by the search and the uncorrected layout, as printed by every available model",
             "width.csv",
             digits=4,
         )

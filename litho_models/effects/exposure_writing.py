@@ -130,7 +130,7 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
 
 
 @of_exposure(
-    "scanner of the printer running unevenly along the written lines",
+    "uneven motion of the printer's scanner along the written lines",
     {"strength": Parameter("1", -0.05, 0.05, 0.005)},
     source="distortion of the write field by a galvo or a stage, quadratic along the line",
     separating="scan each print at 0 and 90 degrees; scan a calibration grating",

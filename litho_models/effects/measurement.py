@@ -53,7 +53,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 @of_microscope(
-    "scanner running unevenly along a line",
+    "uneven motion of the microscope's scanner along a line",
     {"strength": Parameter("1", -0.05, 0.05, 0.005)},
     source="hysteresis of a piezo scanner, quadratic along the line",
     separating="scan a calibration grating; scan at 0 and 180 degrees",

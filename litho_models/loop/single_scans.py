@@ -109,7 +109,7 @@ class SingleScans:
         return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
-        """Test line offsets along the rows of the scan and of the layout.
+        """Test for offsets of the scan's rows, and for offsets of the layout's rows.
 
         The two are compared with each other, and with offsets along columns, which serve as a control. Scans
         are slightly rotated relative to their layouts. Offsets that follow the layout's rows come from the

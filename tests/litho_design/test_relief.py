@@ -125,7 +125,7 @@ def test_the_offset_of_a_print_does_not_affect_the_yield(make_printer):
 
 
 def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_printer, refused):
-    """Check a second round for a printer whose gain, unlike the model's, falls by 20 % from side to side."""
+    """Check a second round if the printer's gain falls by 20 % across the field and the model's does not."""
     settings = relief_settings(TINY | {"off_blur_um": 0.2})
     model = make_printer(settings.layout, sigma_um=0.15)
     cells = torch.from_numpy(np.random.default_rng(0).integers(3, 10, (24, 24))).float()
