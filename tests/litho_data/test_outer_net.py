@@ -33,7 +33,7 @@ def os_error(code: int) -> OSError:
 
 OUTSIDE: dict[str, tuple[Exception, str]] = {
     "a full disk": (os_error(errno.ENOSPC), "cannot use /some/where, got no space .*make room"),
-    "a place without rights": (os_error(errno.EACCES), "permission denied; choose another place"),
+    "a place without rights": (os_error(errno.EACCES), "permission denied; choose another path"),
     "too many files": (os_error(errno.EMFILE), "too many open files; .*ulimit -n"),
     "a read-only place": (os_error(errno.EROFS), "choose another --out"),
     "a file that went": (os_error(errno.ENOENT), "no such file"),

@@ -52,7 +52,7 @@ OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {
     "masks": (lambda out: write_layout_set(out, count=1, size_px=64, seed=1), "seed = 0, but now 1"),
     "simulate": (
         lambda out: simulate(out, count=1, size_px=64, knobs=["z-gain=0.1"]),
-        "settings, knobs",
+        r"settings \(knobs\)",
     ),
     "simulate twice": (lambda out: simulate(out, count=2, size_px=64), "count = 1, but now 2"),
 }
@@ -74,10 +74,10 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
     require_same(tmp_path, read_record(tmp_path / "plan.json"), now)
     for settings, differs in (
         ({"prints": 4, "sizes": [1, 2], "cache": None}, ""),
-        ({"prints": 4}, "settings, sizes, wanted"),
-        (None, "settings, prints, wanted"),
+        ({"prints": 4}, r"settings \(sizes\), wanted"),
+        (None, r"settings \(prints\), wanted"),
         ({"prints": 3, "sizes": [1, 2]}, "prints = 3, but now 4 is requested"),
-        ({"prints": 4, "sizes": [1, 3]}, "sizes, wanted"),
+        ({"prints": 4, "sizes": [1, 3]}, r"\(sizes\), wanted"),
         ({"prints": 4, "sizes": [1, 2], "cache": 1}, "cache = 1, but now None"),
     ):
         record.write_text(json.dumps({"dataset": {"name": "a"}, "settings": settings}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
     notes = export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
     result = import_pairs(tmp_path / "pairs", tmp_path / "back.zarr")
     assert result.n_scans == 3
-    raised = {note.split(":")[0]: float(note.split()[3]) / 1e3 for note in notes}
+    raised = {note.split(":")[0]: float(re.search(r"by ([\d.]+) nm", note)[1]) / 1e3 for note in notes}
     back = open_store(tmp_path / "back.zarr")
     for scan in open_store(campaign / "prints.zarr").scans():
         other = back.scan(scan.id)

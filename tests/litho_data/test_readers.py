@@ -194,7 +194,7 @@ def test_arguments_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
     # If the arguments are only defaults for many files, what the file states takes precedence.
     scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=True)
     assert (scan.unit, scan.pitch_um) == ("m", pytest.approx(PITCH_UM))
-    assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "2.5 × 1.6 µm"]
+    assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "size 2.5 × 1.6 µm"]
 
 
 def test_missing_files(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_doses_that_were_mixed_up_are_named(layouts: int, seed: int) -> None:
         said = doubts_of(prints)
         assert set(said) == {"P11", "P31"}
         assert "+" in said["P11"]
-        assert "as in 0.8" in said["P31"]
+        assert "agrees with 0.8" in said["P31"]
 
 
 @pytest.mark.parametrize("left_out", [(), (0.8,)])

@@ -30,5 +30,7 @@ def test_a_missing_card_and_a_single_size_are_reported_in_words(tmp_path):
     assert "Errno" not in str(missing.value)
     card = litho_data.simulate(tmp_path / "fab", count=1, size_px=128)
     card.write_text(re.sub(r"^size_um = .*$", "size_um = 54", card.read_text(), flags=re.MULTILINE))
-    with pytest.raises(InputError, match=r"size_um = 54, got one value, wanted y and x, such as \[54, 54\]"):
+    with pytest.raises(
+        InputError, match=r"54, got one value, wanted two values, y and x, such as \[54, 54\]"
+    ):
         litho_data.build_dataset(card, tmp_path / "s.zarr")

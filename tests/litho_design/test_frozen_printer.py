@@ -80,7 +80,7 @@ def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigm
         # The message is the same in `score`, which does not have this option.
         (
             {"pitch_um": 0.2, "cell_um": 0.4},
-            r"pitch_um of the layout, .*; design with --pitch-um 0\.1, or take a model of 0\.2 µm$",
+            r"pitch_um of the layout, .*--pitch-um 0\.1, or use a model with a pitch of 0\.2 µm$",
         ),
         ({"levels": 16}, "calibrated"),
         ({"level_height_um": 0.08}, "level_height_um"),

@@ -205,7 +205,7 @@ def test_python_takes_the_same_changes():
     [
         (("hoe", "--set", "loss.weight=0.2"), "got 'loss.weight', wanted loss.scale"),
         (("hoe", "--set", "los.weight=0.2"), "got 'los.weight', wanted variant, layout, optics, search"),
-        (("hoe", "--set", "loss=0.2"), "wanted one of loss.scale"),
+        (("hoe", "--set", "loss=0.2"), "wanted a value for one of loss.scale"),
         (("hoe", "--set", "layout.levels.top=2"), "layout.levels itself, which is a single value"),
         (("hoe", "--set", "layout.levels"), "PATH=VALUE"),
         (("hoe", "--set", "layout.levels=many"), "setting layout.levels, got 'many', wanted a valid integer"),

@@ -21,7 +21,7 @@ def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tm
     result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
     assert "no intervals: " in result.stdout
     assert "are too few, 6 are needed" in result.stdout
-    assert " folds instead of 50: one for each scan" in result.stderr
+    assert " folds instead of 50: one for each of the scans" in result.stderr
     assert "…" not in result.stdout
     assert result.stdout.splitlines()[-2].startswith("affine is")
 
@@ -50,7 +50,7 @@ def test_one_estimate_covers_all_fits_where_workers_share_them(
 def test_a_benchmark_is_extended_but_not_replaced_by_another(store, tmp_path):
     litho_models.benchmark(store, tmp_path, models=["identity"], folds=2)
     litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2)
-    with pytest.raises(InputError, match="holds a benchmark of model identity"):
+    with pytest.raises(InputError, match="holds a benchmark that also contains model identity"):
         litho_models.benchmark(store, tmp_path, models=["affine"], folds=2)
     with pytest.raises(InputError, match="seed = 0, but now 1"):
         litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2, seed=1)

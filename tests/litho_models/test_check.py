@@ -280,7 +280,7 @@ def test_an_error_that_the_fit_has_made_small_is_not_judged(lab, tmp_path):
 def test_taller_prints_end_the_strict_command_with_3(lab, tmp_path, monkeypatch, capsys):
     arguments = ["check", str(lab / "model"), str(lab / "taller.zarr"), "--out", str(tmp_path / "out")]
     assert _exit_code(monkeypatch, [*arguments, "--strict"]) == 3
-    assert capsys.readouterr().out.startswith("ALARM: since print 13 the height gain is")
+    assert capsys.readouterr().out.startswith("ALARM: since print 13, the height gain is")
     assert _exit_code(monkeypatch, arguments) == 0
     found = Check.read(tmp_path / "out")
     alarm = found.figures[0].alarm

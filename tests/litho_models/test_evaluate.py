@@ -43,7 +43,7 @@ def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_pat
 
 def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):
     store, _, folder = trained
-    with pytest.raises(InputError, match=f"take {folder}/model$") as caught:
+    with pytest.raises(InputError, match=f"use {folder}/model$") as caught:
         evaluate(folder, store, tmp_path / "out")
     assert "\n" not in str(caught.value)
     (tmp_path / "empty").mkdir()

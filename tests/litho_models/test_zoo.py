@@ -242,5 +242,5 @@ def test_the_command_in_the_card_makes_the_same_weights(made, store, tmp_path):
 
 def test_a_table_of_other_data_is_refused(made, tmp_path):
     other = write_store(tmp_path / "other.zarr", make_scans(5, size_px=80))
-    with pytest.raises(InputError, match="the store given"):
+    with pytest.raises(InputError, match="the given store"):
         make_zoo(other, tmp_path / "runs", made[0], tmp_path / "zoo", models=["affine"])
