@@ -3,11 +3,12 @@
     python -m benchmarks.corrections --out runs/corrections [--publish]
 
 Five reliefs are printed by three virtual fabs and by a model of the zoo. The fabs have the effects of
-benchmarks.gap, which no model has. Each correction is made with three models that have different formulas.
-For a fab, they are trained on scans of its prints. For the measured prints, they are models of the zoo, and
-PBL is the judge. Each correction is compared with two simple layouts: nominal heights, and the best affine
-layout (gain and zero). Its gain and zero are chosen once by the models of the search, and once by the judge,
-which is impossible before printing. An interrupted run resumes.
+benchmarks.gap, which none of the models contains. Each correction is made with three models that have
+different formulas. For a fab, these models are trained on scans of its prints. For the measured prints, they
+are models of the zoo, and PBL is the judge. Each correction is compared with two simple layouts: nominal
+heights, and the best affine layout, which has a gain and a zero. The gain and the zero are chosen once by the
+models of the search and once by the judge. The choice of the judge could not be made before printing. An
+interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return the summary, and a table with a row for each relief and printer; a cell covers all seeds."""
+    """Return the summary, and a table with one row per relief and printer. Each cell covers all seeds."""
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in record["rows"]:
         groups.setdefault((row["relief"], row["judge"]), []).append(row)
@@ -165,13 +166,13 @@ def holds(row: Mapping[str, Any]) -> bool:
 
 
 def over_idle(row: Mapping[str, Any], idle: Sequence[str] = ("uncorrected", "best affine")) -> float:
-    """Return the error of a correction divided by that of the best ``idle`` layout, both by the judge."""
+    """Return the judged error of a correction divided by the judged error of the best layout in ``idle``."""
     printed = row["printed_nm"]
     return float(printed["corrected"] / min(printed[name] for name in idle))
 
 
 def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[Printer], Printer]]:
-    """Yield the seed, the models and the judge of each printer; make those missing in the folder."""
+    """Yield the seed, the models and the judge of each printer. Missing prints and models are made first."""
     for seed in SEEDS:
         folder = out / f"fab-{seed}"
         store = folder / "prints.zarr"
@@ -191,7 +192,7 @@ def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[P
 
 
 class _Plain(ReliefTask):
-    """Find the best affine layouts; the loss omits the models' errors on their training prints."""
+    """Find the best affine layouts with a loss that ignores the models' errors on their training prints."""
 
     loss_by = Task.loss_by
 

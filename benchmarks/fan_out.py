@@ -3,9 +3,10 @@
     python -m benchmarks.fan_out [--publish]
 
 The element is 12.8 µm wide. Neighbouring spots are two diffraction limits apart. The power and uniformity of
-the spots are computed for the printed layout. The printer is Physics of the zoo, or prints nominal heights.
-The element is compared with a continuous phase designed with the same loss, and with the Gerchberg-Saxton
-phase, both continuous and rounded to the nearest of 13 levels.
+the spots are computed for the printed layout. The printer is either the Physics model of the zoo or an ideal
+printer that prints the nominal heights. The element is compared with a continuous phase that is designed with
+the same loss. It is also compared with the Gerchberg-Saxton phase, which is used both as a continuous phase
+and rounded to the nearest of 13 levels.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class FanOut(Task):
     errors = ("uniformity_error",)
 
     def powers(self, seen: Tensor) -> Tensor:
-        """Return the share of power in each spot (49,), within 2/3 of a diffraction limit of its centre."""
+        """Return the shares of the power (49,) within 2/3 of a diffraction limit of each spot centre."""
         return torch.einsum("kyx,vyx->k", _spots().to(seen), seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
@@ -71,7 +72,7 @@ class FanOut(Task):
         return 1 - powers.sum() + powers.std(correction=0) / powers.mean()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the efficiency, and (highest - lowest) / (highest + lowest) of the powers of the spots."""
+        """Return the efficiency and the uniformity error: (high - low) / (high + low) of the spot powers."""
         powers = self.powers(seen)
         low, high = float(powers.min()), float(powers.max())
         return {"efficiency": float(powers.sum()), "uniformity_error": (high - low) / (high + low)}
@@ -128,7 +129,7 @@ def _spots() -> Tensor:
 
 
 def _phases(task: FanOut) -> dict[str, Tensor]:
-    """Return, for each element with continuous phase, the phase of each cell in radians."""
+    """Return the phase of each cell, in radians, for each element that has a continuous phase."""
     phase = _gerchberg_saxton(task)
     free = phase.clone().requires_grad_()
     optimiser = torch.optim.Adam([free], lr=0.1)

@@ -3,8 +3,8 @@
     python -m benchmarks.film_design prefab-soi.zarr [--publish]
 
 The target is the layout of a locked pattern, so no model was trained on it. The layout is corrected through
-`e-beam`. `blur-table` and `random-features` judge it: they were trained on the same micrographs, but have
-other formulas.
+`e-beam`. The judges `blur-table` and `random-features` were trained on the same micrographs, but have
+different formulas.
 """
 
 from __future__ import annotations

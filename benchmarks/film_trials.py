@@ -1,10 +1,10 @@
-"""Run blind trials on films: the fab plants one cause or none, and the loop has to name exactly this.
+"""Run blind trials on films: the fab plants at most one cause, and the loop must name only this cause.
 
     python -m benchmarks.film_trials [--process e-beam] [--seed 1] [--only 0,3] [--publish]
 
-Each process has ten trials: seven with one cause each, and three without. Dose and charging differ in all
-trials. The loop sees only the store. Its base model is the bare printer of the process. An interrupted run
-resumes.
+Each process has ten trials: seven with one cause each, and three without a cause. The dose and the
+charging vary from trial to trial. The loop sees only the store. Its base model is the bare printer of the
+process. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -72,7 +72,10 @@ def draw(process: str, seed: int) -> list[Trial]:
 
 
 def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
-    """Run and judge one trial. It is ``right`` if exactly the planted cause, or nothing, is named."""
+    """Run and judge one trial. It is ``right`` if the loop names the planted cause and no other.
+
+    If nothing was planted, it is ``right`` if the loop names no cause.
+    """
     own = folder / f"{trial.number}"
     card = simulate_films(
         own / "fab", process, count=COUNT, size_px=SIZE_PX, seed=seed * 100 + trial.number, knobs=trial.knobs

@@ -45,7 +45,7 @@ PAGES = {
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the text to publish at each mark of the pages, made from the result files in a folder."""
+    """Return the texts for the pages, by the names of their marks, made from the result files in a folder."""
     benchmark, noise = in_table(folder), _found(folder, "noise.json")
     return {
         "headline": headline_table(benchmark, noise),

@@ -42,12 +42,12 @@ _HELD_OUT = {
 
 
 def texts(result: CloseLoop) -> dict[str, str]:
-    """Return the text to publish at each mark of the page."""
+    """Return the texts to publish on the page, by the names of their marks."""
     return {"errors": errors_table(result), "causes": causes_table(result)}
 
 
 def errors_table(result: CloseLoop) -> str:
-    """Return the table of errors, with a row per model, measurement model and kind of held-out scans."""
+    """Return the table of errors, one row for each model, measurement model and way of holding out scans."""
     keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
     rows = []
     for model, measurement, held_out in keys:

@@ -20,7 +20,7 @@ _FREE = {
 def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
     """Merge two benchmarks on the same scans; for a model in both, use the newer result.
 
-    Networks take long to train, so a changed model is benchmarked again without the others.
+    Training a network takes long, so a model that has changed is benchmarked again without the others.
 
     Raises:
         ValueError: the benchmarks differ in data, scans, folds or scan terms.
@@ -69,12 +69,12 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         rows,
         f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds by scan, "
         f"seed {split['seed']}; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. The "
-        f"{len(split['lock_box'])} locked scans are in no fold and in no number of this table. Per-scan "
+        f"{len(split['lock_box'])} locked scans belong to no fold and affect no number here. Per-scan "
         "terms are fitted on pixels that are not scored. Levelling leaves a shared background in every map. "
         "Its five coefficients come from the training scans. It is added to predictions of measured maps, "
         "but not to designs. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
-        "prints. A better model can reduce an error at least by its excess over the noise. The excess at "
-        f"k = 1 and at k = 7 is: {_above(benchmark, floor)}.",
+        "prints. A better model can remove at least the part of an error that exceeds the noise. At k = 1 "
+        f"and at k = 7, this part is: {_above(benchmark, floor)}.",
     )
 
 
@@ -98,8 +98,8 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
         "folds. Each scan is predicted by models not trained on it, plus the smooth background of "
         "their training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
-        "Intervals: 95 % confidence over scans, in the last row but one over the 6 prints. That row "
-        "includes errors common to a place, field or print.",
+        "Intervals: 95 % confidence over scans. For what the layout cannot explain, they are over "
+        "the 6 prints and include errors common to a place, field or print.",
     )
 
 
@@ -131,21 +131,21 @@ def noise_table(noise: dict[str, Any]) -> str:
             )
             for row in budget["flat_levels"]
         ],
-        "Only the quarter of the pixels where the layout is flattest (slope at most "
+        "Only the flattest quarter of all layout pixels is used (slope at most "
         f"{budget['flat_slope']:.3f}). Offset, gain, tilt, bow and lines are fitted to each scan.",
     )
     return f"{by_terms}\n\n{by_level}"
 
 
 def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
-    """Return the row of the noise: a cell per policy of scan terms; for None, the cell is empty."""
+    """Return the row of the noise, with one cell per policy of scan terms. The cell of None is a dash."""
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
     return (f"noise ({floor['kind'].replace('-', ' ')})", *cells)
 
 
 def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
-    """Return as text how far the error of each model exceeds the noise, with the same scan terms."""
+    """Return text that states how far the error of each model exceeds the noise with the same scan terms."""
     least = {row["policy"]: row["mae_nm"] for row in floor["by_policy"]}
     parts = []
     for score in benchmark["scores"]:
@@ -156,6 +156,6 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
 
 
 def _steps_text(benchmark: dict[str, Any]) -> str:
-    """Return as text how many optimiser steps each network was trained for."""
+    """Return text that states for how many optimiser steps each network was trained."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())

@@ -1,4 +1,4 @@
-"""Copy the plan for new prints by the measured printer into the docs: files for a lab, tables, pictures.
+"""Copy the plan for new prints on the measured printer into the docs, with lab files, tables and pictures.
 
     litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
         --steps 20
@@ -59,7 +59,7 @@ def draw(plan: NextPrint) -> None:
 
 
 def texts(plan: NextPrint) -> dict[str, str]:
-    """Return the text to publish at each mark of the page."""
+    """Return the texts to publish on the page, by the names of their marks."""
     count = plan.prints
 
     def number(value: float | None, digits: int = 1) -> str:

@@ -1,11 +1,11 @@
-"""Measure how often the loop finds a cause where none is missing: in prints of its own model plus noise.
+"""Measure how often the loop finds a false cause in prints that its own model simulates, plus noise.
 
     python -m benchmarks.null_calibration [--stores 40] [--workers 2] [--publish]
 
 Each store has 12 scans of random layouts, printed by a Physics model whose values differ from the loop's
-starting values. The noise is stationary and Gaussian, 16 nm, with the spectrum of the virtual fab's flat
-print (lines along x included). Each scan also has a datum and a tilt. The right result is to find nothing:
-every cause or law is a false positive. An interrupted run resumes.
+starting values. The noise is stationary and Gaussian and has a standard deviation of 16 nm. Its spectrum,
+which includes lines along x, is that of a flat print in the virtual fab. Each scan also has its own datum and
+tilt. The right result is to find nothing: every cause or law is a false positive. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def calibrate_one(seed: int) -> dict[str, Any]:
-    """Return the causes that the loop finds in one store, and the error before and after the loop, nm."""
+    """Return the causes that the loop finds in one store, and the error, nm, before and after the loop."""
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     closed = close(Study.dealt(null_scans(seed), FOLDS), {"physics": base})
     return {

@@ -73,7 +73,7 @@ def published(page: Path, name: str) -> str:
 
 
 def _parts(page: Path, name: str) -> tuple[str, str, str]:
-    """Split a page into three parts: up to and with the first mark, between the marks, and the rest."""
+    """Split a page into three texts: up to and including the first mark, between the marks, and the rest."""
     start, end = f"<!-- {name}: written by the benchmark -->", f"<!-- end of {name} -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(start)
     inside, found_end, after = rest.partition(end)

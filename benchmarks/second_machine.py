@@ -61,8 +61,8 @@ def main() -> None:
     parser = options(__doc__, "write the tables into docs/second_machine.md", RESULT)
     parser.add_argument("store", type=Path)
     parser.add_argument("--cache", type=Path, default=Path("runs/second-machine"), help="a file per fit")
-    parser.add_argument("--learned", default="", help=f"models to train, of {', '.join(LEARNED)}")
-    parser.add_argument("--loop", type=Path, help="folder of the closed loop, run if it has no result")
+    parser.add_argument("--learned", default="", help=f"models to train, out of {', '.join(LEARNED)}")
+    parser.add_argument("--loop", type=Path, help="folder of the closed loop; it runs if there is no result")
     arguments = parser.parse_args()
     store = open_store(arguments.store)
     folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
@@ -107,7 +107,7 @@ class Bench:
         return [self.fit(name, fold)["values"] for fold in self.folds]
 
     def fit(self, name: str, fold: Fold) -> dict[str, Any]:
-        """Return the fitted values of a model, and the scores of the held-out patterns of a fold."""
+        """Return, for one fold, the fitted values of a model and the scores of the held-out patterns."""
         file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
         if not file.exists():
             bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
@@ -118,8 +118,8 @@ class Bench:
 def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str, Any]:
     """Fit one model to the training patterns of a fold and judge it on the held-out patterns.
 
-    A model composed of parts is fitted twice: from its default values, and from the fitted values of the
-    bare model. The better fit counts.
+    If ``bare`` holds the fitted values of the bare model, a model composed of parts is fitted twice: once
+    from its default values, and once from the values of the bare model. The better fit counts.
     """
     geometry = common_geometry(fold.training)
     if name in LEARNED:
@@ -143,7 +143,7 @@ def made(name: str, values: Mapping[str, Any], **geometry: Any) -> Simulator:
 
 
 def started(bare: Mapping[str, float]) -> dict[str, float]:
-    """Return the starting values of the model with all parts that equal the fitted bare model."""
+    """Return starting values for the model with all parts, taken from the fitted bare model."""
     return {"two-spots.sigma_um": bare["spot.sigma_um"], "hill.threshold": bare["etch.threshold"]}
 
 
@@ -163,7 +163,7 @@ def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
 
 
 def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str, Any]:
-    """Return what the loop found, the edge errors, and a comparison with the model that has all parts."""
+    """Return the findings and edge errors of the loop, and compare it with the model that has all parts."""
     before, after = loop.error("base"), loop.error("all")
     assert before is not None
     assert after is not None
@@ -182,7 +182,7 @@ def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str,
 
 
 def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
-    """Return by how much the edge error falls: mean, interval, p, and number of improved patterns."""
+    """Return how far the mean edge error falls, with interval and p, and how many patterns improved."""
     gains = [was["edge_mean_nm"] - now["edge_mean_nm"] for was, now in zip(before, after, strict=True)]
     found = over_units(gains)
     better = [found.positive, found.count]
@@ -190,7 +190,7 @@ def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
 
 
 def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return mean errors over patterns, sums of counts, and the range of fitted values over folds."""
+    """Return mean errors over patterns, total counts, and the range of each fitted value over the folds."""
     errors = [row["edge_mean_nm"] for row in rows]
     means = {
         key: float(np.mean([row[key] for row in rows]))
@@ -234,7 +234,7 @@ def draw_places(store: Store, bench: Bench, name: str) -> Figure:
 
 
 def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Return half the width (px) and the place of the narrowest film that continues at both ends."""
+    """Return half the width (px) and the place of the narrowest neck: a film that continues at both ends."""
     from scipy.ndimage import binary_dilation, convolve
     from skimage.morphology import medial_axis
 
@@ -254,7 +254,7 @@ def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
 
 
 def corner(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Return the largest difference between film and layout at an edge, negated, and its place."""
+    """Return minus the largest difference between film and layout at an edge, and the place of this edge."""
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     film = _inner_film(scan)

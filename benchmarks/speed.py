@@ -125,8 +125,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         heads,
         rows,
         f"{size_px} × {size_px} px, float32, {record['device']}, {record['threads']} thread, "
-        f"processor time, median of {REPEATS} runs, torch {record['versions']['torch']}. Training is "
-        "wall-clock time on a machine with other work.",
+        f"processor time, median of {REPEATS} runs, torch {record['versions']['torch']}. Training was "
+        "timed by the wall clock on a busy machine.",
     )
 
 

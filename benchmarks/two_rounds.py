@@ -1,14 +1,14 @@
-"""Run two rounds of prints on the virtual fab: the second, which the loop plans, decides open questions.
+"""Run two rounds of prints on the virtual fab. The second round is planned to decide open questions.
 
     python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
 Each trial has its own fab and plants one knob in it, with an effect of 12 to 30 nm rms. Knobs and sizes are
-drawn from the seed before anything is run. The first round is a loop on 14 scans of random layouts. For
-its open questions, four prints are planned and printed in the same fab. As a control, as many prints of
-random layouts are scanned in the same ways. An answer is right if only the planted cause remains and is
-attributed to the right machine (printer or microscope). If the first round leaves no question that scans can
-decide, the trial is counted separately. Every seed has its own result file and table. An interrupted run
-resumes.
+drawn from the seed before anything is run. The first round is a loop on 14 scans of random layouts. To
+answer its open questions, four prints are planned and printed in the same fab. As a control, the same number
+of prints with random layouts are made and scanned in the same ways. An answer is right if only the planted
+cause remains and is attributed to the right machine (printer or microscope). If the first round leaves no
+question that scans can decide, the trial is counted separately. Every seed has its own result file and
+table. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def main() -> None:
 def draws(
     count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
 ) -> list[dict[str, Any]]:
-    """Draw the cause that each trial plants: knobs in turn, log-uniform sizes, and a seed per trial."""
+    """Draw the cause and the seed of each trial. Knobs are taken in turn, and their sizes are log-uniform."""
     random = np.random.default_rng([seed, 17])
     return [
         {
@@ -121,7 +121,7 @@ def run_trial(
     arms: Sequence[Arm],
     report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run both rounds of one trial; run the second once for each kind of layouts in ``arms``."""
+    """Run both rounds of one trial. The second round is run once for each kind of layout in ``arms``."""
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
@@ -234,9 +234,9 @@ def summary(trials: list[dict[str, Any]]) -> str:
             "declared not separable",
         ),
         rows,
-        f"{len(trials)} trials, with the knobs planted in turn. In {with_question}, the first round left a "
-        f"question about the planted cause. Powers are those that the plan predicts for {PRINTS} prints. "
-        "Shares have 95 % confidence intervals (Wilson). The last column was declared before printing.",
+        f"The {len(trials)} trials plant the knobs in turn. In {with_question} of them, the first round left "
+        f"a question about the planted cause. Powers are those that the plan predicts for {PRINTS} prints. "
+        "Shares have 95 % Wilson intervals. The last column was declared before printing.",
         f"Questions about the planted cause that optimised layouts decided correctly: {_by_knob(trials)}.",
     )
 

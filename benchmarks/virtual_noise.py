@@ -31,7 +31,7 @@ DOSES, REFERENCES = "dose-matrix", "references"
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the text to publish at each mark of the page, made from the two results in a folder."""
+    """Return the texts for the page, by the names of their marks, made from the two results in a folder."""
     doses, references = (NoiseAnalysis.read(folder / name) for name in (DOSES, REFERENCES))
     return {
         "dose matrix": dose_table(doses),
@@ -68,8 +68,8 @@ def planted_text(found: NoiseAnalysis) -> str:
     noise = found.budget.floor.at("full")
     assert noise is not None
     return (
-        f"Virtual prints, planted roughness {Noise().roughness_nm:g} nm: the flat print gives "
-        f"{flat.sigma_nm:.2f} ± {flat.sigma_uncertainty_nm:.2f} nm, and the noise budget "
+        f"The planted roughness of the virtual prints is {Noise().roughness_nm:g} nm. The flat print gives "
+        f"{flat.sigma_nm:.2f} ± {flat.sigma_uncertainty_nm:.2f} nm, and the noise budget gives "
         f"{with_interval(noise.rmse_nm, noise.rmse_ci95_nm)} at k = 7, from residuals of "
         f"`{found.budget.model}` on {found.run.n_scans} scans."
     )

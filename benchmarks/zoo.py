@@ -1,10 +1,10 @@
-"""Make the models that ship with the package: those of the benchmark's table, trained alike.
+"""Make the models that ship with the package: the models of the benchmark table, trained in the same way.
 
     make zoo
     python -m benchmarks.zoo runs/zoo --models pbl,fno
 
 Training uses all scans except the locked ones. A finished run is reused; an interrupted one continues.
-Each card first lists the errors of the table, which come from five other fits, each to fewer scans.
+Each card first lists the errors of the table. They come from five other fits, each of them to fewer scans.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def make_zoo(
         models: names of models in the table; all by default.
 
     Raises:
-        InputError: the table is of other data, a model has other training settings, or the zoo is too large.
+        InputError: the table is not about these data, a model has other training settings, or the zoo is too
+            large.
     """
     dataset = open_store(store)
     if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
@@ -131,7 +132,7 @@ def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtoco
 
 
 def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise InputError if a model was trained with other settings than the table's."""
+    """Raise InputError if a model was not trained with the settings of the table."""
     for key, value in wanted.items():
         # A fit by least squares ignores the optimiser of the recipe.
         if key != "optimiser" and trained[key] != value:

@@ -32,7 +32,7 @@ BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random
 
 @dataclass(frozen=True)
 class Effort:
-    """The extent of training and design: enough to try every step, or as much as the docs' numbers need.
+    """How much the demo trains and designs: enough to try every step, or as much as the docs' numbers need.
 
     If ``training_steps`` is None, each model uses its default.
     """
@@ -200,7 +200,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         ]
     steps.append(
         Step(
-            "Compare designs: designed with × judged with",
+            "Compare designs made with one model and judged with another",
             _design(
                 "compare",
                 "--models",
@@ -235,7 +235,7 @@ def run(step: Step, number: str) -> float:
 
 
 def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
-    """Write one page with the answer of the demo and links to all reports; return the answer and the page."""
+    """Write a page with the demo's answer and links to all reports; return the answer and the page's path."""
     import pandas as pd
 
     page = Page(
@@ -249,7 +249,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
         page.verdict(answer)
         rows = {"the base model": loop.error("base"), "what the loop found": loop.error("all")}
         tiles = [
-            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans, one term per scan fitted")
+            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans (one term fitted per scan)")
             for name, row in rows.items()
             if row is not None
         ]
@@ -260,7 +260,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     table = pd.DataFrame(
         {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
     )
-    page.table(table, "0 s: the result existed from an earlier run.", "steps.csv", digits=1)
+    page.table(table, "0 s means that the result existed from an earlier run.", "steps.csv", digits=1)
     return answer, page.write(out, "index.html")
 
 
@@ -270,7 +270,7 @@ def _spell(command: tuple[str, ...]) -> str:
 
 def _paper_split(store: Path, models: str, out: Path, seed: int) -> Step:
     return Step(
-        f"Compare the models on the paper's split, draw {seed}",
+        f"Compare the models on the paper's split, random draw {seed}",
         _models(
             "benchmark", store, "--models", models, "--split", "paper", "--seed", seed, "--out", out,
         ),

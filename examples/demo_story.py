@@ -1,4 +1,4 @@
-"""Write the page of the demo: the planted effects, the effects found, and the gain of a hologram."""
+"""Write the page of the demo: the planted effects, the effects that were found, and a better hologram."""
 
 from __future__ import annotations
 
@@ -58,15 +58,18 @@ def tell(page: Page, out: Path) -> str:
         f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
         f"{': ' if hit else ''}{' and '.join(hit)}"
         f"{_also([name for name in found if name not in planted])}. On held-out scans, the error "
-        f"went from {before.mae_nm:.1f} to {after.mae_nm:.1f} nm, {abs(less):.0f} % "
-        f"{'less' if less >= 0 else 'more'}. A hologram designed through "
-        f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it; "
-        f"designed without a model, it has {psnr['none']:.1f} dB. A single run cannot show what is chance."
+        f"changed from {before.mae_nm:.1f} to {after.mae_nm:.1f} nm ({abs(less):.0f} % "
+        f"{'less' if less >= 0 else 'more'}). When this printer prints it, a hologram designed through "
+        f"the corrected model reaches {psnr[CORRECTED]:.1f} dB; one designed without a model reaches "
+        f"{psnr['none']:.1f} dB. A single run cannot show how much of this is chance."
     )
     page.verdict(answer)
     page.heading("1. What was planted")
     told = [f"{get_effect(name).title} ({knob})" for name, knob in planted.items()]
-    page.paragraph(f"In the virtual fab only, in no file that the programs read: {'; '.join(told)}.")
+    page.paragraph(
+        f"Only the virtual fab knows these effects: {'; '.join(told)}. No file that the programs read "
+        "mentions them."
+    )
     page.figure(_first_scan(out / "store.zarr"), "The first field: its layout, its scan, and the difference.")
     page.links([("store-report/report.html", "The dataset, scan by scan")])
     page.heading("2. What was found")
@@ -74,10 +77,11 @@ def tell(page: Page, out: Path) -> str:
                    f"{', '.join(name for name in planted if name not in found) or 'none'}."
                    f"{_width(loop)}")  # fmt: skip
     page.figure(
-        _gains(loop, set(planted)), "How much the error grows without each cause. Planted causes are blue."
+        _gains(loop, set(planted)),
+        "How much the error grows when each cause is left out. Planted causes are blue.",
     )
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
-    page.heading("3. The error before and after, with equally many fitted terms")
+    page.heading("3. The error before and after the loop")
     over = loop.over_scans
     interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, 95 % over scans)".format(*over.ci95_nm)
     page.paragraph(
@@ -97,16 +101,19 @@ def tell(page: Page, out: Path) -> str:
     colours = [model_colour(name) for name in scores]
     page.figure(
         _bars(scores, "error, nm", colours),
-        "Errors of the models on held-out scans, with the zero of each scan fitted.",
+        "Errors of the models on held-out scans, after the zero of each scan is fitted.",
     )
     page.links(
-        [("benchmark/report.html", "The benchmark"), ("compare/report.html", "Designed × judged with")]
+        [
+            ("benchmark/report.html", "The benchmark"),
+            ("compare/report.html", "Designs made with one model and judged with another"),
+        ]
     )
     designs = {"none": "without a model", CORRECTED: "through the corrected model"}
     for number, (arm, how) in enumerate(designs.items(), 5):
         folder = design_folder(Path("compare"), arm, gap.seeds[0])
         page.heading(f"{number}. A hologram designed {how}")
-        page.paragraph(f"Printed by the fab itself, its image has {psnr[arm]:.1f} dB.")
+        page.paragraph(f"When the fab prints this hologram, its image reaches {psnr[arm]:.1f} dB.")
         page.figure(_hologram(out / folder, out / "fab" / "truth"), "The target, the print, and its image.")
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
     return answer
@@ -118,13 +125,14 @@ def _causes(loop: CloseLoop) -> list[FoundEffect]:
 
 
 def _width(loop: CloseLoop) -> str:
-    """Return a sentence with the loop's estimate of how much wider the spot is along one direction, µm."""
+    """Return a sentence that states how much wider the loop finds the spot along one axis, in µm."""
     spot = next((effect for effect in loop.effects if effect.name == "elliptical-psf"), None)
     if spot is None:
         return ""
     # The moments grow by s² along one axis: Cxx - Cyy and 2 Cxy are s² cos 2a and s² sin 2a.
     stretch, shear = (spot.strengths[name][0].value for name in ("stretch_um2", "shear_um2"))
-    return f" The loop estimates that the spot gains {math.hypot(stretch, shear) ** 0.5:.2f} µm on one axis."
+    wider_um = math.hypot(stretch, shear) ** 0.5
+    return f" The loop finds an extra blur of {wider_um:.2f} µm along one axis of the spot."
 
 
 def _also(names: list[str]) -> str:
@@ -148,7 +156,7 @@ def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
     gains = [effect.left_out_nm or 0.0 for effect in effects]
     axis.barh(names, gains, color=[PLANTED if name in planted else OTHER for name in names])
     axis.invert_yaxis()
-    axis.set_xlabel("increase of the error without it, nm")
+    axis.set_xlabel("increase of the error without the cause, nm")
     return figure
 
 
@@ -168,9 +176,9 @@ def _hologram(folder: Path, fab: Path) -> Figure:
     design = LoadedDesign(folder)
     printed = design.printed_um(load_printer(fab, design.record.layout))
     assert design.target is not None
-    shown = {"wanted": design.target, "printed, µm": printed, "image": design.display(design.image(printed))}
+    shown = {"target": design.target, "printed, µm": printed, "image": design.display(design.image(printed))}
     maps = {title: np.asarray(picture) for title, picture in shown.items()}
-    return _row(maps, {"wanted": IMAGE, "image": IMAGE})
+    return _row(maps, {"target": IMAGE, "image": IMAGE})
 
 
 def _row(maps: dict[str, np.ndarray], scales: dict[str, dict[str, Any]]) -> Figure:

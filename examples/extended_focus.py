@@ -2,8 +2,8 @@
 
     python examples/extended_focus.py zoo:pbl
 
-The free cells are rings. The loss is the brightness on the axis, mainly in the dimmest planes. The search
-starts from a plain lens.
+The free cells of the layout are rings. The loss rewards brightness on the axis, mainly in the dimmest planes.
+The search starts from a plain lens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ WAVELENGTH_UM, PLANES = 0.6328, 9
 
 
 class Axis:
-    """Compute the central spot's brightness in several planes, relative to a perfect lens at its focus."""
+    """Compute the central spot's brightness in several planes, relative to the focus of a perfect lens."""
 
     def __init__(self, element: litho_design.Element, focal_um: float, range_um: float):
         size, pitch = element.layout.size_px, element.layout.pitch_um
@@ -47,7 +47,7 @@ class Axis:
 
 
 def main() -> None:
-    """Compare, as printed, a plain lens with lenses designed for a perfect printer and through a model."""
+    """Compare printed lenses: a plain one, one designed for a perfect printer, and one through a model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=320)

@@ -1,4 +1,4 @@
-"""Measure how much slope and bow of the print a plain background removes, scan by scan.
+"""Measure, scan by scan, how much of the print's own slope and bow a plain background removes.
 
     python examples/layout_aware_levelling.py STORE.zarr
 
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def compare(store: Store, scan_id: str) -> dict[str, float]:
-    """Return in nm each plane's range over the field, and the rms difference of the second-degree fits."""
+    """Return the range of each plane over the field, and the rms difference of the second-degree fits, nm."""
     print_ = store.scan(scan_id)
     height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
     own = store.quality["scan"] == scan_id

@@ -2,9 +2,9 @@
 
     python examples/microscope_phase_mask.py zoo:pbl
 
-The element is in the pupil. The loss is the Cramer-Rao bound of x, y and z for the photons of one spot,
-averaged over depth. This bound is the smallest error that any localisation can have (Shechtman et al. 2014,
-doi:10.1103/PhysRevLett.113.133902).
+The element is in the pupil. The loss is the Cramer-Rao bound on the errors of x, y and z for the photons of
+one spot, averaged over depth. This bound is the smallest error that any localisation can have (Shechtman et
+al. 2014, doi:10.1103/PhysRevLett.113.133902).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Microscope:
 
 
 def main() -> None:
-    """Compare no mask with masks designed for a perfect printer and through a model, printed by the model."""
+    """Compare printed masks: none, one designed for a perfect printer, and one designed through a model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)
@@ -75,7 +75,7 @@ def main() -> None:
         with torch.no_grad():
             z, y, x = scope.errors_nm(judge).mean(0).tolist()
         what = f"designed with {name}" if iterations else "no mask"
-        print(f"{what}: mean errors of {z:.1f} nm along z, {y:.1f} and {x:.1f} nm across, as printed")
+        print(f"{what}: as printed, mean errors of {z:.1f} nm along z, {y:.1f} along y and {x:.1f} along x")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ SINKING_DEPTH_UM = 0.2
 
 
 def sinking_layers(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Return H - d exp(-M / 0.2 µm): the lowest levels M of a layout are printed lower by d."""
+    """Return H - d exp(-M / 0.2 µm): the lowest parts of a layout M are printed lower, by at most d."""
     return height - values["depth_um"] * torch.exp(-context.layout_um / SINKING_DEPTH_UM)
 
 
@@ -52,7 +52,7 @@ def register() -> None:
     register_effect(
         Effect(
             name="cubic-bow",
-            title="cubic part of the bow of the single scan",
+            title="cubic part of each scan's bow",
             stage="measurement",
             role="measurement",
             acts_on="height",
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("store", help="dataset store")
     parser.add_argument("--out", required=True, help="folder of the result")
     parser.add_argument("--base", default="physics", help="model to correct (default physics)")
-    parser.add_argument("--folds", type=int, default=5, help="outer folds, by scan (default 5)")
+    parser.add_argument("--folds", type=int, default=5, help="number of outer folds of scans (default 5)")
     given = parser.parse_args()
     register()
     result = close_loop(given.store, given.out, base=given.base, folds=given.folds)

@@ -21,7 +21,7 @@ from litho_models import evaluate, register_metric
 def share_off_by_half_a_level(
     scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray
 ) -> float | None:
-    """Return the share of scored pixels whose error exceeds half a level, %; None without such pixels."""
+    """Return the percentage of scored pixels whose error exceeds half a level; None if no pixel is scored."""
     scored = residual_um[np.isfinite(residual_um)]
     return 100 * float(np.mean(np.abs(scored) > scan.level_height_um / 2)) if scored.size else None
 

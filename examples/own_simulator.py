@@ -4,7 +4,7 @@
 
 The script registers a printer whose spot is the sum of two Gaussians, and trains it as `litho-models train`
 does. Nothing else needs to change: benchmark, loop and design accept the name of the model. In a plug-in
-(docs/extending.md), `@register_simulator` above the class registers it, and all commands accept it.
+(docs/extending.md), put `@register_simulator` above the class; all commands then accept the model.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
     python examples/own_task.py zoo:pbl --out rgb-planes
 
 A class defines the images (``views``), what the search minimises (``loss``) and the scores (``figures``).
-Search, checkpoints, polish, process window, report, comparison and export are those of holograms and lenses.
+Everything else (search, checkpoints, polish, process window, report, comparison and export) works as it does
+for holograms and lenses.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ NANOMETRES, PLANES_UM = (640, 532, 473), (-4.0, 0.0, 4.0)
 
 @litho_design.register_task
 class ColoursInPlanes(litho_design.Task):
-    """Draw one spot per colour, sharp in three planes: extended depth of focus in three colours."""
+    """Draw one spot per colour that is sharp in three planes: extended depth of focus in three colours."""
 
     name = "colours-in-planes"
 
@@ -47,7 +48,7 @@ def spots(size_px: int) -> np.ndarray:
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, print both with the model, and export the latter."""
+    """Design for a perfect printer and through a model, print both designs, and export the second one."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -72,7 +73,9 @@ def main() -> None:
     )
     for item in result.summary:
         if item.figure == "worst_on_spots" and item.judge == "model":
-            print(f"designed with {item.arm}: {100 * item.judged_mean:.1f} % on the worst spot as printed")
+            print(
+                f"designed with {item.arm}: the worst spot gets {100 * item.judged_mean:.1f} % of the light"
+            )
     best = words.out / "designs" / "model" / "seed0"
     print(litho_design.export(best, "png16", words.out / "to-printer"))
     score = litho_design.score(best, words.out / "score", judges=["none"])

@@ -1,10 +1,10 @@
-"""Run a loop of fifty lines on a blind board: ridge regression on the layout plus the best covariates.
+"""Analyse a blind board in fifty lines: ridge regression on the layout and on the best covariates.
 
     litho-models board judge BOARD --loop "python examples/plain_loop.py" --out judged
 
 Each scan is predicted by a ridge regression fitted to the other scans. Each covariate has the name of the
-effect that causes it. The loop names this effect if the covariate reduces the squared error by at least 1 %
-in total, and in every scan except at most one.
+effect that causes it. The loop names this effect if the covariate reduces the total squared error by at least
+1 %, and reduces it in all scans but at most one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STEP_PX, BLURS_PX, RIDGE, LEAST_GAIN = 4, (0, 2, 5, 12, 30), 1e-6, 0.01
 
 
 def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the predictors of a scan (pixels, columns), and its covariates by the name of their effect."""
+    """Return the predictors of a scan (pixels, columns) and a dictionary of covariates, keyed by effect."""
     level = scan.mask_level / scan.levels
     blurred = [gaussian_filter(level, px) for px in BLURS_PX]
     y, x = (np.linspace(-1, 1, n) for n in level.shape)
@@ -44,7 +44,7 @@ def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.n
 
 
 def errors_nm(maps: list[np.ndarray], heights: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the residuals of each scan (pixels,), nm, after a fit to the others with an offset per scan."""
+    """Return each scan's residuals (pixels,), nm, from a fit to the other scans with one offset per scan."""
     maps, heights = ([one - one.mean(axis=0) for one in own] for own in (maps, heights))
     grams, rights = ([a.T @ b for a, b in zip(maps, own, strict=True)] for own in (maps, heights))
     gram, right, found = sum(grams), sum(rights), []

@@ -20,7 +20,7 @@ COLOURS_UM = (0.640, 0.532, 0.473)
 
 
 def discs(size_px: int) -> torch.Tensor:
-    """Return three overlapping discs, values in [0, 1], (3, size, size)."""
+    """Return three overlapping discs with values in [0, 1], (3, size, size)."""
     y, x = np.mgrid[0:size_px, 0:size_px] / size_px - 0.5
     angles = 2 * np.pi * np.arange(3) / 3
     return torch.tensor(
@@ -54,7 +54,7 @@ def loss(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, and print both elements with the model."""
+    """Design one element for a perfect printer and one through a model, and print both with the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)
@@ -76,7 +76,8 @@ def main() -> None:
             seen = scene.images(judge)
         shares = ", ".join(f"{100 * share:.1f} %" for share in (seen * targets).sum((1, 2)).tolist())
         print(
-            f"designed with {name}: loss {float(loss(seen, targets)):.4f} as printed; on the discs {shares}"
+            f"designed with {name}: loss {float(loss(seen, targets)):.4f} as printed; "
+            f"share of the light on each disc {shares}"
         )
 
 

@@ -2,8 +2,9 @@
 
     python examples/structured_light_4f.py zoo:pbl
 
-The system has two lenses with the element between them. It uses torchoptics (extra ``torchoptics``), in m.
-A vortex beam has zero overlap with a Gaussian beam; the element in the Fourier plane must unwind its phase.
+The system has two lenses with the element between them. It uses torchoptics (extra ``torchoptics``), whose
+lengths are in m. A vortex beam has zero overlap with a Gaussian beam, so the element in the Fourier plane
+must unwind the phase of the vortex.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ WAVELENGTH, PITCH = 632.8e-9, 0.1e-6
 def overlap(
     element: litho_design.Element, f: float, vortex: torchoptics.Field, wanted: torchoptics.Field
 ) -> torch.Tensor:
-    """Return the share of the light behind the 4f system of focal length ``f`` that is in the target beam."""
+    """Return what share of the light behind a 4f system with focal length ``f`` is in the target beam."""
     shape = vortex.shape
     between = element.as_torchoptics(z=2 * f, unit_um=1e6)
     system = torchoptics.System(Lens(shape, f, f), between, Lens(shape, f, 3 * f))
@@ -32,7 +33,7 @@ def overlap(
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, and print both elements with the model."""
+    """Design one element for a perfect printer and one through a model, and print both with the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
     parser.add_argument("--size-px", type=int, default=256)
@@ -57,7 +58,7 @@ def main() -> None:
         judge.start_from_levels(element.levels())
         with torch.no_grad():
             share = float(overlap(judge, f, vortex, wanted))
-        print(f"designed with {name}: {100 * share:.1f} % of the light in the Gaussian beam as printed")
+        print(f"designed with {name}: as printed, {100 * share:.1f} % of the light is in the Gaussian beam")
 
 
 if __name__ == "__main__":

@@ -16,9 +16,10 @@ class Scan:
     """A height map in the scan's own frame.
 
     Args:
-        height_um: (ny, nx) float64, µm, row 0 on top; NaN where nothing was measured.
-        pitch_um: (along y, along x) sampling, µm; None if neither the file nor the caller states it.
-        name: what the scan is called, by default the stem of its file.
+        height_um: heights (ny, nx) as float64 in µm, with row 0 at the top; NaN where nothing was measured.
+        pitch_um: distance of the pixels (along y, along x) in µm; None if neither the file nor the caller
+            states it.
+        name: name of the scan, by default the stem of its file name.
         channel: name of the channel that was read.
         unit: unit of the heights in the file, before conversion to µm.
         fast_axis: the axis along which the tip moved fast; None if unknown.
@@ -29,8 +30,8 @@ class Scan:
         notes: warnings for whoever uses the heights.
 
     Raises:
-        InputError: not a map of at least 2 x 2 pixels, no finite height at all, a mask of another
-            shape, or a pitch that is not positive.
+        InputError: the heights are not a map of at least 2 x 2 pixels or contain no finite value, the mask
+            has another shape, or the pitch is not positive.
     """
 
     height_um: Array

@@ -1,4 +1,4 @@
-"""Models of the printer: they are trained on a dataset, corrected by its residual, and frozen for design."""
+"""Models of the printer: they are trained on a dataset, corrected with its residuals, and frozen."""
 
 from typing import TYPE_CHECKING
 

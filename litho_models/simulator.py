@@ -22,7 +22,8 @@ _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Return the spot (standard deviation, µm) that sets the default lengths for layouts with this pitch.
+    """Return the spot (standard deviation, µm) from which the default lengths for layouts with this pitch are
+    derived.
 
     This is the spot of the first printer if it is between half a pixel and ten pixels wide. Otherwise the
     layouts belong to another printer, whose spot is assumed to be two pixels wide.
@@ -32,8 +33,8 @@ def spot_um(pitch_um: float) -> float:
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """Take the lengths of a config from ``set_`` or the defaults and scale them to a pitch; return an empty
-    dict if the scale is 1.
+    """Scale the lengths of a config to a pitch. Lengths that are missing in ``set_`` take their default
+    values. Return an empty dict if the scale is 1.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -62,7 +63,7 @@ class SimulatorConfig(BaseModel):
     pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
     level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
     levels: int = Field(13, ge=2, le=65536, description="number of layout levels, 0 included")
-    fixed: tuple[str, ...] = Field((), description="parameters that no fit changes, by name in ranges")
+    fixed: tuple[str, ...] = Field((), description="names, as in ranges, of parameters that no fit changes")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
@@ -108,7 +109,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """Register a parameter; if the config fixes it, it is not trained."""
+        """Register a parameter. A parameter that the config fixes is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)
@@ -126,14 +127,15 @@ class Simulator(nn.Module, ABC):
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the pixels that are farther than ``reach_px`` from the edge, (b, 1, y - 2r, x
-        - 2r), µm.
+        """Return the height in µm of the pixels that are farther than ``reach_px`` from the edge. The result
+        is (b, 1, y - 2r, x - 2r), where r is ``reach_px``.
 
-        A model without a receptive radius receives a whole image or one tile, and returns the same size.
+        A model without a receptive radius receives a whole image or one tile, and returns heights of the same
+        size.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field; beyond its edge, the outermost pixels of the layout are
+        """Return the height of the whole field. Beyond the edge of the layout, its outermost pixels are
         repeated.
         """
         reach = self.reach_px or 0
@@ -155,14 +157,16 @@ class Simulator(nn.Module, ABC):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Return the range of each limited value, by the name of its parameter (one raw number). The other
-        parameters are not limited.
+        """Return the ranges of the values that are limited. Each key is the name of the parameter that holds
+        the value as one raw number. Other parameters are not limited.
         """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Return the names of the values that lie on a bound of their range, each with this bound."""
+        """Return the values that lie on a bound of their range, as a dict from the name of the value to this
+        bound.
+        """
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
         return {name: bound for name, bound in bounds.items() if bound is not None}
@@ -186,8 +190,9 @@ class Simulator(nn.Module, ABC):
 def is_small(model: nn.Module) -> bool:
     """Return whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
 
-    Small models are fitted by least squares, except with the paper's recipe. The loop fits them together with
-    the effects. Other models are trained by stochastic gradient descent, and the loop does not refit them.
+    Small models are fitted by least squares, unless the paper's recipe is used. The loop fits a small model
+    together with the effects. Other models are trained by stochastic gradient descent, and the loop does not
+    refit them.
     """
     return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 

@@ -107,7 +107,9 @@ class Browser:
         self._profile.cleanup()
 
     def show(self, page: Path | str, width_px: int, dark: bool) -> None:
-        """Load a page from a file or an address. Afterwards, ``errors`` lists the errors that it reported."""
+        """Load a page from a file or an address. Afterwards, ``errors`` lists the errors that the page
+        reported.
+        """
         self.errors = []
         self.screen(width_px, dark)
         self._loaded = False

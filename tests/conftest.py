@@ -34,7 +34,7 @@ def _legible(page: report.Page, figure: Figure, caption: str) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Check every figure that a test makes, but draw it only in tests marked ``pictures``."""
+    """Check every figure that a test makes. Figures are drawn only in tests marked ``pictures``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report.Page, "figure", _legible)
         if item.get_closest_marker("pictures") is None:

@@ -1,10 +1,14 @@
-"""Draw small faults at random places of the product, to see how many of them the tests notice.
+"""Put small faults at random places in the code, to see how many of them the tests notice.
 
-``python -m tests.drawn_faults SEED COUNT`` prints the faults. A third argument FILE tries them: each of its
-lines, ``NUMBER TESTS``, names a fault and the tests to run with it, after mypy. Every line of code is equally
-likely to be drawn, and so is every possible change of that line. Three kinds of change are never drawn,
-because they are no faults: a new value of a named constant or a default, swapped arguments of functions such
-as ``min`` and ``max``, and a change of the argument ``strict`` of ``zip``, which only adds a check.
+``python -m tests.drawn_faults SEED COUNT`` prints the faults. With a third argument FILE, it tries them. Each
+line of this file, ``NUMBER TESTS``, names a fault and the tests that are run after mypy.
+
+Every line of code is equally likely to be drawn, and all possible changes of a line are equally likely. Three
+kinds of change are not faults and are never drawn:
+
+- a new value of a named constant or of a default;
+- swapped arguments of a function such as ``min`` or ``max``;
+- a change of the argument ``strict`` of ``zip``, which only adds a check.
 """
 
 from __future__ import annotations
@@ -36,7 +40,7 @@ NAMES = {one: other for pair in PAIRS.split(",") for one, other in (pair.split()
 
 
 def changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield the wrong expressions that a programmer could have written by mistake instead of this one."""
+    """Yield wrong versions of this expression that a programmer could have written by mistake."""
     new = copy.deepcopy(node)
     match new:
         case ast.BinOp() | ast.BoolOp() if type(new.op) in OTHER:
@@ -87,7 +91,9 @@ def expressions(tree: ast.AST, *, within: bool = False) -> Iterator[ast.AST]:
 
 
 def drawn(seed: int, count: int) -> list[Fault]:
-    """Draw ``count`` faults. Each contains the whole text of its file, but names no tests yet."""
+    """Draw ``count`` faults. Each fault contains the whole text of its file. It does not name any tests
+    yet.
+    """
     places: dict[tuple[Path, int], list[tuple[ast.expr, ast.AST]]] = {}
     for file in sorted(file for package in PRODUCT for file in (ROOT / package).rglob("*.py")):
         for node in expressions(ast.parse(file.read_bytes())):

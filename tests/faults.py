@@ -1,4 +1,5 @@
-"""Put small faults into a copy of the project, one at a time, and check that the named tests catch each.
+"""Put small faults into a copy of the project, one at a time, and check that the named tests catch each of
+them.
 
 ``python -m tests.faults [WORDS]`` tries the faults whose name contains one of the words; without words it
 tries all. It exits with 1 if any fault is not caught. It takes minutes, so the test suite does not run it.
@@ -260,7 +261,9 @@ FAULTS = [
 
 
 def catches(fault: Fault, copy: Path, typed: bool = False) -> str:
-    """Return the name of the check that a fault makes fail, either a test or "mypy"; "" if none fails."""
+    """Return the name of the check that fails because of a fault: a test or "mypy". Return "" if no check
+    fails.
+    """
     with _put_in(fault, copy):
         if typed and subprocess.run([*_MYPY], cwd=copy, capture_output=True).returncode:
             return "mypy"

@@ -1,8 +1,8 @@
-"""Grids on which confusing the axes always changes the result; the tests of all rooms use them.
+"""Grids for tests of all packages. On these grids, confusing the axes always changes the result.
 
-Some fields are higher than wide, others wider than high. Their sizes are even or odd, their pixels are
-longer along one axis, and their corners lie off the origin. So a transposed pair, the size of the wrong axis
-and a shift by half a pixel are all noticed.
+Some fields are taller than wide, others wider than tall. Their numbers of pixels are even or odd, their
+pixels are longer along one axis than along the other, and their corners do not lie at the origin. Therefore,
+tests notice a transposed pair, the size of the wrong axis, and a shift by half a pixel.
 """
 
 from __future__ import annotations

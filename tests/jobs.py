@@ -18,7 +18,7 @@ def large(count: int) -> dict[str, list[int]]:
 
 
 def told(job: Job) -> tuple[list[int], int, tuple[str, str, str | None]]:
-    """Return the list that all jobs share, its entry at this job's number, and facts about the run."""
+    """Return the list that all jobs share, the entry of this list for this job, and facts about the run."""
     number, known = job
     return known, known[number], (run_facts()["command"], os.getcwd(), os.environ.get("OMP_NUM_THREADS"))
 
@@ -28,7 +28,7 @@ def refuse(number: int) -> None:
 
 
 def die_once(job: tuple[int, Path]) -> int:
-    """Return the number of the job, but kill the process at the first try of job 2, after leaving a mark."""
+    """Return the number of the job. On the first try of job 2, leave a mark and kill the process instead."""
     number, mark = job
     if number == 2 and not mark.exists():
         mark.touch()
@@ -37,7 +37,7 @@ def die_once(job: tuple[int, Path]) -> int:
 
 
 def die_at_first(job: tuple[int, int, Path]) -> int:
-    """Kill the process at the first ``deaths`` tries, leaving a mark each time; then return the number."""
+    """On each of the first ``deaths`` tries, leave a mark and kill the process. Then return the number."""
     number, deaths, marks = job
     for death in range(deaths):
         if not (mark := marks / f"{number}.{death}").exists():

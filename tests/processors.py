@@ -3,8 +3,9 @@
     python tests/processors.py [--all] [--after-native] [native] [avx2] [avx512]
 
 Without names, the tests run as each of the three. With --all, every test runs, not only the quick numerical
-ones. An older processor is skipped if this processor has no further instructions and the tests also run as
-"native". The option --after-native states that the native tests have just passed, so that they count as run.
+ones. An older processor is skipped if this processor has no instructions that the older one lacks, and the
+tests also run as "native". The option --after-native states that the native tests have just passed, so that
+they count as run.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ _QUICK = ["-m", "numerics and not slow and not long"]
 class Processor(NamedTuple):
     """Describe a processor that this one can imitate.
 
-    This processor needs the ``capability`` to imitate it, and the variables in ``environment`` make the
-    libraries do so. ``beyond`` lists capabilities that the imitated processor lacks. Any processor without
-    them gives the same numbers.
+    To imitate it, this processor needs the ``capability``. The variables in ``environment`` restrict the
+    libraries to the instructions of the imitated processor. ``beyond`` lists capabilities that the imitated
+    processor lacks. Any processor without these capabilities gives the same numbers as the imitated
+    processor.
     """
 
     capability: str
@@ -61,13 +63,15 @@ PROCESSORS = {
 
 
 def can_play(name: str) -> bool:
-    """Return whether this processor has all instructions of the named one and can imitate it."""
+    """Return whether this processor has all instructions of the named processor and can therefore imitate
+    it.
+    """
     capability = PROCESSORS[name].capability
     return not capability or bool(torch.cpu.get_capabilities().get(capability))
 
 
 def why_left_out(name: str, beside: Collection[str]) -> str:
-    """Return why the tests are not run as the named processor, or "" if they are."""
+    """Return the reason why the tests are not run as the named processor, or "" if they are run."""
     if not can_play(name):
         return "this processor lacks the instructions"
     known = torch.cpu.get_capabilities()

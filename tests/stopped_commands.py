@@ -303,7 +303,9 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
 
 
 def content(folder: Path) -> dict[str, Any]:
-    """Return all files that a command left, hidden ones too, without fields that differ between two runs."""
+    """Return the content of all files that a command left, including hidden files. Fields that differ between
+    two runs are left out.
+    """
     if (folder / "out" / "zarr.json").exists():
         assert not verify(folder / "out").findings
         found: dict[str, Any] = {"dataset": open_store(folder / "out").sha256}
@@ -328,7 +330,9 @@ def _steady(value: Any) -> Any:
 
 
 def chosen(count: int, most: int) -> list[int]:
-    """Return stops spread over all writes, and the last three writes, which put the results in place."""
+    """Return the numbers of writes at which to stop. They are spread over all writes. The last three writes,
+    which put the results in place, are always among them.
+    """
     spread = range(0, count, max(1, -(-count // most)))
     return sorted({*spread, *range(max(0, count - 3), count)})
 

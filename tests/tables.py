@@ -1,4 +1,6 @@
-"""Check that each row of a table is one object of the record, and each column the field that it names."""
+"""Check that each row of a table shows one object of the record, and that each column shows the field that it
+names.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,10 @@ def require_tables_equal_record(
     """Fail if a row of a CSV file in the folder does not match any object of the record.
 
     Args:
-        names: for each table, the field of each column whose name differs from that of its field;
-            "" for a column that is made from several fields.
+        names: for each table, the fields of columns that are not named like their field; "" for a column that
+            is made from several fields.
         pivoted: tables whose rows are not objects; other tests check them.
-        besides: how rows begin that describe the whole record; they are not checked.
+        besides: how those rows begin that describe the whole record. These rows are not checked.
     """
     objects = list(_objects(json.loads((folder / record).read_text(encoding="utf-8")), {}))
     fields = {name for one in objects for name in one}

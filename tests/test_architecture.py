@@ -49,7 +49,9 @@ def _sources(package: str, root: Path = ROOT) -> list[Path]:
 
 
 def _imports(file: Path) -> set[str]:
-    """Return the dotted names of everything that a file imports, also inside its functions."""
+    """Return the dotted names of everything that a file imports, including the imports inside its
+    functions.
+    """
     names: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -133,7 +135,7 @@ def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
 
 
 def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
-    """Return the imports from a room that comes later in the list than the importing room."""
+    """Return the imports of rooms (folders) that come later in the list than the importing room."""
     place = {room: number for number, room in enumerate(rooms)}
     pairs = [(name, other) for name, imported in graph.items() for other in imported]
     steps = [(name, other, name.split(".")[1], other.split(".")[1]) for name, other in pairs]
@@ -145,7 +147,7 @@ def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
 
 
 def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
-    """Return for each module of a package which modules of the same package it imports.
+    """Return, for each module of a package, the modules of the same package that it imports.
 
     The package's ``__init__.py`` is excluded: it names everything, but no module of the package imports it.
     """

@@ -68,7 +68,7 @@ def test_the_demo_runs_from_an_empty_home_to_its_answer_and_its_page(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     answer, last = done.stdout.strip().splitlines()[-2:]
     assert re.search(
-        r"the error went from [\d.]+ to [\d.]+ nm, .* has [\d.]+ dB when this printer prints it", answer
+        r"the error changed from [\d.]+ to [\d.]+ nm .* the corrected model reaches [\d.]+ dB", answer
     )
     page = Path(re.fullmatch(r"done in [\d.]+ min; open (.+)", last)[1])
     assert answer in page.read_text("utf-8")

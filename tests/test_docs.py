@@ -69,7 +69,9 @@ def test_a_broken_link_and_a_wrong_anchor_are_found(tmp_path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_an_empty_line_separates_a_list_from_the_text_before_it(page):
-    """Check for an empty line before each list, which the site's Markdown needs, unlike GitHub's."""
+    """Check that there is an empty line before each list. The site's Markdown needs it, but GitHub's does
+    not.
+    """
     text = _FENCED.sub("", page.read_text("utf-8"))
     assert re.findall(r"^(?![-*|#<]|\d+\. | |$).*\n(?:[-*]|\d+\.) .*$", text, re.MULTILINE) == []
     # This finds a second paragraph of a list item that is directly followed by the next item.
@@ -183,7 +185,7 @@ def figures(text: str) -> set[str]:
 
 
 def not_said_again(text: str, linked: str) -> set[str]:
-    """Return the numbers of a page's short answer that are found nowhere else, also not on linked pages."""
+    """Return the numbers of a page's short answer that occur nowhere else on the page or on linked pages."""
     short, _, rest = text.partition("**In short")[2].partition("\n\n")
     found = figures(f"{rest} {linked}")
     rounded = {f"{float(one):.{places}f}" for one in found for places in (1, 2)}

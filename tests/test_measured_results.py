@@ -38,7 +38,7 @@ def test_the_pages_say_where_the_locked_scans_take_part():
     assert paper.split.lock_box_opened
     page = (FOLDER / "README.md").read_text("utf-8")
     assert "These draws include the locked scans" in page
-    assert "4 locked scans are in no fold and in no number of this table" in texts(FOLDER)["benchmark"]
+    assert "4 locked scans belong to no fold and affect no number here" in texts(FOLDER)["benchmark"]
 
 
 def test_every_result_is_there():
@@ -56,8 +56,8 @@ def test_the_page_on_the_store_quotes_the_uncertainty_of_the_measured_heights():
     unclear = sum(float(scan["sigma_levelling_nm"]) == 0 for scan in scans)
     assert f"the median of `sigma_nm` is {middle('sigma_nm')} nm" in page
     assert (
-        f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}; {unclear} of the {len(scans)} scans show no "
-        f"clear surface). Pixels and lines ({middle('sigma_pixel_nm')}, {middle('sigma_line_nm')}), "
+        f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}). {unclear} of the {len(scans)} scans show "
+        f"no clear surface. Pixels ({middle('sigma_pixel_nm')}), lines ({middle('sigma_line_nm')}), "
         f"resampling ({middle('sigma_resampling_nm')}) and registration "
         f"({middle('sigma_registration_nm')})"
     ) in page

@@ -1,4 +1,6 @@
-"""Check the project's files and installations: litho_data without torch, the wheel in an empty folder."""
+"""Check the files and the installation of the project. litho_data must work without torch, and the wheel must
+work in an empty folder.
+"""
 
 from __future__ import annotations
 

@@ -44,8 +44,8 @@ def alarms(record: dict[str, Any]) -> list[str]:
     return [
         f"raised {min(false)} to {max(false)} false alarms",
         f"in {min(noticed['48']):.0f} to {max(noticed['48']):.0f} % of the sets with 48",
-        f"in {np.mean(noticed['24']):.0f} % with 24 and in {min(noticed['12']):.0f} to "
-        f"{max(noticed['12']):.0f} % with 12",
+        f"{np.mean(noticed['24']):.0f} % of those with 24, and {min(noticed['12']):.0f} to "
+        f"{max(noticed['12']):.0f} % of those with 12",
     ]
 
 

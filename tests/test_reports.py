@@ -1,4 +1,6 @@
-"""Check reports in a browser: no errors, nothing wider than a phone, all pictures and words visible."""
+"""Check reports in a browser. There are no errors, nothing is wider than a phone, and all pictures and words
+are visible.
+"""
 
 from __future__ import annotations
 

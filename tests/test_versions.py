@@ -41,7 +41,9 @@ def commands_in(command):
 
 @pytest.mark.parametrize("package", ["litho_data", "litho_models", "litho_design"])
 def test_every_option_is_described_in_one_style(package):
-    """Check that help texts start in lower case, without full stop or brackets, which rich would drop."""
+    """Check that help texts start in lower case, do not end with a full stop, and contain no brackets, which
+    rich would drop.
+    """
     for command in commands_in(get_command(importlib.import_module(f"{package}.cli.app").app)):
         for parameter in command.params:
             if parameter.name == "help" or getattr(parameter, "hidden", False):

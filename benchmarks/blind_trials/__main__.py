@@ -63,7 +63,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
             "store of measured prints",
             got="none",
             wanted="--measured STORE",
-            hint="give the store, or omit these trials by --only",
+            hint="give the store, or skip these trials with --only",
         )
     open_campaign(out, draws)
     options = ["--keep-data"] * arguments.keep_data
@@ -97,9 +97,14 @@ def _arguments() -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--out", type=Path, required=True, help="folder of the board's trials")
-    add("--board", choices=get_args(Board), default="singles", help="one cause per trial, or two to four")
-    add("--seed", type=int, help="seed of the draws (default: the announced seed of the board)")
-    add("--base", help="base of the loop (default: physics for singles, auto for mixtures)")
+    add(
+        "--board",
+        choices=get_args(Board),
+        default="singles",
+        help="one cause per trial (singles), or two to four",
+    )
+    add("--seed", type=int, help="seed of all random draws (default: the seed announced for the board)")
+    add("--base", help="base model of the loop (default: physics for singles, auto for mixtures)")
     add("--measured", type=Path, help="store of measured prints, into which causes are injected")
     add("--scans", type=int, default=12, help="scans per trial (default 12)")
     add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")

@@ -1,4 +1,7 @@
-"""Run all drawn trials as parallel processes. A campaign can resume, and a failed trial stops no other."""
+"""Run all drawn trials as parallel processes.
+
+An interrupted campaign can be resumed. A failed trial does not stop the other trials.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +57,8 @@ def run_campaign(
 ) -> None:
     """Run the unfinished trials among ``numbers``, and print a line when a trial ends.
 
-    A trial is recorded as failed if its process dies or runs longer than ``timeout_s``. The command of each
-    trial also gets the words ``options``, see `run_one`.
+    A trial is recorded as failed if its process dies or runs longer than ``timeout_s``. The words in
+    ``options`` are appended to the command of each trial, see `run_one`.
 
     Raises:
         InputError: a number was not drawn, or the workers are not available.

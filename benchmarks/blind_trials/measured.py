@@ -1,4 +1,4 @@
-"""Inject causes into measured prints: add the change that the causes make in prints of the virtual fab."""
+"""Inject causes into measured prints by adding the height changes that they make in the virtual fab."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def measured_jobs(store: Store) -> tuple[Job, ...]:
     """Return the layouts of a store as jobs for the fab.
 
     Raises:
-        InputError: the layouts differ from the fab's in pitch, level height or number of levels.
+        InputError: the pitch, level height or number of levels of the store is not that of the fab.
     """
     got = (store.pitch_um, store.level_height_um, store.levels)
     wanted = (Printer.pitch_um, Printer.level_height_um, Printer.levels)
@@ -35,7 +35,7 @@ def measured_jobs(store: Store) -> tuple[Job, ...]:
 
 
 def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
-    """Crop the fields to their centres. To save time, the sizes of effects are measured only there."""
+    """Crop the fields to their centres. To save time, only these parts are used to measure effect sizes."""
     corners = [[(side - size_px) // 2 for side in job.level.shape] for job in jobs]
     return [
         replace(job, level=job.level[max(y, 0) : size_px + max(y, 0), max(x, 0) : size_px + max(x, 0)])
@@ -44,7 +44,7 @@ def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
 
 
 def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
-    """Copy a store and add the planted effects to its heights, and change nothing else.
+    """Copy a store and add the planted effects to the heights of the copy. Everything else is unchanged.
 
     Raises:
         InputError: the store is a single file.

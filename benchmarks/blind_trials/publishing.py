@@ -1,4 +1,4 @@
-"""Publish a scoreboard in its page of the documentation."""
+"""Publish a scoreboard on its page of the documentation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from litho_models.boards.records import Scoreboard
 
 
 def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
-    """Replace the text between the marks of a board in the page by the results of the board.
+    """Write the results of a board into the page, between the two marks of this board.
 
     Raises:
         InputError: some trials have not been run, or the page lacks the marks.
@@ -23,7 +23,7 @@ def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
 
 
 def mark_of(scoreboard: Scoreboard) -> str:
-    """Return the name of the marks of a board in the page."""
+    """Return the name that appears in the two marks of a board on the page."""
     return f"board of {scoreboard.board} {scoreboard.seed}"
 
 

@@ -3,11 +3,11 @@
     python -m benchmarks.gap --out runs/gap --workers 2
     python -m benchmarks.gap --out runs/gap-small --small 128
 
-A fab with effects that no model knows prints fields, and six arms are trained on the scans. One hologram and
-two lenses are designed through each arm with equal budgets, and the fab prints the designs. Then the same
-hologram is designed through the models of measured prints that come with the package. The run needs hours;
-with ``--tasks``, only some tasks are run. A step is skipped if its result exists. An interrupted design
-resumes from its checkpoint.
+The fab has effects that no model knows. It prints fields, and six arms are trained on the scans of these
+prints. One hologram and two lenses are designed through each arm with equal budgets, and the fab prints the
+designs. Then the same hologram is designed through the models of measured prints that come with the package.
+The run takes hours; with ``--tasks``, only the tasks named there are run. A step is skipped if its result
+exists. An interrupted design resumes from its checkpoint.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
     parser.add_argument("--workers", type=int, default=1, help="parallel processes, one thread each")
     parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
-    parser.add_argument("--small", type=int, metavar="PX", help="use small elements, to try the benchmark")
+    parser.add_argument("--small", type=int, metavar="PX", help="try the benchmark with small elements")
     parser.add_argument(
         "--corrected", type=Path, help="model of a closed loop on the measured prints, as a further arm"
     )

@@ -71,7 +71,7 @@ def publish_results(out: Path) -> None:
 
 
 def _models(out: Path) -> dict[str, dict[str, float]]:
-    """Return the mean absolute errors of every trained model on the test prints, nm."""
+    """Return the mean absolute errors, nm, of every trained model on the test prints."""
     errors = {}
     for arm in ARMS:
         file = out / "test" / arm / "evaluation.json"
@@ -83,7 +83,7 @@ def _models(out: Path) -> dict[str, dict[str, float]]:
 
 
 def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
-    """Return the scores of a continuous phase on the grid of the designs, unprinted; None for a lens."""
+    """Return the scores of an unprinted continuous phase on the grid of the designs, or None for a lens."""
     design = Design.read(design_folder(folder, next(iter(gap.arms)), gap.seeds[0]))
     return (design.baselines or {}).get("continuous phase")
 

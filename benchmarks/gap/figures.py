@@ -1,4 +1,4 @@
-"""Draw the figures of the comparison: images and PSFs with spectra, in design and after printing."""
+"""Draw the figures of the comparison: images, PSFs and spectra, as designed and after printing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, pat
         axes[2, column].imshow(_middle(height.cpu().numpy()), cmap="viridis", vmin=0, vmax=1.2)
         axes[0, column].set_title(f"designed with {arm}", fontsize=9)
         axes[1, column].set_title(f"printed by {printer.name}", fontsize=9)
-        axes[2, column].set_title("its middle, 0 to 1.2 µm", fontsize=9)
+        axes[2, column].set_title("centre of the print, 0 to 1.2 µm", fontsize=9)
     for axis in axes.ravel():
         axis.set_xticks([])
         axis.set_yticks([])
@@ -66,7 +66,7 @@ def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path:
 def _judged(
     folder: Path, gap: GapResult, judge: tuple[str, str] | None
 ) -> dict[str, tuple[LoadedDesign, Printer]]:
-    """Return each arm's first design and its judge (without a judge, the last other arm)."""
+    """Return the first design and the judge of each arm. The default judge is the last of the other arms."""
     names = list(gap.arms)
     judged = {}
     for arm in names:

@@ -19,7 +19,7 @@ _BIN = Path(sys.executable).parent
 
 @dataclass(frozen=True)
 class Job:
-    """One command: its name in the log, its words, and the file or folder that it writes last."""
+    """One command: its name in the log, its command line, and the file or folder that it writes last."""
 
     name: str
     command: tuple[str, ...]
@@ -60,7 +60,7 @@ def design_command(*words: object) -> tuple[str, ...]:
 
 
 def _run(step: tuple[Job, Path]) -> float | None:
-    """Run one command and return its seconds; None if it failed."""
+    """Run one command; return the number of seconds that it took, or None if it failed."""
     (job, log), started = step, time.monotonic()
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as stream:

@@ -29,7 +29,10 @@ _FULL_HOE_PX, _FULL_LENS_PX = 1024, 1200
 
 
 class Effort(Record):
-    """How much is printed, trained and designed. All arms of a task have the same number of iterations."""
+    """The amount of printing, training and design work.
+
+    All arms of a task have the same number of iterations.
+    """
 
     hoe_px: int = _FULL_HOE_PX
     lens_px: int = _FULL_LENS_PX
@@ -47,17 +50,17 @@ class Effort(Record):
 
     @property
     def hoe_distance_um(self) -> float:
-        """Return the distance of the image, µm: 300 at full size."""
+        """Return the image distance in µm; it is 300 µm at full size."""
         return round(300 * self.hoe_px / _FULL_HOE_PX, 3)
 
     @property
     def lens_distance_um(self) -> float:
-        """Return the focal length, µm: 400 at full size."""
+        """Return the focal length in µm; it is 400 µm at full size."""
         return round(400 * self.lens_px / _FULL_LENS_PX, 3)
 
     @classmethod
     def small(cls, size_px: int) -> Effort:
-        """Return a small effort with elements of ``size_px``, for trying the benchmark."""
+        """Return a small effort for trying the benchmark, with elements that are ``size_px`` pixels wide."""
         return cls(
             hoe_px=size_px,
             lens_px=size_px,

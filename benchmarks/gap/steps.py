@@ -37,7 +37,7 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 
 
 def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
-    """Return the jobs that train, freeze and test every arm, in stages; the longest training is first."""
+    """Return the stages of jobs that train, freeze and test every arm. The longest training starts first."""
     arms = [arm for arm in reversed(ARMS) if arm != "none"]
     trained = {arm: trained_as(arm) for arm in arms}
     train = [

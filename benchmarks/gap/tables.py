@@ -77,7 +77,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     # continuous phase. The difference is given as rms error, which follows from the SI-PSNR.
     ceiling = task.get("ceiling") if independent else None
     heads += ["loss of Strehl ratio against a perfect lens"] if "strehl" in shown else []
-    above = "rms error of the image above that of a continuous phase, printed by"
+    above = "excess rms image error over a continuous phase, printed by"
     heads += [f"{above} {judge}" for judge in judges if ceiling]
     lines = [f"| designed with | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for arm in arms:
@@ -115,7 +115,7 @@ def figure_file(name: str) -> str:
 
 
 def figure_digits(figure: str) -> int:
-    """Return the decimals shown of a score: image errors are a few hundredths and differ by 1 % of that."""
+    """Return how many decimals of a score are shown. Image errors are a few hundredths and differ by 1 %."""
     if figure == "cbr":  # a ratio of hundreds and thousands
         return 0
     return 5 if figure.startswith("mae") else 3
@@ -131,7 +131,7 @@ def _cell(row: Mapping[str, Any], digits: int) -> str:
 def lead_text(
     paired: Sequence[Mapping[str, Any]], means: Mapping[str, float], figure: str, sign: int, judge: str
 ) -> str:
-    """Return a sentence with the best arm of a score and its lead over each other arm, paired by seed."""
+    """Return text that names the best arm for a score and its lead over each other arm, paired by seed."""
     digits = figure_digits(figure)
     best = max(means, key=lambda arm: sign * means[arm])
     against = []

@@ -15,7 +15,7 @@ ZOO_ARMS = ("none", "physics", "fno", "pbl")
 
 @dataclass(frozen=True)
 class Task:
-    """One comparison: the kind of its designs, their options, and the models and judges by name."""
+    """One comparison: the kind and the options of its designs, and its models and judges by name."""
 
     name: str
     kind: str
@@ -98,7 +98,7 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
     """Return the tasks with these names, separated by commas; all if None.
 
     Raises:
-        InputError: one of the names is not that of a task.
+        InputError: no task has one of the names.
     """
     if names is None:
         return list(every)

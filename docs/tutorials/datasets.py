@@ -76,5 +76,5 @@ print(
 )
 
 # %% [markdown]
-# `xarray.open_zarr` also opens `prints.zarr`, without this package. Next: [which model predicts these prints
+# `xarray.open_zarr` opens `prints.zarr` without this package. Next: [which model predicts these prints
 # best](models.md), [how levelling works](../levelling.md), [what is in the file](../dataset_store.md).

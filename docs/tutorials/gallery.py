@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Twelve pictures, ten lines each
 #
-# The code above each picture draws it. Run all the code once, from top to bottom. The first cell defines a
-# function that shows maps (all about 16 µm wide), and simulates four prints. For real prints, see [your own
+# The code above each picture draws it. Run all the code once, from top to bottom. The first cell simulates
+# four prints and defines a function that shows maps, all about 16 µm wide. For real prints, see [your own
 # scans](../own_data.md).
 
 # %%

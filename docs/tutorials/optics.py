@@ -49,7 +49,7 @@ figure
 # %% [markdown]
 # Both images are predictions. What counts is a measurement: `litho_design.score` accepts a photograph of the
 # image or an AFM scan of the print in place of the model. To print the element, export the layout as an image
-# of levels. Its sidecar states heights and size, so that the file can be read back.
+# of levels. A sidecar states heights and size, so that the image can be read back.
 
 # %%
 print(litho_design.export("with", "png16", "to-printer").name)

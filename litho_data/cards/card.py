@@ -43,7 +43,7 @@ def check_card(content: dict[str, Any], what: str) -> Card:
 
 
 def with_tip(card: Card, tip: float | str) -> Card:
-    """Return the card with another ``process.tip``.
+    """Return a copy of the card with this ``process.tip``.
 
     Raises:
         InputError: the tip is neither a positive number nor ``blind``, or the card is of micrographs, which
@@ -118,10 +118,10 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 class LayoutFiles(Record):
     """The layout files.
 
-    ``grey_per_level`` is the grey-value step from level to level in layouts saved as pictures, such as 255 /
-    (levels - 1) if white is the highest level. If ``average_px`` is set, the files are black-and-white
-    pictures. Each square with this many pixels on a side becomes one pixel of the layout, whose level is the
-    number of white pixels in the square.
+    If the layouts are saved as pictures, ``grey_per_level`` is the difference in grey value between
+    neighbouring levels, such as 255 / (levels - 1) if white is the highest level. If ``average_px`` is set,
+    the files are black-and-white pictures. Each square with this many pixels on a side becomes one pixel of
+    the layout, whose level is the number of white pixels in the square.
     """
 
     files: FilePatterns
@@ -142,11 +142,11 @@ class LayoutFiles(Record):
 
 
 class ScanFiles(Record):
-    """The scan files. ``size_um`` is (y, x), for formats that do not state the size.
+    """The scan files. ``size_um`` is the size (y, x), for formats that do not state it.
 
-    ``instrument``: the kind of microscope. A ``confocal`` microscope has no tip. The files of ``sem``, a
-    scanning electron microscope, are pictures of a film of the layout's full height; the build measures the
-    edges of the film.
+    ``instrument``: the kind of microscope. A ``confocal`` microscope has no tip. The files of a scanning
+    electron microscope (``sem``) are pictures of a film that has the layout's full height; the build measures
+    the edges of this film.
 
     ``levelled`` says that the build uses the heights in the files without levelling them. ``missing``
     contains numbers and words that mark pixels without a measurement; an empty list says that there are no
@@ -170,12 +170,12 @@ class ScanFiles(Record):
             raise ValueError("wanted either unit or full_scale_file (in metres), not both")
         given = (self.unit, self.full_scale_file, self.channel, self.missing)
         if self.instrument == "sem" and (self.size_um is None or any(one is not None for one in given)):
-            raise ValueError("wanted size_um and no settings of heights, because a micrograph has no heights")
+            raise ValueError("wanted size_um and no height settings, because a micrograph has no heights")
         return self
 
 
 class Process(Record):
-    """How raw scans are processed: a levelling recipe file, a registration model, a tip.
+    """How raw scans are processed: the file of a levelling recipe, the registration model and the tip.
 
     Without ``level``, the layout-aware plane is subtracted from scans that are not level yet. ``tip`` is the
     radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
@@ -207,7 +207,7 @@ class Standard(Record):
 
 
 class Grating(Standard):
-    """A grating along one axis; a square grating serves both axes."""
+    """A grating that gives the scale of one axis; a square grating can be used for both axes."""
 
     period_um: Length
 
@@ -234,7 +234,7 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """Facts about the writing of a field; missing facts are assumed, and labelled as assumptions.
+    """How a field was written; missing facts are assumed, and labelled as assumptions.
 
     ``surround`` says what lies around a printed field: the bare substrate or more of the print.
     """
@@ -245,7 +245,7 @@ class Write(Record):
 
 
 class KnownGrating(Record):
-    """The certified period, along both axes, of the grating in scans whose use is ``grating``."""
+    """The certified period of the grating in scans whose use is ``grating``; it holds for both axes."""
 
     period_um: Length
     uncertainty_um: Uncertainty = 0.0

@@ -1,4 +1,4 @@
-"""Fetch a known dataset: each file is downloaded once, and used only if its SHA-256 is the registered one."""
+"""Fetch a known dataset. Each file is downloaded once, and is used only if it has the registered SHA-256."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def cache_folder(name: str) -> Path:
 
 
 def find_card(dataset: str | Path) -> Path:
-    """Return the path of a card, from a path to a ``.toml`` file or the name of one of the project's cards.
+    """Return the path of a card, given this path (a ``.toml`` file) or the name of a card of the project.
 
     Raises:
-        InputError: no card of that name.
+        InputError: the project has no card with this name.
     """
     if Path(dataset).suffix == ".toml":
         return Path(dataset)

@@ -30,9 +30,9 @@ class PrintedField:
     """One field to build: its files and what the card says about it.
 
     ``columns`` contains the optional numbers (µm, dose) and words of the table. ``read`` contains the reading
-    options that the table gives instead of the card. ``full_scale_um`` is the height of the largest integer
-    value of a scan that is an image. ``layout`` may be None only for a reference scan (whose ``use`` is not
-    dataset).
+    options in the table, which replace those of the card. If the scan is an image, ``full_scale_um`` is the
+    height that its largest integer value stands for. ``layout`` may be None only for a reference scan (whose
+    ``use`` is not dataset).
     """
 
     id: str
@@ -50,7 +50,7 @@ class PrintedField:
 class Listing:
     """A card with the folder of its files, the fields to build, and the files of every id.
 
-    ``unpaired`` (ids with only one file) and ``refused`` map each id that is not a field to the reason.
+    Each id that is not a field is in ``unpaired`` (it has only one file) or in ``refused``, with the reason.
     """
 
     card: Card
@@ -72,12 +72,12 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 
     Args:
         card_path: the card.
-        data_dir: folder where the card's file patterns start; by default the first that has files among the
-            card's own folder, ``$LITHO_DATA_DIR/<name>`` and the user cache.
+        data_dir: folder where the card's file patterns start. By default, it is the first folder that has
+            files: the card's own folder, ``$LITHO_DATA_DIR/<name>``, or the user cache.
 
     Raises:
-        InputError: the card or its table is bad, no folder has the files, or no id has both a layout and a
-            scan.
+        InputError: the card or its table is invalid, no folder has the files, or no id has both a layout and
+            a scan.
     """
     file = Path(card_path)
     card = load_card(file)
@@ -129,9 +129,9 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         )
     if card.grating is None and (unknown := [one.id for one in fields if one.use == "grating"]):
         raise InputError(
-            f"card {file}: period of the grating of {unknown[0]}",
+            f"card {file}: period of the grating in scan {unknown[0]}",
             got="no [grating]",
-            wanted="period_um in that table, from the certificate of the grating",
+            wanted="a table [grating] with period_um, from the certificate of the grating",
         )
     if not any(one.use == "dataset" for one in fields):
         shown = "; ".join(f"{key}: {why}" for key, why in [*{**unpaired, **refused}.items()][:3]) or "no ids"
@@ -156,12 +156,12 @@ def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Pa
 
 
 def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the patterns of a card's entry, which may be one or several."""
+    """Return the patterns in a card's entry, which may contain one or several."""
     return (files,) if isinstance(files, str) else tuple(files)
 
 
 def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
-    """Find the files of each id, by one pattern or several; ``*`` stands for any part of a name."""
+    """Find the files of each id with one pattern or several; ``*`` stands for any part of a name."""
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):
         before, *rest = (
@@ -189,8 +189,8 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
 
 
 def leads_out(files: tuple[Path, ...], folder: Path) -> str:
-    """Return a message if a file is a link that leads out of the data folder, otherwise an empty text. The
-    card describes only this folder.
+    """Return a message if a file is a link that leads out of the data folder, otherwise an empty text. Such a
+    link is refused because the card describes only this folder.
     """
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
@@ -208,7 +208,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
-    """Return the facts that the card does not state and that are assumed for the effects that need them."""
+    """Return the assumptions that replace facts that some effects need but the card does not state."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")

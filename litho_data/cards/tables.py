@@ -24,7 +24,7 @@ _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, Any]]:
-    """Read a card's CSV table; return, by id, the checked values of the cells that are not empty.
+    """Read and check a card's CSV table; return the values of all cells that are not empty, keyed by id.
 
     The reader accepts what spreadsheets write in any language: cells separated by commas, semicolons or tabs,
     text that may be UTF-16, and decimal commas if cells are not separated by commas.
@@ -61,7 +61,7 @@ def read_table(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _value(name: str, text: str) -> Any:
-    """Return the value of a cell of this column.
+    """Return the value of a cell in the column ``name``.
 
     Raises:
         InputError: the text is of the wrong kind.
@@ -100,7 +100,7 @@ def _value(name: str, text: str) -> Any:
 
 
 def read_full_scales(path: Path) -> dict[str, float]:
-    """Read the height of the largest grey value per file name or id from a JSON object; convert metres to µm.
+    """Return the heights of the largest grey value in µm, by file name or id; the JSON file states them in m.
 
     Raises:
         InputError: the file does not exist or is not a JSON object, or a value is not a positive number.

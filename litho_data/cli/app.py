@@ -24,7 +24,7 @@ app.command()(tip)
 StorePath = Annotated[Path, argument("dataset store, a .zarr folder or .zarr.zip file")]
 DataDir = Annotated[
     Path | None,
-    option("folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"),
+    option("folder of the raw files; by default the card's folder, $LITHO_DATA_DIR/<name> or the user cache"),
 ]
 Strict = Annotated[
     bool, option("do not build if a scan is skipped, or if a scan or layout has no partner", "--strict")
@@ -72,8 +72,8 @@ def build(
         str | None,
         typer.Option(
             metavar="UM|blind",
-            help="radius of the tip, or blind to estimate the tip; pixels that the tip may not have "
-            "touched become invalid",
+            help="radius of the tip, or blind to estimate it from the scans; pixels that the tip may not "
+            "have touched become invalid",
         ),
     ] = None,
 ) -> None:
@@ -109,7 +109,9 @@ def build(
     for key, reason in [*result.unpaired.items()][:1]:
         typer.echo(f"{key}: {reason}", err=True)
     if result.skipped:
-        typer.echo(f"skipped: {', '.join(result.skipped)}; --strict refuses to build without them", err=True)
+        typer.echo(
+            f"skipped: {', '.join(result.skipped)}; --strict builds nothing if a scan is skipped", err=True
+        )
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
 
@@ -156,7 +158,7 @@ def history(
     store: StorePath,
     scan: Annotated[str | None, argument("id of a scan; without it, one line per scan")] = None,
 ) -> None:
-    """Print where the arrays of a scan come from: files, operations, parameters, hashes.
+    """Print how the arrays of a scan were made: the files, operations, parameters and hashes.
 
     Example: litho-data history prints.zarr P11
     """
@@ -172,7 +174,7 @@ def replay(
     array: Annotated[list[str] | None, option("name of an array, e.g. height_um; repeatable")] = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Compute arrays again from the raw files and report the largest difference from the store.
+    """Recompute arrays from the raw files and report the largest difference from those in the store.
 
     Example: litho-data replay prints.zarr P11 --array height_um
     """
@@ -187,7 +189,8 @@ def replay(
 def export(
     store: StorePath,
     format: Annotated[
-        Format, option("single file, 8-bit pairs in the authors' format, or self-describing release")
+        Format,
+        option("zip: one file; pairs: 8-bit files in the authors' format; ro-crate: a folder with metadata"),
     ],
     out: Annotated[Path | None, option("file (zip) or folder to write; by default beside the store")] = None,
 ) -> None:
@@ -220,7 +223,7 @@ def import_pairs(
     pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,
     levels: Annotated[int, option("number of levels of the layouts")] = 13,
-    name: Annotated[str | None, option("name of the dataset; by default the folder's")] = None,
+    name: Annotated[str | None, option("name of the dataset; by default the name of the folder")] = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     strict: Strict = False,

@@ -83,7 +83,7 @@ def simulate(
         option("folder to write (raw/ and truth/); an older run with the same settings is replaced"),
     ],
     preset: Annotated[
-        str, option("plain, demo, measured-like or second-printer; for films, e-beam or projection")
+        str, option("plain, demo, measured-like or second-printer; e-beam or projection for films")
     ] = "plain",
     layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
     plan: Annotated[
@@ -96,8 +96,10 @@ def simulate(
             "folder (raw/ and truth/) of an earlier run whose machine prints the plan; needs a new --seed"
         ),
     ] = None,
-    count: Annotated[int | None, option("number of scans; by default the preset's", min=1)] = None,
-    size_px: Annotated[int | None, option("side of a layout; by default the preset's", min=32)] = None,
+    count: Annotated[int | None, option("number of scans; by default that of the preset", min=1)] = None,
+    size_px: Annotated[
+        int | None, option("side of a layout, pixels; by default that of the preset", min=32)
+    ] = None,
     seed: Annotated[int, option("seed of every random draw", min=0)] = 0,
     knob: Annotated[
         list[str] | None,
@@ -106,7 +108,7 @@ def simulate(
     noise: Annotated[str, option("default or off")] = "default",
     microscope: Annotated[str, option("default (scans slightly warped) or aligned (no warp)")] = "default",
     write_field_um: Annotated[
-        float | None, option("side of the write field that the fields of a print share, µm")
+        float | None, option("side of a write field that all fields of a print share, µm")
     ] = None,
     stitch_field_um: Annotated[
         float | None, option("side of the fields that the effect stitching displaces, µm")
@@ -143,7 +145,7 @@ def simulate(
     shaped = any(value is not None for value in (count, size_px, write_field_um))
     if plan is not None and fab is not None:
         if layouts is not None or knob or shaped:
-            wanted = "only --out and --seed, because the plan and the fab set all others"
+            wanted = "only --out and --seed, because the plan and the fab set all other options"
             raise InputError("options given with --plan", wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")

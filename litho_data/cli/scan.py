@@ -89,8 +89,8 @@ def inspect(
 ) -> None:
     """List the channels of a file with their sizes, units and pitches, and print the range of the heights.
 
-    A picture needs one height channel: choose it with --channel if there are several, and give --unit (or
-    --full-scale-um) if the file states no unit.
+    A picture shows one height channel. If there are several, choose one with --channel. If the file states no
+    unit, give --unit or --full-scale-um.
 
     Example: litho-data inspect P11.gwy --picture P11.png
     """

@@ -14,7 +14,9 @@ _COLOURS = "viridis"
 
 
 def write_picture(scan: Scan, path: str | Path) -> Path:
-    """Write a PNG of the heights in nm, row 0 on top, with axes in µm, or in px if the pitch is unknown."""
+    """Write a PNG of the heights in nm, with row 0 at the top. The axes are in µm, or in px if the pitch is
+    unknown.
+    """
     ny, nx = scan.shape
     unit, pitch = ("µm", scan.pitch_um) if scan.pitch_um is not None else ("px", (1.0, 1.0))
     figure = new_figure(6.4, 5.2)

@@ -41,7 +41,7 @@ def tip(
     if maps is None:
         return
     if found.radius_um is None:
-        raise InputError("maps of the tip", got=found.reason, wanted="scans that limit the radius of the tip")
+        raise InputError("maps of the tip", got=found.reason, wanted="scans that give an estimate or a bound")
     import numpy as np
 
     from litho_data.foundation.files import atomic_file
@@ -81,6 +81,7 @@ def _text(found: TipEstimate) -> str:
     for scan in found.scans:
         limit = f"details below {scan.resolution_um:.3g} µm" if scan.resolution_um else "no details"
         lines.append(
-            f"{scan.name}: {scan.certain_fraction:.1%} certainly touched; {limit} may come from the tip"
+            f"{scan.name}: {scan.certain_fraction:.1%} of the pixels were certainly touched; {limit} may "
+            "come from the tip"
         )
     return "\n".join(lines)

@@ -22,8 +22,8 @@ UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """Make an option of a command. Give names only if they differ from the default; ``more`` is passed to
-    typer.
+    """Make an option of a command. ``names`` are needed only if they differ from the default; ``more`` is
+    passed to typer.
     """
     return typer.Option(*names, help=help, **more)
 
@@ -41,7 +41,7 @@ WorkersOption = Annotated[
 DaskOption = Annotated[
     str | None,
     option(
-        "address of a Dask scheduler, such as tcp://host:8786; its workers replace --workers",
+        "address of a Dask scheduler, such as tcp://host:8786; its workers are used instead of local ones",
         "--dask",
     ),
 ]
@@ -76,7 +76,7 @@ HelpAll = Annotated[
 
 
 def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
-    """Give a function that takes ``**values`` the signature that typer should see."""
+    """Replace the signature of a function that takes ``**values`` by the one that typer should see."""
     # Typer reads the signature and the annotations.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -94,7 +94,7 @@ def takes_more(
     more: Sequence[inspect.Parameter],
     without: str = "",
 ) -> Callable[..., None]:
-    """Give ``run``, which wraps a command, the command's parameters except ``without``, plus ``more``."""
+    """Set the parameters of the wrapper ``run``: those of ``command`` except ``without``, then ``more``."""
     own = inspect.signature(command, eval_str=True).parameters.values()
     kept = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own if one.name != without]
     return takes(run, [*kept, *more])
@@ -183,7 +183,7 @@ def run_app(app: typer.Typer, name: str) -> None:
 
 
 def _not_allowed(error: Exception) -> InputError | None:
-    """Return the error to print if the system or the input is to blame; return None for a defect of this
+    """Return the error to print if the system or the input caused it; return None for a defect of this
     project.
     """
     # PyTorch and safetensors raise their own errors for a full disk.
@@ -208,7 +208,7 @@ def _not_allowed(error: Exception) -> InputError | None:
 
 
 def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
-    """Return, in this project's words, Typer's complaint about a command line that it cannot parse.
+    """Return one line that says, in this project's words, why Typer cannot parse a command line.
 
     Args:
         error: a ``UsageError``.

@@ -20,7 +20,7 @@ _silent = threading.Event()
 
 
 def run_script(main: Callable[[], T]) -> T:
-    """Run the main function of a script; the results that it makes record its command line."""
+    """Run the main function of a script, so that its results record the script's command line."""
     with running_command(command_line()):
         return main()
 
@@ -31,7 +31,7 @@ def given_words() -> list[str]:
 
 
 def command_line(program: str | None = None) -> str:
-    """Return the command that started this process; ``program`` is by default the script or module."""
+    """Return the command that started this process; by default, ``program`` is the script or module."""
     if program is None:
         module = sys.modules["__main__"].__spec__
         started = (
@@ -52,15 +52,15 @@ def progress(
 ) -> Iterator[T]:
     """Iterate with a progress bar on stderr, or without one if stderr is not a terminal.
 
-    If the remaining items will take more than a minute, one line states how long, as soon as this can be
-    estimated. The first items include start-up, so they do not count towards the estimate unless they take a
-    minute themselves.
+    If the remaining items will take more than a minute, one line states the remaining time as soon as it can
+    be estimated. The time of the first items includes start-up, so it does not count towards the estimate
+    unless it exceeds a minute.
 
     Args:
-        items: what is iterated over; ``what``: what is done with them.
+        items: the items to iterate over; ``what``: a text that says what is done with them.
         total: number of items, if ``len`` does not give it.
-        estimate_of: number of items that the estimate covers, by default all; 0 for no estimate.
-        at_once: number of items that are worked on at a time.
+        estimate_of: number of items that the estimate covers; by default all. 0 means no estimate.
+        at_once: number of items that are processed at the same time.
     """
     from rich.console import Console
     from rich.progress import track

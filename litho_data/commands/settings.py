@@ -1,4 +1,4 @@
-"""State each setting once: a field of a record contains its default, limits, unit, help and option.
+"""Define each setting in one place: a field of a record, with default, limits, unit, help and option.
 
 The command lines make their options from these fields, and every field can be changed by its dotted path.
 """
@@ -27,7 +27,7 @@ def setting(
     """Make a field of a settings record.
 
     Args:
-        default: its value if none is given; ``...`` makes the setting required.
+        default: value of the setting if none is given; ``...`` makes the setting required.
         help: what the setting is, in a few words without a full stop.
         unit: unit of the value, such as µm.
         option: name or names on the command line, such as ``--pitch-um``; none for settings that can be
@@ -89,15 +89,15 @@ def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> 
 
 
 def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dict[str, Any]:
-    """Return the values of nested or dotted keys, each under its dotted path.
+    """Flatten nested or dotted keys; return the values by dotted path.
 
     Args:
-        settings: a record; every key must be one of its names.
-        content: as read from a file, or ``{"layout.pitch_um": 0.2}``.
-        what: what messages call a setting.
+        settings: a record, which must have a field for every key.
+        content: nested keys, as read from a file, or dotted ones, as in ``{"layout.pitch_um": 0.2}``.
+        what: the word for a setting in messages.
 
     Raises:
-        InputError: the record has no such name; the message lists the names that it has.
+        InputError: the record has no field for a key; the message lists the fields that it has.
     """
     flat: dict[str, Any] = {}
     for key, value in content.items():
@@ -136,10 +136,10 @@ def _names(part: BaseModel, above: str) -> list[str]:
 
 
 def changed(settings: M, changes: Facts) -> M:
-    """Return ``settings`` with some values changed by dotted path, checked as a whole.
+    """Return a copy of ``settings`` with values changed by dotted path; the whole copy is validated.
 
     Raises:
-        InputError: an unknown name, or a value that the record does not accept.
+        InputError: a name is unknown, or the record does not accept a value.
     """
     content = settings.model_dump()
     for path, value in flattened(settings, changes).items():
@@ -168,8 +168,8 @@ def refused(error: ValidationError) -> InputError:
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
-    """Return the values of words of the form ``path=value`` by dotted path. A value that is not JSON is a
-    string.
+    """Parse words of the form ``path=value``; return the values by dotted path. A value that is not JSON is
+    taken as a string.
 
     Raises:
         InputError: a word has no ``=``, or a path is repeated.

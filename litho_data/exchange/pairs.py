@@ -1,7 +1,7 @@
-"""Import and export the authors' pair format, whose limits ``litho_data.readers.pairs`` states.
+"""Import and export the authors' pair format; ``litho_data.readers.pairs`` describes its limits.
 
-``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` heights, and ``src_max_dict.txt`` the full scales in
-metres. The quadrant q is 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
+``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` contains heights, and ``src_max_dict.txt`` contains
+the full scales in metres. The quadrant q is 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
 """
 
 import json
@@ -48,13 +48,14 @@ def import_pairs(
 ) -> BuildResult:
     """Build a store from a folder in the pair format; the four quadrants of a name become one field.
 
-    A height is value / 255 · full scale. In the authors' own files, heights are truncated to the grey value
-    below, so on average they are too low by half a grey value (about 2 nm).
+    A height is value / 255 · full scale. In the authors' own files, heights were rounded down to a grey
+    value, so they are too low by half a grey value (about 2 nm) on average.
 
     Args:
         folder: folder with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
         out: path of the store.
-        pitch_um, level_height_um, levels: the files do not state them; by default, they are the paper's.
+        pitch_um, level_height_um, levels: values that the files do not state; the defaults are those of the
+            paper.
         name: name of the dataset; by default that of the folder.
         workers, dask: as for ``build_dataset``.
         strict: whether to refuse the build if a field must be skipped.
@@ -69,7 +70,7 @@ def import_pairs(
         raise InputError(
             f"complete pairs in {folder}",
             got="none",
-            wanted=f"files of one name in mask/ and afm/, with this name in {SCALES_FILE}",
+            wanted=f"files with the same name in mask/ and afm/, and this name in {SCALES_FILE}",
         )
     card = _card(
         name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
@@ -95,9 +96,9 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """The job of stitching one field; ``quadrants`` maps each quadrant to the name of its files.
+    """The job that stitches one field; ``quadrants`` maps each quadrant to the name of its files.
 
-    A field in one piece has the quadrant 0.
+    A field that is not divided has only the quadrant 0.
     """
 
     id: str
@@ -180,7 +181,7 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; return a note for each scan whose negative heights or gaps are lost.
+    """Write a store in the pair format; return a note on each scan that loses negative heights or gaps.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 

@@ -21,7 +21,7 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
     """Pack a store into one ``.zarr.zip`` file, which ``open_store`` and zarr can read directly.
 
     Raises:
-        InputError: there is no store, it is packed already, or ``out`` is not a zip file.
+        InputError: the store does not exist or is packed already, or ``out`` is not a zip file.
     """
     store = open_store(store_path)
     folder = Path(store_path)
@@ -44,7 +44,7 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
     and the citation. ``croissant.json`` describes the files and the columns of the table.
 
     Raises:
-        InputError: there is no store, it is packed or has no manifest, or the folder contains files of
+        InputError: the store does not exist, is packed or has no manifest, or the folder contains files of
             another kind.
     """
     store = open_store(store_path)
@@ -71,7 +71,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def _root(store: Store) -> dict[str, Any]:
-    """Return the crate's entry for the dataset."""
+    """Return the entry for the dataset in the RO-Crate."""
     manifest = store.manifest
     card = manifest["card"]
     root: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""How every command that writes a folder declares, begins, continues and finishes its result.
+"""Rules for commands that write a folder: how they declare, begin, continue and finish the result.
 
 A command first declares its result: the name of its record file, which is written last, and the fields of
 this record that determine the result. The folder is then in one of four states:
@@ -55,13 +55,14 @@ def growing_folder(
     Args:
         out: the folder; it is created if it is missing.
         record: name of the record file of a finished result, such as ``run.json``. The block writes it last.
-        facts: fields of the record that determine the result; a folder with other values is refused.
-        holds: names of files that the folder may contain before the result is begun, such as designs made one
-            by one.
+        facts: fields of the record that determine the result; a folder whose record has other values is
+            refused.
+        holds: names of files that the folder may contain before the result is begun, such as designs that
+            were made one by one.
 
     Raises:
-        InputError: ``out`` is a file, contains something else or a result with other facts, is being written
-            by another process, or cannot be written. It is raised before the block begins.
+        InputError: ``out`` is a file, contains something else, contains a result with other facts, is being
+            written by another process, or cannot be written. It is raised before the block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)
@@ -110,7 +111,7 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
-    """Return whether the folder contains the same result, begun but not finished."""
+    """Return whether the same result was begun in this folder but not finished."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # If a process was stopped before it wrote the content of ``begun.json``, the folder counts as empty.

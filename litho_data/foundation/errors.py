@@ -30,7 +30,7 @@ class InputError(ValueError):
 
 @contextmanager
 def about(what: str) -> Iterator[None]:
-    """Put ``what`` at the beginning of the messages of InputErrors in the block."""
+    """Add ``what`` at the beginning of the message of any InputError that the block raises."""
     try:
         yield
     except InputError as error:
@@ -39,11 +39,11 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Guard a block that reads a file that a program wrote but that somebody may have edited since.
+    """Guard a block that reads a file written by a program, because somebody may have edited the file.
 
     Raises:
-        InputError: replaces any error about the content, such as a missing key, text instead of a number, or
-            invalid JSON.
+        InputError: it replaces any error that the content causes, such as a missing key, text instead of a
+            number, or invalid JSON.
     """
     try:
         yield
@@ -54,7 +54,7 @@ def damaged(what: str) -> Iterator[None]:
 
 
 def said(error: Exception) -> str:
-    """Say in plain words, instead of Python's, why something could not be read."""
+    """Return the reason for an error in plain words instead of Python's."""
     if isinstance(error, UnicodeDecodeError):
         return "bytes that are not text"
     if isinstance(error, OSError) and error.strerror:
@@ -79,9 +79,9 @@ def unknown_name(
 
     Args:
         what: what the name stands for.
-        got: the name; ``known``: the known names.
+        got: the unknown name; ``known``: all known names.
         hint: what to suggest if no known name is similar.
-        also: what could have been given instead of a name, such as "an image file".
+        also: what else could have been given instead of a name, such as "an image file".
     """
     names = list(known)
     near = difflib.get_close_matches(str(got), names)

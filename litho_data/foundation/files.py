@@ -45,7 +45,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
-    """Yield an empty folder; it replaces ``path`` only on success, and an older folder stays until then.
+    """Yield an empty folder that replaces ``path`` if the block succeeds; an older folder stays until then.
 
     For a path that a user chose, use ``litho_data.foundation.begun.whole_folder`` instead.
 
@@ -163,7 +163,7 @@ def _lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 def _remove_unless_held(left: Path) -> None:
-    """Remove a partial file that a stopped process left; a file that is still being written is locked."""
+    """Remove a partial file that a stopped process left, unless it is locked because it is being written."""
     with contextlib.suppress(FileNotFoundError), open(left) as stream:
         if _lock(stream):
             left.unlink()
@@ -173,7 +173,7 @@ def read_text(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
-        OSError: the file cannot be read, or is a pipe, which would keep its reader waiting.
+        OSError: the file cannot be read, or is a pipe, from which reading could block forever.
         UnicodeDecodeError: the bytes are not UTF-8.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):

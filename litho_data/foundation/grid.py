@@ -16,13 +16,13 @@ class PixelGrid:
     """A rectangular grid of square or rectangular pixels, with row 0 at the top.
 
     Args:
-        shape: (ny, nx) in pixels.
-        pitch_um: (along y, along x) distance between pixel centres, µm.
-        origin_um: (y, x) of the top-left *corner* of pixel (0, 0), µm; a pixel centre therefore
-            lies at ``origin + (i + 0.5) * pitch``.
+        shape: numbers of pixels, (ny, nx).
+        pitch_um: distances between pixel centres along y and along x, µm.
+        origin_um: position (y, x) of the top-left *corner* of pixel (0, 0), µm; a pixel centre therefore lies
+            at ``origin + (i + 0.5) * pitch``.
 
     Raises:
-        InputError: a size below one pixel, or an impossible pitch.
+        InputError: the grid is smaller than one pixel, or the pitch is impossible.
     """
 
     shape: tuple[int, int]

@@ -28,7 +28,7 @@ def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
 
     Args:
         array: any numeric or boolean array; every NaN counts as the same NaN.
-        unit: unit of the values as stored, "1" if there is none.
+        unit: unit of the stored values; "1" if they have none.
         dims: one name per axis.
 
     Returns:

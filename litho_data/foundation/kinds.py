@@ -9,6 +9,6 @@ Array = np.ndarray
 Shape = tuple[int, ...]
 """(ny, nx), pixels."""
 YX = tuple[float, float]
-"""(along y, along x): a pitch, a size or a position."""
+"""A pitch, a size or a position: the values along y and along x."""
 Facts = Mapping[str, Any]
-"""Plain data by name, such as parameters, attributes or a record."""
+"""Plain data, keyed by name, such as parameters, attributes or a record."""

@@ -1,8 +1,8 @@
 """Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
-A missing or empty folder is accepted. If the folder contains an earlier run of the same command on the same
-subject (dataset, model, design) with the same settings, the run resumes or its result is made again. Anything
-else is refused, and nothing is changed.
+A missing or empty folder is accepted. So is the folder of an earlier run of the same command on the same
+subject (dataset, model, design) with the same settings; this run is resumed or repeated. Anything else is
+refused, and nothing is changed.
 """
 
 import json
@@ -45,7 +45,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose record, finished or begun, has facts that differ from these."""
+    """Refuse a folder whose record (of a finished or a begun result) has other facts than these."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
@@ -57,8 +57,8 @@ def require_same(folder: Path, held: Any, facts: Facts) -> None:
 
 
 def first_difference(then: Facts, now: Facts, path: str = "") -> str:
-    """Name the first setting of ``now`` that ``then`` lacks or has with another value; return "" if there is
-    none.
+    """Return the first setting of ``now`` that is missing in ``then`` or has another value there; return ""
+    if there is none.
     """
     for name, after in now.items():
         if isinstance(after, dict):
@@ -74,8 +74,8 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     """Accept a free path, an empty folder, or a folder with the same kind of result, whose record file is
     ``record``.
 
-    A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
-    with schema ``litho-models/close-loop/1``.
+    A file counts as the record of a result if its name matches the kind of its schema: ``close_loop.json``
+    matches the schema ``litho-models/close-loop/1``.
 
     Args:
         path: where the result will be; other files in a folder that holds this result are left alone.
@@ -83,7 +83,7 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
         begun: names, or patterns of names, of files that an interrupted run of the same kind leaves.
 
     Raises:
-        InputError: the path is a file, or a folder that contains another result or anything else.
+        InputError: the path is a file, or the folder contains another result or anything else.
     """
     folder = Path(path)
     _refuse_a_file(folder)

@@ -18,8 +18,8 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """A frozen part of a result. Unknown keys are errors, except those in ``FORMER``, which older files
-    contain.
+    """A frozen part of a result. Unknown keys are errors, except for the keys in ``FORMER``, which occur only
+    in older files.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()
@@ -60,9 +60,7 @@ class Result(Record):
         return pd.DataFrame(self._facts()).to_html(index=False, header=False)
 
     def _facts(self) -> list[tuple[str, str]]:
-        """Return the facts that fit on a line: short values, names of parts, and the lengths of longer
-        values.
-        """
+        """Return the facts for a one-line summary: short values, names of parts, sizes of collections."""
         facts = []
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -107,7 +105,7 @@ class Result(Record):
 
 
 def first_error(error: ValidationError) -> str:
-    """Return the first complaint of pydantic as one line: where, what, and the value."""
+    """Return the first error of pydantic as one line with the place, the problem and the value."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
     if first["type"] == "extra_forbidden":

@@ -58,7 +58,7 @@ def run_facts() -> dict[str, Any]:
 
 @contextmanager
 def running_command(command: str) -> Iterator[None]:
-    """Record the command line in results made inside this context; library code cannot know it otherwise."""
+    """Record a command line in the results made inside this context, because library code cannot know it."""
     token = _COMMAND.set(command)
     try:
         yield

@@ -29,7 +29,7 @@ _SPELLINGS = str.maketrans({"\u00b5": "u", "\u03bc": "u", "~": "u", "\u212b": "�
 
 
 def um_per(unit: str) -> float:
-    """Return how many µm one ``unit`` of length is.
+    """Return the length of one ``unit`` in µm.
 
     Args:
         unit: for example ``"m"``, ``"nm"``, ``"µm"``, ``"um"``, ``"pm"``, ``"Å"``. Case matters: ``"Mm"`` is

@@ -32,8 +32,9 @@ def write_card(
 
     Args:
         folder: folder in which the card is written.
-        name: name of the dataset; ``title``: one line for readers.
-        pitch_um: pitch of the layouts, µm; ``level_height_um``: nominal height of one of the ``levels``, µm.
+        name: name of the dataset; ``title``: a title of one line.
+        pitch_um: pitch of the layouts, µm; ``level_height_um``: nominal height of a level, µm; ``levels``:
+            number of levels.
         scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: format of the microscope's files.
         levelled: whether a build uses the heights of the files without levelling them.
         tables: further tables of the card, such as ``ids`` and ``write``; values that are None are omitted.

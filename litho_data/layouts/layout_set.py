@@ -83,7 +83,7 @@ def write_layout_set(
     Args:
         pattern: a key of `PATTERNS`.
         count: number of random layouts, or number of doses of a dose matrix.
-        size_px: side of a layout, or (ny, nx), pixels.
+        size_px: side of a layout in pixels, or (ny, nx).
         levels: number of levels.
         cutoff_per_um: cut-off of random layouts, cycles/µm.
         passband: ``square`` or ``round``.
@@ -95,7 +95,7 @@ def write_layout_set(
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
-            folder contains a set with other settings or something else, such as scans.
+            folder contains anything but a set with these settings, such as scans.
     """
     require_known("pattern", pattern, PATTERNS)
     LEVELS.require("levels of a layout", levels)
@@ -203,10 +203,10 @@ PATTERNS: dict[str, tuple[Callable[[SetSettings], Iterator[NamedLayout]], str]] 
     "random": (_random, "the paper's random layouts"),
     "flat": (_flat, "one level everywhere"),
     "step-ladder": (_steps, "stairs over all levels"),
-    "checkerboard": (_checkerboard, "squares of 1/16 of the side"),
+    "checkerboard": (_checkerboard, "squares with sides of 1/16 of the layout"),
     "line-space": (_lines, "lines and spaces, each one pixel wider than the last, along x and along y"),
     "siemens-star": (_star, "18 wedges around the centre"),
-    "pillars": (_pillars, "isolated squares from one pixel up, full height on bare ground"),
-    "pits": (_pits, "isolated square holes from one pixel up, in a film of full height"),
-    "dose-matrix": (_dose_matrix, "one framed step ladder per dose, 0.7 to 1.3 of the recipe's"),
+    "pillars": (_pillars, "isolated squares of full height on bare ground, one pixel wide and more"),
+    "pits": (_pits, "isolated square holes in a film of full height, one pixel wide and more"),
+    "dose-matrix": (_dose_matrix, "one framed step ladder per dose, from 0.7 to 1.3 times the recipe's dose"),
 }

@@ -33,8 +33,8 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
     ``lowest`` to ``highest``, with a step for every level if there is room.
 
     Args:
-        frame: layout (ny, nx) that does not repeat.
-        highest, lowest: levels of the last and the first step.
+        frame: layout (ny, nx) without a periodic pattern.
+        highest: level of the last step; ``lowest``: level of the first one.
         tread_px: smallest width of a step; at least 3 steps must fit.
     """
     inset_y, inset_x = (size // 5 for size in frame.shape)

@@ -25,11 +25,11 @@ def random_layout(
 ) -> Array:
     """Make one random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
 
-    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the nearest of
-    ``levels`` values. The result is periodic in both directions. The paper does not define the low-pass
-    filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) or ±0.5
-    cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels were truncated instead of
-    rounded; ``quantiser="floor", field_px=540`` makes similar layouts.
+    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds to the nearest of ``levels``
+    values (halves are rounded up). The result is periodic in both directions. The paper does not define the
+    low-pass filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) or
+    ±0.5 cycles/µm (prints 6 and 7). These layouts were cut from a larger field, and their levels were rounded
+    down; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.
@@ -39,8 +39,8 @@ def random_layout(
         seed: anything that `numpy.random.default_rng` accepts.
         passband: ``square`` limits the frequency along each axis; ``round`` limits the length of the
             frequency vector.
-        quantiser: ``round``, as in the paper's equation, or ``floor``, with which only the largest value gets
-            the highest level.
+        quantiser: ``round`` rounds as in the paper's equation; ``floor`` rounds down, so only the largest
+            value gets the highest level.
         field_px: side, in pixels, of a larger field from whose middle the layout is cut. Such a layout is not
             periodic and may lack the lowest or the highest level. If None, the layout is the whole field.
 
@@ -98,7 +98,7 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Map values in [0, 1] to ``levels`` integers by rounding half up, or by rounding down (``floor``)."""
+    """Map values in [0, 1] to ``levels`` integers, rounded to the nearest (halves up) or down (``floor``)."""
     require_known("quantiser", quantiser, QUANTISERS)
     whole = np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round"))
     return whole.astype(np.min_scalar_type(levels - 1))

@@ -54,7 +54,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
 
 
 def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
-    """Draw layouts (ny, nx), given by title, side by side, with one colour scale for their levels."""
+    """Draw layouts (ny, nx) side by side, with titles from the keys and one colour scale for all levels."""
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):
         axes = figure.add_subplot(1, len(levels), place)

@@ -38,8 +38,8 @@ def mark_features(
     """Mark the pixels whose distance from the main surface exceeds ``threshold`` times the noise sigma.
 
     The main surface is the median of the selected pixels, and the noise sigma is 1.4826 · MAD, so features
-    must be a minority. Measured pixels that were not selected are marked too. The result is therefore
-    everything that later steps should exclude.
+    must be a minority. Measured pixels that were not selected are marked too, so the result contains all
+    pixels that later steps should exclude.
 
     Args:
         z: (ny, nx), any unit, already levelled.

@@ -41,16 +41,16 @@ def level_layout_aware(
 
     The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
     response with one knot per level. A plain fit would count the structure's own slope as background. The
-    datum is part of the response, so the subtracted polynomial has no constant of its own: its mean over the
-    fitted pixels is zero.
+    datum is part of g, so the subtracted polynomial has no free constant: its mean over the fitted pixels is
+    zero.
 
     Args:
         z: (ny, nx), any unit.
         layout_level: (ny, nx) level of each pixel in the scan's frame, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing; by default, the value out of a few
-            that fits best. Pixels within two sigma of the layout's edge are not fitted, because their height
-            depends on what surrounds the layout.
+        blur_px: sigma of a Gaussian for the lateral spread of printing; by default, a few values are tried
+            and the best one is used. Pixels within two sigma of the layout's edge are not fitted, because
+            their height depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
@@ -78,7 +78,7 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the known pixels beyond a border around unknown ones, or all known pixels if few remain."""
+    """Select the known pixels except a border beside unknown ones; if few remain, select all known pixels."""
     if known.all():
         return known
     inner = ndimage.distance_transform_edt(known) > border_px
@@ -97,8 +97,8 @@ def layout_in_scan_frame(
 
     Args:
         layout_level: (ny, nx) levels.
-        scan_to_layout: 3 x 3 matrix that maps (x_um, y_um, 1) of the scan's frame to the layout's.
-        bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
+        scan_to_layout: 3 x 3 matrix that maps (x_um, y_um, 1) from the scan's frame to the layout's.
+        bend_um: bend of the scan, which is removed before ``scan_to_layout`` is applied.
 
     Returns:
         float64 of ``scan_shape``, from the nearest layout pixel, because levels are labels and must not be
@@ -117,7 +117,7 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Return the background's Legendre coefficients, and the explained sum of squares with a minus sign."""
+    """Return the background's Legendre coefficients, and the negative of the explained sum of squares."""
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]

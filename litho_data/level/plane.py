@@ -33,8 +33,8 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
     """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) does not change.
 
     ``prevailing_slope`` is applied to the slopes of all 2 x 2 cells whose four pixels are selected, with s² =
-    mean |v|² / 20. It ends when the change is below sqrt(1e-9), the limit of Gwyddion 2.62. (With the limit
-    of version 2.45, 1e-8, the result differs by 2e-3 of the range.)
+    mean |v|² / 20. The iteration ends when the change is below sqrt(1e-9), the limit of Gwyddion 2.62. (With
+    the limit of version 2.45, 1e-8, the result differs by 2e-3 of the range.)
 
     Args:
         z: (ny, nx), µm; the slopes are physical, so height and pitch must share a unit.

@@ -64,7 +64,8 @@ def level_robust(
     """Subtract a robustly fitted polynomial, including its constant, so that the main surface lies at zero.
 
     The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives
-    features far from the surface no weight. It starts from Huber's solution, which has a single minimum.
+    features far from the surface no weight. The iteration starts from the Huber fit, whose loss has a single
+    minimum.
 
     Args:
         z: (ny, nx), any unit.
@@ -119,13 +120,13 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
 def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
     """Return weighted least-squares coefficients c[q, p] of the Legendre products P_q(y) P_p(x).
 
-    x = 2 j / (nx - 1) - 1, and likewise for y. A set of terms that contains all lower terms spans the same
-    polynomials in the Legendre basis as in powers, and is far better conditioned. The moments are separable,
-    so the fit costs only a few thin matrix products.
+    x = 2 j / (nx - 1) - 1, and likewise for y. If a set of terms contains all lower terms, Legendre products
+    span the same polynomials as powers, but are far better conditioned. The moments are separable, so the fit
+    costs only a few thin matrix products.
 
     Args:
         z: (ny, nx); NaN only where the weight is zero.
-        weights: (ny, nx), not negative, or bool with weight 1 for True.
+        weights: (ny, nx); non-negative numbers, or bool, where True has the weight 1.
 
     Raises:
         InputError: the weighted pixels do not determine all terms.

@@ -57,7 +57,7 @@ class Recipe(BaseModel):
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:
-        """Make a recipe from plain tables, as TOML or ``canonical()`` gives them; refuse wrong ones."""
+        """Make a recipe from plain tables, as in TOML or from ``canonical()``; refuse invalid tables."""
         tables = dict(content)
         if tables.pop("schema", cls.SCHEMA) != cls.SCHEMA:
             raise InputError(f"recipe {source}: schema", got=repr(content["schema"]), wanted=repr(cls.SCHEMA))
@@ -67,7 +67,7 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Return everything that determines the result, including all defaults, for ``from_dict``."""
+        """Return tables for ``from_dict`` with all that determines the result, including all defaults."""
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
     def apply(

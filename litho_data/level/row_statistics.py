@@ -51,7 +51,7 @@ def _modus(ordered: Array) -> float:
 
 
 def _decimal_metres(height_um: Array) -> Array:
-    """Return the doubles that a file in metres with up to 12 significant digits would have given."""
+    """Return the heights in metres, as if read from a file with up to 12 significant digits."""
     metres = height_um * METRE_PER_UM
     with np.errstate(divide="ignore"):
         exponent = np.nan_to_num(np.floor(np.log10(np.abs(metres))), neginf=0.0)

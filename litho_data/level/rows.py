@@ -47,8 +47,8 @@ def align_rows(
 
     Args:
         z: (ny, nx), µm. ``"matching"`` and ``"modus"`` require this unit, because both convert to metres as
-            Gwyddion does. The weights of ``"matching"`` compare a squared height with a height, and
-            ``"modus"`` chooses between equally short windows.
+            Gwyddion does. The unit matters because the weights of ``"matching"`` compare a squared height
+            with a height, and because ``"modus"`` chooses between windows of equal length.
         method: ``median``, ``trimmed-mean`` and ``modus`` make this statistic equal for all rows. The two
             ``-of-differences`` methods and ``matching`` add up the steps between neighbouring rows, which
             preserves large features. ``polynomial`` fits each row separately. ``facet-tilt`` removes the
@@ -163,7 +163,7 @@ def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
 
 
 def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
-    """Return the slope per pixel of each row's prevailing facet, from pairs of selected neighbours."""
+    """Return the prevailing slope of each row, per pixel, from pairs of neighbouring selected pixels."""
     slopes, both = np.diff(z, axis=1) / pitch_um, chosen[:, 1:] & chosen[:, :-1]
     tilts = np.zeros(len(z))
     for i in np.flatnonzero(both.sum(axis=1) >= _FEWEST_SLOPES):

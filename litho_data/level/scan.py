@@ -38,7 +38,7 @@ def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
     """Level a scan by a recipe, given as an object or as a TOML file.
 
     Returns:
-        The scan with levelled heights, and the removed surface, (ny, nx) µm; their sum is the input.
+        The scan with levelled heights, and the removed surface (ny, nx) in µm; both maps add up to the input.
 
     Raises:
         InputError: the recipe is invalid, or a step cannot be applied.

@@ -29,11 +29,11 @@ def mark_scars(
 ) -> Array:
     """Mark scars: streaks along the rows that stand out from the rows above and below.
 
-    A streak may be up to ``max_width_px`` rows wide. In each column, it stands out by the height of its
-    lowest pixel above the higher of the two pixels that bound it above and below. Negative streaks are found
-    in the same way in the negative map. The unit is the rms difference, sqrt(sum of squared differences
-    between rows / number of pixels). A run along a row counts if it reaches ``high`` somewhere, never falls
-    below ``low`` and is at least ``min_length_px`` long.
+    A streak may be up to ``max_width_px`` rows wide. In each column, its prominence is the height of its
+    lowest pixel minus that of the higher pixel just above or below the streak. Negative streaks are found in
+    the same way in the negative map. The unit of prominence is the rms difference, sqrt(sum of squared
+    differences between rows / number of pixels). A run along a row counts if it is at least ``min_length_px``
+    long and its prominence reaches ``high`` somewhere and never falls below ``low``.
 
     Returns:
         bool (ny, nx); only selected pixels are marked.
@@ -43,7 +43,7 @@ def mark_scars(
     """
     if low > high:
         raise InputError(
-            "scar parameters", got=f"low {low} and high {high}", wanted="a low that does not exceed high"
+            "scar parameters", got=f"low {low} and high {high}", wanted="low at most as large as high"
         )
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
@@ -119,7 +119,7 @@ def _harmonic(z: Array, unknown: Array) -> Array:
     beside = ndimage.binary_dilation(~left_out)
     if set(np.unique(areas[unknown])) - set(np.unique(areas[beside & left_out])):
         raise InputError(
-            "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
+            "a marked area has no measured neighbour", wanted="marks with measured pixels around them"
         )
     known = Topography(np.ma.masked_array(z, left_out), z.shape)
     filled: Array = known.interpolate_undefined_data_with_harmonic_function().heights()

@@ -27,10 +27,10 @@ IMAGES = "o"
 
 @dataclass(frozen=True)
 class Source:
-    """Everything from which a store is made, with the raw files by id for the manifest.
+    """Everything from which a store is made, including the raw files that the manifest lists.
 
-    ``files`` maps each id to its raw files by recorded name, and ``standards`` contains the raw files of the
-    calibration. ``unpaired`` and ``refused`` map ids to reasons.
+    ``files`` maps each id to its raw files, keyed by their names in the record, and ``standards`` contains
+    the raw files of the calibration. ``unpaired`` and ``refused`` map ids to reasons.
     """
 
     card: Card
@@ -59,9 +59,9 @@ def assemble(
         root: the group of the store that is being written.
         records: records of the finished scans, sorted by id, including references (``use`` other than
             dataset).
-        load: the arrays of an id on the layout grid.
+        load: returns the arrays of an id on the layout grid.
         source: what the records were made from.
-        skipped: per id, why it is not in the store.
+        skipped: ids that are not in the store, each with the reason.
         build: facts that must not be part of a hash: time, folder, software.
     """
     scans = [_row(record) for record in records_of_use(records)]
@@ -95,7 +95,7 @@ def facts_of_card(card: Card) -> dict[str, Any]:
 
 
 def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """Return the attributes of the root group; all but the two hashes follow from the manifest.
+    """Return the attributes of the root group. Except for the two hashes, all follow from the manifest.
 
     The attributes are only numbers and words, which any format can store.
     """
@@ -151,7 +151,7 @@ def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
 
 
 def provenance_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return one row per step of every scan: the record as JSON, its id, and the software that ran it."""
+    """Return one row per step of every scan: the step's id, its record as JSON, and the software used."""
     import pandas as pd
 
     rows = [
@@ -206,12 +206,13 @@ def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[s
     Args:
         source: the files by id and recorded name, and the ids without a partner.
         records: records of the finished scans, by id.
-        skipped: per id, why it is not in the store.
+        skipped: ids that are not in the store, each with the reason.
 
     Returns:
-        Columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256`` of the
-        bytes that were used (empty for a file that cannot be read), ``size_bytes``, and ``read``, JSON with
-        reader, unit, channel, pitch and the vendor's full header.
+        The columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256``,
+        ``size_bytes`` and ``read``. ``sha256`` is the hash of the bytes that were used; it is empty if the
+        file cannot be read. ``read`` is JSON with the reader, the unit, the channel, the pitch and the
+        vendor's full header.
     """
     import pandas as pd
 

@@ -58,7 +58,8 @@ def build_dataset(
         out: folder of the store; an older store there is replaced.
         data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
             user cache, whichever has the files.
-        workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
+        workers: number of local processes.
+        dask: address of a Dask scheduler that is used instead of local processes. The result is the same.
         strict: refuse to build if any scan has to be skipped, or if a scan or layout has no partner.
         seed: seed of the robust registration.
         tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans; it replaces the
@@ -191,8 +192,8 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """Find which other layout of the set each unregistered scan shows, and add it to the reasons in
-    ``skipped``.
+    """For every unregistered scan, find out which other layout of the set it shows, and add the answer to its
+    reason in ``skipped``.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
@@ -217,10 +218,11 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
-    """If the card states the size of the scans, find scans whose pixels have another aspect ratio than those
-    of most scans.
+    """If the card states the size of the scans, find the scans whose pixels do not have the same aspect ratio
+    as the pixels of most scans.
 
-    A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
+    A text file that lacks its last rows can still be read as a matrix, but its pixels then become too long,
+    because the stated size is divided by too few rows.
     """
     if card.scan.size_um is None:
         return {}

@@ -1,4 +1,4 @@
-"""Find the scales of a microscope from the card's scans of gratings and of a step."""
+"""Determine the scale factors of a microscope from the card's scans of gratings and of a step."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """Return the scales that a build of the card would apply, for those of ``y``, ``x`` and ``z`` that the
-    card calibrates.
+    """Return the scales that a build of the card would apply, by axis (``y``, ``x`` or ``z``). Axes that the
+    card does not calibrate are left out.
 
     Raises:
         InputError: the card has no ``[calibration]``, a file is missing, or a scan shows no grating or step.
@@ -43,10 +43,10 @@ class Standards:
     """The calibration standards of a card; empty without ``[calibration]``.
 
     Attributes:
-        described: per standard ``scale`` (x, y or z), ``file`` (a number, in the order of the files),
-            ``known_um``, ``uncertainty_um``, ``across`` (axis of the profiles) and ``read``, the options of
-            ``read_scan``.
-        files: the files by recorded name.
+        described: for every standard, a mapping with ``scale`` (x, y or z), ``file`` (index into ``files``),
+            ``known_um``, ``uncertainty_um``, ``across`` (axis of the profiles) and ``read`` (the options of
+            ``read_scan``).
+        files: paths of the files, by their recorded names.
     """
 
     described: tuple[Facts, ...] = ()
@@ -104,8 +104,8 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
-    """Return the factor and standard uncertainty of each scale, (3, 2) in the order of ``SCALES``; without a
-    standard, they are 1 and 0.
+    """Return the factor and the standard uncertainty of every scale as an array (3, 2), in the order of
+    ``SCALES``. A scale without a standard has the factor 1 and the uncertainty 0.
 
     Raises:
         InputError: a scan shows no grating or step of about the known size.

@@ -15,7 +15,9 @@ from litho_data.store.partial import Piece
 
 @dataclass
 class Chain:
-    """The results of the operations so far: recorded steps, arrays by name, facts by operation."""
+    """The results of the operations that have run so far: recorded steps, arrays by name, and facts by
+    operation.
+    """
 
     steps: list[Step] = field(default_factory=list)
     arrays: dict[str, Array] = field(default_factory=dict)
@@ -40,12 +42,14 @@ class Chain:
 
     @property
     def pitch_um(self) -> list[float]:
-        """Return the stated (y, x) pitch of the scan times the scales of its axes, if they are known."""
+        """Return the (y, x) pitch that the scan states, multiplied by the scales of its axes if they are
+        known.
+        """
         axes = zip("yx", self.read["pitch_um"], strict=True)
         return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
 
     def piece(self, **said: Any) -> Piece:
-        """Return the part of the store that these steps made, with further facts for its record."""
+        """Return the part of the store that these steps made, with the facts ``said`` in its record."""
         steps = [step.to_record() for step in self.steps]
         record = {**said, "steps": steps, "software": software_record()}
         return Piece(json.loads(json.dumps(record)), self.arrays)

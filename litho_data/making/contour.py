@@ -1,8 +1,8 @@
 """Find the edges of a film in an electron micrograph as signed distances, and convert them to heights.
 
 The film is bright, its rim is brightest, and charging distorts both. The edge is placed half way between the
-local brightness of the ground and that of the rim. Which point on the flank of the rim is the edge of the
-film's wall is a convention that a micrograph cannot check.
+local brightness of the ground and that of the rim. This position is a convention: the wall of the film may
+lie at another point on the flank of the rim, and a micrograph cannot show where.
 """
 
 from typing import NamedTuple
@@ -87,8 +87,8 @@ def _dense(line: Array) -> Array:
 
 
 def coverage(distance_um: Array, pitch_um: float) -> Array:
-    """Return the share of each pixel (0 to 1) that film covers, given the signed distance of the pixel's
-    centre from an edge.
+    """Return the fraction of each pixel (0 to 1) that is covered by film, given the signed distance from the
+    centre of the pixel to an edge.
     """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 
@@ -96,12 +96,14 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
     """Mark defects in a micrograph: film far inside a gap of the layout, or a pit in the film.
 
-    A gap that is completely closed, or an island that is completely lost, counts as print.
+    A gap that is completely closed, or an island that is completely lost, is part of the print and not a
+    defect.
 
     Args:
-        covered: coverage (ny, nx), NaN where not seen; ``layout_share``: coverage by the layout.
+        covered: measured coverage by film (ny, nx), NaN where not seen.
+        layout_share: coverage by film according to the layout.
         depth_px: deviations within this distance of an edge of the layout may belong to the print and are not
-            defects. Defects are widened by the same distance.
+            defects. The marked defects are widened by the same distance.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

@@ -1,4 +1,4 @@
-"""Find the tip of all scans of a card before they are built."""
+"""Estimate the radius of the tip from all scans of a card, before the scans are built."""
 
 import sys
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs with the radius in place of ``blind``, or without a tip if the scans do not limit its
-    radius.
+    """Return the jobs with the estimated radius of the tip in place of ``blind``. If the scans set no limit
+    on the radius, return the jobs without a tip.
 
     The result is also printed on stderr. Scans that cannot be read are left out; their jobs report why.
     """

@@ -13,10 +13,11 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """One scan of a grating. Values that the scan does not show are None, and ``problem`` says why.
+    """One scan of a grating. Values that cannot be measured in the scan are None, and ``problem`` says why.
 
     Args:
-        scale_x, scale_y: factors for stated lengths; ``_sd``: their standard uncertainties.
+        scale_x, scale_y: factors by which stated lengths must be multiplied. ``scale_x_sd`` and
+            ``scale_y_sd`` are their standard uncertainties.
         bow_um: how far the middle of a line is displaced along x relative to its ends.
         line_um: length of a line.
         tip_at_most_um: upper bound on the radius of the tip. A tip so blunt that it bridges the gaps between
@@ -37,8 +38,8 @@ class GratingScan(Record):
 
 
 def grating_scans(store: Store) -> list[GratingScan]:
-    """Measure the gratings among a store's references in the scans as they were read, with x as the fast
-    axis.
+    """Measure the gratings among the references of a store. The scans are used as they were read, with x as
+    the fast axis.
     """
     known = store.manifest.get("card", {}).get("grating")
     if known is None:

@@ -25,26 +25,31 @@ def height_sigma(
     fast_axis: Axis = "x",
     z_uncertainty: float = 0.0,
 ) -> tuple[Array, Mapping[str, float]]:
-    """Return the standard uncertainty of registered heights, not including that of the scan's offset.
+    """Return the standard uncertainty of registered heights, without the uncertainty of the scan's offset.
 
-    The variance is a sum of six parts: the white noise of pixels and that of lines, both after resampling;
-    the error of the resampling itself; the slope times the uncertainty of the warp; the surface that
-    levelling left or wrongly removed; and the uncertainty of the z scale times the height relative to the
-    scan's mean.
+    The variance is a sum of six parts, which have these causes:
+
+    - ``pixel``: white noise of pixels, after resampling;
+    - ``line``: white noise of lines, after resampling;
+    - ``resampling``: the fine structure that interpolation loses;
+    - ``registration``: the uncertainty of the warp, multiplied by the slope of the heights;
+    - ``levelling``: the surface that levelling left or wrongly removed;
+    - ``calibration``: the uncertainty of the z scale, multiplied by the height above the scan's mean.
 
     Args:
-        levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
-        height_um: the same on the layout's grid, NaN where not valid.
+        levelled_um: heights (ny, nx) in the scan's own frame, NaN where not measured.
+        height_um: heights on the layout's grid, NaN where not valid.
         layout_level: levels on that grid.
         blur_px, model: blur and model of the registration, see ``warp_error``.
-        levelled: whether a recipe was applied. If so, the estimated part of the print that the recipe removed
-            is included. If not, a surface in addition to the print is included only if it is significant.
+        levelled: whether a recipe was applied. If so, the uncertainty includes an estimate of the part of the
+            print that the recipe removed. If not, it includes a surface that does not belong to the print,
+            but only if this surface is significant.
         fast_axis: the axis along which the tip moved.
         z_uncertainty: relative uncertainty of the z scale; 0 if it was not calibrated.
 
     Returns:
-        float32 µm on the layout's grid, NaN where not valid; and the root mean square of each part as
-        ``sigma_<part>_nm``, and of the whole as ``sigma_nm``.
+        The uncertainty in µm as float32 on the layout's grid, NaN where not valid, and a mapping of root mean
+        squares: ``sigma_<part>_nm`` for each part and ``sigma_nm`` for the whole.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape
@@ -77,8 +82,9 @@ def _resampling_nm2(
     line_nm: float,
     fast_axis: Axis,
 ) -> float:
-    """Return the variance of the fine structure that interpolation loses, nm²: the integral of the print's
-    noise-free spectrum times the relative loss at each frequency.
+    """Return the variance, in nm², of the fine structure that interpolation loses. At each frequency, the
+    noise-free spectrum of the print is multiplied by the relative loss; the variance is the integral of this
+    product.
     """
     filled = fill_gaps(levelled_um)
     lost = 0.0

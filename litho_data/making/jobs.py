@@ -42,7 +42,7 @@ class Job(Protocol):
 
 
 def finish(job: Job, unfinished: PartialStore) -> Facts | str:
-    """Run a job, store its arrays from the process that made them, and return only the record.
+    """Run a job and store its arrays from within the process that made them; return only the record.
 
     For bad input, return the reason why the scan is skipped, so that one bad file never stops a build.
     """
@@ -107,7 +107,7 @@ class FieldJob:
         return chain
 
     def register_params(self, chain: Chain) -> dict[str, Any]:
-        """Return the parameters for the registration of the scan that was read."""
+        """Return the parameters with which the scan is registered."""
         pitches = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         # If the fast axis is unknown, the lines are assumed to be rows.
         lines = {"fast_axis": "y"} if chain.read["fast_axis"] == "y" else {}

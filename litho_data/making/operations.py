@@ -31,8 +31,8 @@ READERS = ("read-scan", "read-micrograph")
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
-    """Register a function as the operation ``name``. ``code`` names the source on which its result depends,
-    besides this file.
+    """Register a function as the operation ``name``. ``code`` names the source files and folders, apart from
+    this file, on which the result depends.
     """
 
     def made(function: Function) -> Function:
@@ -107,7 +107,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, and make from them the height map that will be registered."""
+    """Find the edges of the film, and convert them into the height map that will be registered."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -121,8 +121,8 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Compute the film on the layout's grid without dirt: its height times the share of each pixel that it
-    covers.
+    """Compute the height map of the film on the layout's grid: the height of the film times the fraction of
+    each pixel that it covers. Pixels with dirt are invalid.
     """
     from litho_data.making.contour import coverage, foreign
     from litho_data.register.refine import interior_of
@@ -156,7 +156,9 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
 
 
 def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
-    """Return the factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
+    """Return the factor of the heights and its relative uncertainty. Without a calibration, these are 1 and
+    0.
+    """
     if "calibration" not in arrays:
         return 1.0, 0.0
     factor, uncertainty = arrays["calibration"][2].tolist()

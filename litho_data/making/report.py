@@ -86,7 +86,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     ]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and why. With --strict, nothing is built if there are any"
+        caption = "Ids that are not in the store, and the reasons. With --strict, any such id stops the build"
         page.table(rows, caption, "left_out.csv")
 
 
@@ -109,9 +109,9 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
     if "sigma_nm" in quality:
         page.table(
             quality[list(_COLUMNS["uncertainty"])],
-            "Parts of the uncertainty of the heights, each as root mean square over a scan, without the "
-            "scan's offset. If the card has no z calibration, that part is 0, and the total lacks the "
-            "error of the z scale",
+            "Parts of the uncertainty of the heights, each as root mean square over a scan. The "
+            "uncertainty of the scan's offset is not included. If the card has no z calibration, the "
+            "part from the calibration is 0, and the total lacks the error of the z scale",
             "uncertainty.csv",
             digits=2,
         )

@@ -58,13 +58,15 @@ def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array
 
     Args:
         records: records of the scans of a dataset.
-        load: returns the arrays ``mask_level`` and ``height_um`` of an id.
+        load: function that takes the id of a scan and returns its arrays ``mask_level`` and ``height_um``.
     """
     return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Return, by id, the reasons to suspect that a scan does not show its own layout; empty for most sets."""
+    """Return, by id, the reasons to suspect that a scan does not show its own layout. In most sets, there are
+    no such scans.
+    """
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -118,8 +120,8 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans that another layout of the set explains better, even with the warp onto their own
-    layout.
+    """Yield the scans whose heights fit another layout of the set better, even though the scans were
+    registered onto their own layout.
     """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
@@ -161,7 +163,9 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield scans whose height per level fits another group better, and doses that are out of order."""
+    """Yield the scans whose height per level suggests that they belong to another group, and the scans whose
+    doses are out of order.
+    """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
@@ -195,12 +199,13 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
-    """Return the slope of the heights over the blurred layout, µm per level, and how that slope grows with
-    the dose.
+    """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
+    relative growth of that slope with the dose, d ln slope / d ln dose.
 
-    Exposure is level times dose, so the curve g of the heights over the blurred levels T also shows what a
-    larger dose would do to their slope: d ln slope / d ln dose = cov(T, T g') / cov(T, g). For a parabola,
-    this is one plus the share of its square term in the slope; in a saturated print it is negative.
+    Exposure is level times dose. The curve g of the heights against the blurred levels T therefore also shows
+    how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). If g is a parabola, the
+    growth is one plus the fraction of the slope that comes from the square term. In a saturated print, the
+    growth is negative.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -228,11 +233,12 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Return messages for the doses that are out of order, if the height per level clearly falls somewhere.
+    """Return messages for the doses that are out of order. There are no messages unless the height per level
+    clearly falls from one dose to a larger one.
 
     Args:
-        rising: for each dose at which a larger dose should raise the height: the log of the height per level,
-            and the number of scans.
+        rising: the log of the height per level and the number of scans, by dose. Only doses at which a larger
+            dose should raise the height are included.
         scatter: standard deviation of that log for one scan.
     """
     doses = sorted(rising)

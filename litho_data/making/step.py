@@ -122,8 +122,8 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit numerical libraries to one thread, so that sums do not depend on the cores and workers do not
-    compete.
+    """Limit numerical libraries to one thread. Sums then do not depend on the number of cores, and workers do
+    not compete for cores.
     """
     import cv2
     import scipy.linalg  # noqa: F401 - has its own BLAS, which can be limited only once it is loaded

@@ -1,4 +1,6 @@
-"""Find the levelling recipe after which the layout best explains the heights of three scans of a card."""
+"""Compare levelling recipes on three scans of a card, and suggest the recipe after which the layout explains
+the heights best.
+"""
 
 from __future__ import annotations
 
@@ -62,10 +64,10 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The recipe that leaves the smallest residual, and the residual of every recipe and scan, nm.
+    """The recipe that leaves the smallest residual, and the residuals of all recipes and scans in nm.
 
-    ``left_nm[recipe][scan]`` is the root mean square residual of the fit to the layout, in blocks held out of
-    the fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
+    ``left_nm[recipe][scan]`` is the root mean square residual of the fit to the layout, in blocks that were
+    held out of the fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
     """
 
     recipe: str
@@ -79,10 +81,10 @@ def suggest_recipe(
 ) -> Suggestion:
     """Compare recipes on three scans of a card; write the best recipe, a card that uses it, and a page.
 
-    A free response to the blurred layout is fitted to the levelled heights in half of the blocks of 16 px.
-    The residual in the other half decides, because it contains both the tilt that a recipe leaves and the
-    print that it removes. A recipe is not suggested if it shifts lines that agree with their neighbours in
-    many pixels.
+    The levelled heights are fitted by a free function of the blurred layout, in half of the blocks of 16 px.
+    The recipes are compared by the residual in the other half, because this residual contains both the tilt
+    that a recipe fails to remove and the part of the print that it wrongly removes. A recipe is not suggested
+    if it shifts lines that already agree with their neighbours in many pixels.
 
     Args:
         card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
@@ -159,8 +161,8 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Fit the heights by a free response to the layout, and return the rms residual in blocks held out of the
-    fit, µm.
+    """Fit the heights by a free function of the layout, and return the rms residual in µm, in blocks that
+    were held out of the fit.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -198,7 +200,7 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
 
     page = Page(
         "Which levelling recipe",
-        "Recipes compared on scans of the card, by the part of the heights that the layout does not explain.",
+        "Recipes are compared on scans of the card: how much of the heights does the layout not explain?",
     )
     page.verdict(f"Level by the recipe \u201c{found.recipe}\u201d: build {found.card.name}.")
     rows = [

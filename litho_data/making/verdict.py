@@ -1,4 +1,4 @@
-"""Judge a dataset by comparing every number of the card with the heights, and list what to fix."""
+"""Judge a dataset: compare the numbers of its card with the heights, and list what to fix."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -27,7 +27,7 @@ _SHOWN = 12
 
 
 class Weight(IntEnum):
-    """The order of the findings: the lowest comes first."""
+    """The rank of a finding: findings of the lowest rank are listed first."""
 
     LAYOUT = 0
     PITCH = 1
@@ -91,10 +91,10 @@ def findings(
 
     Args:
         records: records of the dataset's scans.
-        prints: their heights at a few points.
-        doubts: signs that a scan does not show its layout, by id.
-        skipped: why a scan is not in the store, by id.
-        card: its numbers are compared with the heights.
+        prints: the heights of these scans at a few points.
+        doubts: reasons to suspect that a scan does not show its own layout, by id.
+        skipped: the reason why a scan is not in the store, by id.
+        card: the card whose numbers are compared with the heights.
     """
     named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
     named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
@@ -109,8 +109,8 @@ def findings(
 
 
 def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
-    """Yield what is wrong with one scan; ``spread_nm`` contains the standard deviation of the heights by
-    id.
+    """Yield what is wrong with one scan. ``spread_nm`` maps the ids of the scans to the standard deviations
+    of their heights.
     """
     quality = record["quality"]
     for note in record.get("notes", ()):
@@ -121,7 +121,7 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
         text = f"details lie {off:.1f} px from their places in the layout: are layout and pitch right?"
         yield text, Weight.PLACE
     if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
-        yield f"only {valid:.0%} of its layout has a height: is process.tip too large?", Weight.PLACE
+        yield f"heights are valid in only {valid:.0%} of its layout: is process.tip too large?", Weight.PLACE
     left = quality.get("sigma_levelling_nm", 0.0)
     if left > _LEFT * spread_nm.get(record["id"], np.inf):
         text = f"a tilt or bow of {left:.0f} nm remains in its heights: compare recipes with build --suggest"
@@ -131,8 +131,8 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
 def _of_the_card(
     records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Yield the numbers of the card that the scans together contradict, each with the scan (or all scans), a
-    text and the weight.
+    """Yield contradictions between the scans as a whole and the numbers of the card, each as the id of the
+    scan concerned (or "all scans"), a text and a weight.
     """
     layout = card.layout
     times = _height_times(prints, card)
@@ -159,9 +159,9 @@ def _of_the_card(
     edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
     if edge_times > _EDGE_TIMES:
         text = (
-            f"their outermost pixels deviate {edge_times:.0f} times as much from their layouts as the rest: "
-            "set write.surround to substrate if level 0 continues around a field, otherwise to unknown, "
-            "which excludes these pixels"
+            f"their outermost pixels deviate {edge_times:.0f} times as much from the layouts as the others: "
+            "if level 0 continues around a field, set write.surround to substrate; otherwise, set it to "
+            "unknown, which excludes these pixels"
         )
         yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
@@ -177,7 +177,9 @@ def _scale(record: Facts) -> float:
 
 
 def _height_times(prints: Sequence[Print], card: Card) -> float:
-    """Return the height per level of the prints divided by that of the card; 0 if it is unknown."""
+    """Return the height per level of the prints divided by the level height of the card. It is 0 if
+    unknown.
+    """
     gains = [abs(one.response[0]) for one in prints]
     return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0
 

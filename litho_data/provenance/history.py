@@ -144,8 +144,8 @@ def replay(
         data_dir: folder of the raw files, as in ``verify``.
 
     Returns:
-        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if the shapes differ or only one
-        of the arrays has a number at some pixel), ``unit``, ``same_hash``.
+        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if the shapes differ, or if a
+        pixel is NaN in only one of the two arrays), ``unit``, ``same_hash``.
 
     Raises:
         InputError: there is no such store, scan or array, or raw files are missing or have changed.

@@ -117,7 +117,7 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """Yield the findings of a check, and one more finding if the check cannot read its data."""
+    """Yield the findings of a check. If the check cannot read its data, an additional finding says so."""
     try:
         with damaged("data that a check needs"):
             yield from check
@@ -174,7 +174,9 @@ def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
 
 
 def _arrays(store: Store, history: Recorded) -> Iterator[Finding | None]:
-    """Yield a finding for each array of every scan whose hash has changed, and None for every other array."""
+    """For every array of every scan, yield a finding if the hash of the array has changed and None if it has
+    not.
+    """
     for scan_id, steps in history.items():
         for name, wanted in ((one["name"], one["sha256"]) for _, step in steps for one in step.outputs):
             yield _array(store, scan_id, name, wanted)
@@ -212,7 +214,10 @@ def _other_code(history: Recorded) -> Iterator[str]:
     other = {op for op, code in used if op not in OPERATIONS or code != OPERATIONS[op].code_sha256}
     if other:
         operations = ", ".join(sorted(other))
-        yield f"operations that ran other code than the installed: {operations}; replay shows if this matters"
+        yield (
+            f"the code of these operations has changed since the build: {operations}; "
+            "replay shows whether this matters"
+        )
 
 
 def _raw_file(folder: Path, row: Facts) -> Iterator[Finding]:

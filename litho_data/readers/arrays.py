@@ -50,7 +50,7 @@ class Coordinate:
     """The positions along one dimension in the unit that the file states. If the file states only a length,
     there are no positions.
 
-    ``axis`` is x or y if the file states the axis separately from the dimension's name.
+    ``axis`` is x or y if the file states the axis in addition to the name of the dimension.
     """
 
     values: Array | None
@@ -78,8 +78,9 @@ class Coordinate:
 class Held:
     """An array in a file: its type and shape, a function that reads it, and what the file says about it.
 
-    ``dims`` are the names of its dimensions. ``coordinates`` maps names of these and other dimensions in the
-    file to their coordinates. ``around`` contains the attributes beside and above the array.
+    ``dims`` are the names of its dimensions. ``coordinates`` maps the names of dimensions to their
+    coordinates; it may include dimensions of other arrays in the file. ``around`` contains the single values
+    beside the array and the attributes of the groups that contain it.
     """
 
     dtype: np.dtype
@@ -103,13 +104,14 @@ class Held:
 
 
 def array_channel(name: str, held: Held) -> Channel:
-    """Make the channel of a two-dimensional array, which is [y, x] unless the names of its dimensions differ.
+    """Make the channel of a two-dimensional array. Its indices are [y, x] unless the names of its dimensions
+    say otherwise.
 
     x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
 
     Raises:
-        InputError: attributes that change the values in an unknown way (the message names them), values that
-            are not real numbers, or coordinates at uneven steps.
+        InputError: the array has attributes that change the values in an unknown way (the message names
+            them), values that are not real numbers, or coordinates that are not evenly spaced.
     """
     says = {key: _plain(value) for key, value in held.attributes.items()}
     beside = {key: _plain(value) for key, value in held.around.items()}
@@ -157,8 +159,8 @@ def array_channel(name: str, held: Held) -> Channel:
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
     """Return the names of y and x, and whether the first index runs along x.
 
-    If neither dimension has coordinates, the file's coordinates that are named x and y are used if their
-    lengths match.
+    If neither dimension has coordinates, but the file contains coordinates of matching lengths that are named
+    x and y, these are used.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
@@ -188,7 +190,7 @@ def _plain(value: Any) -> Any:
 
 
 def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
-    """Mark missing pixels in the file's own numbers, then apply scale and offset."""
+    """Find missing pixels by comparing the numbers as stored in the file, and then apply scale and offset."""
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
     values = np.asarray(raw(), dtype=float)
@@ -236,7 +238,7 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 
 
 def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
-    """Return the names of the masks among the arrays, by shape."""
+    """Return the names of those arrays that are masks, by shape."""
     return {one.shape: name for name, one in arrays if one.dtype.kind == "b"}
 
 
@@ -276,7 +278,9 @@ def _hdf5_array(path: Path, item: Any, matlab: bool) -> Held:
 
 
 def _is_line(array: Any) -> bool:
-    """Return whether an array contains numbers along one dimension; in MATLAB files such arrays have two."""
+    """Return whether an array contains numbers along one dimension. In MATLAB files, such an array has a
+    second dimension of length 1.
+    """
     return array.dtype.kind in _NUMBERS and _size(array) > 1 and max(array.shape) == _size(array)
 
 

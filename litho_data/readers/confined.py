@@ -139,7 +139,9 @@ def serve(descriptor: int) -> None:
 
 @contextmanager
 def _limits(computing_s: float, memory: int) -> Iterator[None]:
-    """End the process after this computing time; raise MemoryError if it needs this many more bytes."""
+    """End the process when it has used this much computing time. Raise MemoryError if it needs more than this
+    number of additional bytes.
+    """
     import resource
 
     unlimited = resource.getrlimit(resource.RLIMIT_AS)

@@ -42,7 +42,7 @@ def export_of(file: Path) -> dict[str, Any]:
 
 
 def exported_levels(path: Path, says: Facts) -> Array:
-    """Return the levels of the element alone, uint8 (ny, nx), row 0 on top.
+    """Return the levels of the element alone, uint8 (ny, nx) with row 0 at the top.
 
     Raises:
         InputError: an incomplete sidecar, or a file that does not match it.
@@ -115,8 +115,8 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Read levels uint8 (ny, nx), row 0 on top, from closed polylines. Each polyline begins with its layer
-    and an unused number.
+    """Read levels uint8 (ny, nx) with row 0 at the top, from closed polylines. Each polyline begins with its
+    layer and an unused number.
     """
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)
@@ -131,7 +131,7 @@ def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int])
 def _gwl_levels(
     path: Path, shape: Shape, pitch_um: float, level_height_um: float, pedestal_um: float, slicing_um: float
 ) -> Array:
-    """Read levels uint8 (ny, nx), row 0 on top, from the number of slices stacked at each pixel.
+    """Read levels uint8 (ny, nx) with row 0 at the top, from the number of slices stacked at each pixel.
 
     Raises:
         InputError: the height of a column of resist is not a whole number of levels.
@@ -180,8 +180,8 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Read the levels of the cells, uint8 (ny, nx) with row 0 at the top, from the upper faces of the solid,
-    each of which lies in one cell.
+    """Read the levels of the cells, uint8 (ny, nx) with row 0 at the top, from the upper faces of the solid.
+    Each face lies in one cell.
 
     Raises:
         InputError: a cell has no upper face.
@@ -192,5 +192,5 @@ def read_stl_levels(
     found = np.full(shape, -1)
     found[shape[0] - 1 - row, column] = np.rint((flat[:, 0, 2] - pedestal_um) / level_height_um)
     if found.min() < 0:
-        raise InputError(f"STL {path}", got="a cell without a top face", wanted="a face on top of every cell")
+        raise InputError(f"STL {path}", got="a cell without a top face", wanted="a top face for every cell")
     return found.astype(np.uint8)

@@ -33,7 +33,7 @@ _START = 0x0004080000060D02
 
 
 class GdsRows:
-    """The levels of a GDS file, uint8, row 0 on top; only the requested rows are read."""
+    """The levels of a GDS file, uint8 with row 0 at the top; only the requested rows are read."""
 
     def __init__(self, path: Path, shape: Shape, pitch_um: float, layers: str):
         self.shape = shape
@@ -70,7 +70,9 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find the position of every cell's shapes in the file, and the cells that it refers to."""
+        """For every cell, find the position of its shapes in the file, and find the other cells to which it
+        refers.
+        """
         at, cell, name = 0, "", ""
         while True:
             # Only the records of shapes are longer than this.

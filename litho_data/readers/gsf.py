@@ -17,8 +17,8 @@ def read_channels(path: Path) -> list[Channel]:
     """Read the one field of a GSF file; it has a unit and a size only if the header states them.
 
     Raises:
-        InputError: the file is of another format, its header lacks XRes or YRes or has a scale, or the data
-            have another length.
+        InputError: the file is not a GSF file, its header lacks XRes or YRes or contains a scale, or the
+            length of the data is wrong.
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):

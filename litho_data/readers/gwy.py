@@ -24,7 +24,7 @@ def read_channels(path: Path) -> list[Channel]:
     becomes the channel's header.
 
     Raises:
-        InputError: the file is of another format.
+        InputError: the file is not a Gwyddion file.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):

@@ -28,7 +28,7 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 
 def read_channels(path: Path) -> list[Channel]:
     """Read one channel per signal and direction from JPK and Nanosurf files. From TopoStats files, read the
-    flattened and the raw image, nm.
+    flattened image and the raw image, both in nm.
 
     Thumbnails, traces of grains and other tables are skipped.
 
@@ -110,8 +110,8 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """Make a channel from counts. The range of their integer type stands for the calibrated range. Rows and
-    columns stay as stored.
+    """Make a channel from counts. The range of their integer type corresponds to the calibrated range. Rows
+    and columns stay as stored.
     """
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])

@@ -1,4 +1,4 @@
-"""Read layouts (what was sent to the printer) as integer levels, from files of levels or grey pictures."""
+"""Read layouts (what was sent to the printer) as integer levels, from files of levels or greyscale images."""
 
 from pathlib import Path
 
@@ -19,24 +19,27 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Read the levels of a layout (ny, nx), row 0 on top, as uint8, or as uint16 for more than 256 levels.
+    """Read the levels of a layout (ny, nx) with row 0 at the top, as uint8, or as uint16 above 256 levels.
 
     The file may be TIFF (with any compression that tifffile and imagecodecs support), PNG, BMP or NPY; a
-    colour image counts as grey if its colours are identical. A file that the design package exported, in any
-    format, is read with the help of the sidecar beside it.
+    colour image is treated as greyscale if its channels are identical. A file in any format that the design
+    package exported is read with the help of the sidecar beside it.
 
     Args:
         path: the file.
-        grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
-        levels: number of levels, by default at most 256. In a picture with larger values, white is taken as
-            the highest level if all values are whole steps.
-        average_px: for a picture in two greys: each square with this many pixels on a side becomes one pixel
-            of the layout, whose level is the number of lighter pixels in the square; a remainder at the right
-            and bottom is cropped.
+        grey_per_level: difference between the grey values of neighbouring levels, if the file is a greyscale
+            image of the layout.
+        levels: number of levels, by default at most 256. If the file contains larger values, it is read as a
+            greyscale image in which white is the highest level, provided that all values are multiples of the
+            grey step.
+        average_px: side of a square in pixels, for an image with only two grey values. Each square becomes
+            one pixel of the layout, whose level is the number of lighter pixels in the square. Pixels that
+            remain at the right and at the bottom are cropped.
 
     Raises:
-        InputError: the file does not exist, is damaged, has another format or is a true colour image, its
-            values are neither levels nor whole steps of grey, or its sidecar belongs to another file.
+        InputError: the file does not exist, is damaged, has a format that is not supported or is a true
+            colour image; its values are neither levels nor multiples of the grey step; or its sidecar belongs
+            to another file.
     """
     file = require_file(path)
     if says := export_of(file):
@@ -57,19 +60,19 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Count the light pixels in squares of a picture in two greys."""
+    """Count the light pixels in squares of an image with two grey values."""
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:
-        wanted = f"two greys, and at least {side} x {side} px"
-        raise InputError(f"layout {file}", got=f"{len(greys)} greys, {pixels.shape} px", wanted=wanted)
+        wanted = f"two grey values, and at least {side} x {side} px"
+        raise InputError(f"layout {file}", got=f"{len(greys)} grey values, {pixels.shape} px", wanted=wanted)
     light = (pixels == greys[-1]) & (greys[-1] > 0)
     squares = light[: ny * side, : nx * side].reshape(ny, side, nx, side)
     return squares.sum(axis=(1, 3)).astype(np.uint8)
 
 
 def _white_step(pixels: Array, levels: int | None) -> float:
-    """Return the grey step of a picture whose white is the highest level; 1 for levels."""
+    """Return the grey step of an image in which white is the highest level; 1 if the file contains levels."""
     if levels is None or pixels.max() < levels:
         return 1.0
     for step in (one for white in _WHITE for one in (white / (levels - 1), float(white // (levels - 1)))):

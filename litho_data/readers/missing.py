@@ -1,4 +1,4 @@
-"""Handle missing pixels that a file marks by a number or a word; the caller must name the mark."""
+"""Handle missing pixels, which a file marks by a number or a word. The caller must state these marks."""
 
 from collections.abc import Sequence
 
@@ -23,16 +23,17 @@ _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
 def without_missing(channel: Channel, values: Array, missing: Sequence[float | str] | None) -> Array:
-    """Return the values with NaN where they mark a missing pixel.
+    """Return the values, with NaN in place of the marks of missing pixels.
 
     Args:
         channel: what was read.
         values: (ny, nx) as in the file.
-        missing: the numbers and words that mark missing pixels; None if the caller does not say, an empty
-            list if there are none.
+        missing: the numbers and words that mark missing pixels. An empty list means that there are no marks,
+            and None means that the caller does not know.
 
     Raises:
-        InputError: a word is not in ``missing``, or, if ``missing`` is None, a number looks like a mark.
+        InputError: the file contains a word that is not in ``missing``, or ``missing`` is None and a number
+            looks like a mark.
     """
     marks = {one for one in missing or () if isinstance(one, str)}
     for word, line in channel.words.items():
@@ -53,8 +54,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
 
 
 def _marks(values: Array) -> list[tuple[float, int]]:
-    """Return the extreme values that look like marks, the most extreme first, and the number of their
-    pixels.
+    """Return the extreme values that look like marks, each with its number of pixels. The most extreme value
+    comes first.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     found: list[tuple[float, int]] = []
@@ -72,7 +73,9 @@ def _marks(values: Array) -> list[tuple[float, int]]:
 
 
 def extreme_note(values: Array) -> str:
-    """Return a note on a map whose lowest or highest value fills many pixels; empty for others."""
+    """Return a note if the lowest or highest value of a map occurs in many pixels; otherwise, return an empty
+    text.
+    """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):
         return ""

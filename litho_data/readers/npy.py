@@ -33,7 +33,7 @@ def read_channels(path: Path) -> list[Channel]:
 def read_archive(path: Path) -> list[Channel]:
     """Read one channel per two-dimensional array of numbers in an ``.npz`` file; other arrays are skipped.
 
-    Single values and one-dimensional arrays beside them give the unit and the axes, as in a MATLAB file.
+    Single values and one-dimensional arrays in the same file give the unit and the axes, as in a MATLAB file.
 
     Raises:
         InputError: the file is damaged.
@@ -75,7 +75,7 @@ def load_array(path: Path) -> Array:
 
 
 def _is_archive(head: bytes) -> bool:
-    """Return whether the first file in a ZIP is an array; its name follows a header of 30 bytes."""
+    """Return whether the first file in a ZIP archive is an array. Its name follows a header of 30 bytes."""
     length = int.from_bytes(head[26:28], "little")
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 

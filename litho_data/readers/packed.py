@@ -51,8 +51,8 @@ def _unpack_gzip(path: Path, content: Path) -> None:
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
-    """Copy header, comment and private zone, and append the unpacked streams. In the file, the number of
-    streams, their sizes, and the streams follow the private zone.
+    """Copy the header, the comment and the private zone, and append the unpacked streams. In the file, the
+    private zone is followed by the number of streams, then by their sizes, and then by the streams.
     """
     raw = path.read_bytes()
     start = _SURF_HEADER + sum(struct.unpack_from("<2H", raw, _SURF_ZONES))

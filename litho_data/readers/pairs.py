@@ -18,7 +18,8 @@ GREY_MAX = 255
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
 ) -> dict[str, Array]:
-    """Join the quadrants of one field; ``files`` are first all layouts, then all heights, in quadrant order.
+    """Join the quadrants of one field. ``files`` contains all layouts, followed by all heights, both in the
+    order of ``quadrants``.
 
     Raises:
         InputError: a file is unreadable, quadrants have different sizes, or levels exceed the stated number.

@@ -12,16 +12,16 @@ from litho_data.readers.tiff import open_tiff, require_upright, single_sample
 
 
 def read_picture(path: str | Path, what: str = "picture") -> Array:
-    """Read the stored numbers (ny, nx), row 0 on top; a colour image counts as grey if its colours are
-    identical.
+    """Read the stored numbers (ny, nx) with row 0 at the top. A colour image is treated as greyscale if its
+    channels are identical.
 
     Args:
         path: the file.
-        what: what messages call the file.
+        what: the word for the file in messages, such as "layout".
 
     Raises:
-        InputError: the file does not exist, is damaged, has another format, is a true colour image, or has
-            numbers that are not finite.
+        InputError: the file does not exist, is damaged, has a format that is not supported, is a true colour
+            image, or contains numbers that are not finite.
     """
     file = require_file(path)
     with about(f"{what} {file}"):

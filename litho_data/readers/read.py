@@ -49,21 +49,21 @@ def read_scan(
         path: the instrument's file.
         format: one of ``formats()``, or ``"auto"`` to detect it from the content.
         unit: unit of the heights, needed if the file states none.
-        size_um: (y, x) extent from edge to edge, µm, for files that state none; without it, the pitch stays
-            unknown (None).
-        channel: which channel; needed if a file has several height channels.
+        size_um: extent (y, x) from edge to edge in µm, for files that state none. If it is not given either,
+            the pitch stays unknown (None).
+        channel: name of the channel to read; needed if a file has several height channels.
         fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
         full_scale_um: height of the largest integer value, for images that hold integers: height = value /
             largest value · full_scale_um. It replaces ``unit``.
-        missing: numbers (as in the file) and words that mark pixels without a measurement, besides those that
-            the file states; an empty list says that there are no such marks.
-        defaults: whether ``unit`` and ``size_um`` are only used if the file states none. Otherwise, they must
-            not contradict the file.
+        missing: numbers (as in the file) and words that mark pixels without a measurement, in addition to the
+            marks that the file states. An empty list says that there are no such marks.
+        defaults: if true, ``unit`` and ``size_um`` are ignored if the file states its own. If false, they
+            must not contradict the file.
 
     Raises:
-        InputError: an unreadable file, no height channel or several, a missing or contradictory unit or size,
-            a value that looks like a mark of missing pixels that ``missing`` does not name, impossible
-            heights, or no finite value.
+        InputError: the file is unreadable; it has no height channel, or several and none was chosen; its unit
+            is missing, or its unit or size is contradictory; a value looks like a mark of missing pixels but
+            is not in ``missing``; the heights are impossible; or none of them is finite.
     """
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
@@ -210,8 +210,8 @@ def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
 
 
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
-    """Return (y, x) in µm for coordinates without a unit. The unit is µm or that of the heights, if only one
-    of them gives a possible size.
+    """Return (y, x) in µm for coordinates without a unit. The unit is taken to be µm or the unit of the
+    heights, if only one of the two gives a possible size.
     """
     if channel.extent is None or channel.full_scale is not None:
         return None

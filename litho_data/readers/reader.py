@@ -47,15 +47,16 @@ class Channel:
         shape: (ny, nx) in pixels.
         unit: unit of the values as the file states it; None if it does not.
         size_um: (y, x) extent from edge to edge; None if the file does not state it.
-        load: returns the values, (ny, nx) in ``unit``, row 0 on top, and the file's mask or None.
+        load: function that returns the values (ny, nx) in ``unit``, with row 0 at the top, and the mask of
+            the file or None.
         full_scale: the largest value of an integer image; None for real numbers.
         fast_axis: axis along which the tip moved; None if the file does not state it.
         header: everything that the file states, as strings.
         problem: why the channel cannot be read; empty if it can.
         x_is: the direction in the file that runs along x, in words, such as "a row of the file".
-        extent: (y, x) from edge to edge in a unit that the file does not state.
-        words: words that the file has in place of numbers, each with the line where it first occurs. Their
-            pixels are NaN.
+        extent: (y, x) extent from edge to edge, in a unit that the file does not state.
+        words: words that occur in the file in place of numbers, each with the line where it first occurs. The
+            pixels with these words are NaN.
         notes: warnings for whoever uses the map.
     """
 
@@ -84,7 +85,9 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Return whether the unit is a length, or is unknown and must be stated by the caller."""
+        """Return whether the channel may contain heights: its unit is a length, or the file does not state
+        the unit.
+        """
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
@@ -116,8 +119,8 @@ class Reader:
 
 
 def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
-    """Make a channel. If that fails, make a channel that says why it cannot be read, so that the other
-    channels stay usable.
+    """Make a channel. If this fails, make a substitute that says why the channel cannot be read, so that the
+    other channels stay usable.
     """
     try:
         with foreign_parser("a map"):
@@ -166,7 +169,7 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
-    """Silence Python warnings, and messages of these loggers up to the level ``above``."""
+    """Silence Python warnings, and silence these loggers up to and including the level ``above``."""
     named = [logging.getLogger(name) for name in loggers]
     levels = [logger.level for logger in named]
     try:
@@ -184,8 +187,9 @@ def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
 def foreign_parser(kind: str) -> Iterator[None]:
     """Run another project's parser on a file; turn any exception into one InputError.
 
-    On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
-    errors, and log to stderr. A caller could not handle these errors in any useful way.
+    If a file is damaged, such parsers raise errors of many types (struct, index, key, value, memory, decode,
+    assertion and types of their own) and log to stderr. A caller could not handle these errors in any useful
+    way.
     """
     try:
         with quiet(*_LOGGERS):

@@ -18,7 +18,7 @@ def read_channels(path: Path) -> list[Channel]:
     state.
 
     Raises:
-        InputError: the file is of another kind.
+        InputError: the file is not a Surfer grid.
     """
     raw = path.read_bytes()
     if not raw.startswith(_MAGIC):
@@ -30,8 +30,8 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _older(raw: bytes) -> tuple[Array, float, float, float]:
-    """Read the numbers of columns and rows, the ends of x, y and z, and the heights, from text or binary
-    data.
+    """Read the heights and the numbers of columns and rows, with the ranges of x, y and z, from text or
+    binary data.
     """
     if raw.startswith(b"DSAA"):
         numbers = np.array(raw.split()[1:], dtype=float)

@@ -52,7 +52,9 @@ _SCALE_IN_WORDS = re.compile(
 
 @dataclass
 class Block:
-    """Neighbouring lines of numbers, the header above them, and the line number of the first."""
+    """A block of consecutive lines of numbers, with the header above the block and the number of its first
+    line.
+    """
 
     header: dict[str, str]
     words: list[str]
@@ -116,7 +118,9 @@ class Block:
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
-        """Return (y, x), µm, from the two sides, or from the size of a pixel."""
+        """Return the size (y, x) in µm if the header states the size of a pixel or of both sides; None
+        otherwise.
+        """
         if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
         sides = [_length_um(self.first(side)) for side in ("height", "width")]
@@ -135,12 +139,12 @@ def refuse_scales(header: Mapping[str, str]) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or an 8-bit code of Western Europe, with lines separated by
-    ``\\n``.
+    """Return the text of a file, with lines separated by ``\\n``. The encoding is UTF-8, UTF-16 or an 8-bit
+    encoding of Western European languages.
 
     Raises:
-        InputError: the UTF-16 has an incomplete character, or the bytes are not text; the message names the
-            line.
+        InputError: UTF-16 text contains an incomplete character, or the bytes are not text (the message then
+            names the line).
     """
     raw = path.read_bytes()
     halves = {"utf-16-be": raw[:_LOOKED_AT:2], "utf-16-le": raw[1:_LOOKED_AT:2]}
@@ -213,7 +217,7 @@ def is_row(line: str) -> bool:
     """Return whether a line is a row of numbers: it is not a comment, and at least half of its cells are
     numbers.
 
-    A line that repeats one word that is not a unit is a row of missing pixels.
+    A line that consists of one repeated word is a row of missing pixels, unless the word is a unit.
     """
     if _COMMENT.match(line) or not line.strip():
         return False

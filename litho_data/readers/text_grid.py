@@ -25,8 +25,8 @@ _AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 on top and x to the right, and the side lengths that the table states. ``extent`` is
-    in an unknown unit.
+    """Heights with row 0 at the top and x to the right, and the side lengths of the map, if the table states
+    them. ``size_um`` is in µm, and ``extent`` is in an unknown unit.
 
     ``corner`` says whether the first cell of the table belonged to an axis.
     """
@@ -42,13 +42,13 @@ class Map:
 def without_axes(values: Array, words: Sequence[str]) -> Map:
     """Remove a first row or column of coordinates or counts from the matrix.
 
-    Evenly spaced numbers are coordinates if the neighbouring line is not like them, because neighbouring
-    lines of a map are alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing about
-    lengths.
+    Evenly spaced numbers are taken as coordinates unless the neighbouring line has the same spacing, because
+    neighbouring lines of a map are alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing
+    about lengths.
 
     Raises:
-        InputError: the first row and column look like coordinates at uneven steps, or the last row and column
-            look like coordinates.
+        InputError: the first row and column look like coordinates that are not evenly spaced, or the last row
+            and column look like coordinates.
     """
     body = values[1:, 1:]
     if min(body.shape) <= _FEWEST_STEPS:

@@ -102,7 +102,7 @@ def _recognises(path: Path, head: bytes) -> bool:
     """Return whether the file begins like a text with rows of numbers.
 
     Raises:
-        InputError: the rows are points of a profile or of a cloud.
+        InputError: the rows are points of a profile or of a point cloud.
     """
     lines = re.split("\r\n|\r|\n", _start_of_text(head))
     rows = [line for line in lines[:_MOST_HEADER_LINES] if is_row(line)]

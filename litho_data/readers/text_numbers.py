@@ -22,8 +22,8 @@ _TRUNCATED = "the file may be truncated"
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers (rows, columns) with NaN for words, the line where each word first occurs, and the word in the
-    first cell.
+    """Numbers (rows, columns), with NaN in place of words. ``words`` maps every word to the line where it
+    first occurs, and ``corner`` is the word in the first cell.
     """
 
     values: Array
@@ -32,9 +32,11 @@ class Table:
 
 
 def numbers_of(block: Block) -> Table:
-    """Convert a block to numbers; ``nan`` and words become NaN; an empty cell counts as the word "".
+    """Convert a block to numbers. Words become NaN, and so does ``nan``; an empty cell is treated as an empty
+    word.
 
-    A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
+    Decimal commas are accepted if the cells are not separated by commas. Exponents as in Fortran's
+    ``1.0D-07`` are accepted as well.
 
     Raises:
         InputError: rows differ in length, separators are mixed, a number is too large, or the last number was
@@ -64,8 +66,8 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
     decimal points.
 
     Raises:
-        InputError: commas beside another separator, as in ``1,234.5;2,345.6``; commas that may be decimal
-            commas as well as separators; or commas that may separate thousands.
+        InputError: the text contains commas in addition to another separator, as in ``1,234.5;2,345.6``;
+            commas that may be either decimal commas or separators; or commas that may separate thousands.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
     for mark in "\t;,":  # a separator at the end of every row separates nothing

@@ -37,10 +37,10 @@ _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "
 def read_channels(path: Path) -> list[Channel]:
     """Read one channel per page; RGB pages count as one channel if their samples are identical.
 
-    The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their unit;
-    otherwise, these tags usually describe a print on paper, not the sample. Calibrations of the values by
-    ImageJ and GDAL are applied; GDAL's no-data value marks a missing pixel. Reduced copies of a page are
-    skipped.
+    The size of a pixel is taken from OME metadata. Without such metadata, it is taken from the resolution
+    tags, but only if ImageJ names their unit; otherwise, these tags usually describe a print on paper and not
+    the sample. Calibrations of the values that ImageJ or GDAL wrote are applied. GDAL's no-data value marks a
+    missing pixel. Copies of a page at reduced resolution are skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -78,8 +78,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Return SurfaceTopography's name for the format of the instrument maker whose tags this TIFF has; empty
-    if it has none.
+    """Return the instrument maker's format to which the tags of this TIFF belong, by SurfaceTopography's name
+    for it; return an empty text if there is none.
     """
     try:
         with open_tiff(path) as file:
@@ -130,7 +130,7 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
     """Return scale, offset, unit and no-data value of a page.
 
     Raises:
-        InputError: a calibration by ImageJ is not a straight line, or the description has an unknown scale.
+        InputError: an ImageJ calibration is not a straight line, or the description has an unknown scale.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -166,11 +166,11 @@ def _plain_unit(unit: Any) -> str:
 
 
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
-    """Read the pixel size (y, x) of every page from OME metadata; its lengths are in µm unless it names
+    """Read the pixel size (y, x) of every page from OME metadata. Lengths are in µm unless the metadata name
     another unit.
 
-    The pages are those of the first image, then those of the second, and so on. Each image has as many pages
-    as its sizes in z, channel and time say.
+    The pages of the first image come first, then those of the second, and so on. The number of pages of an
+    image is the product of its sizes in z, channel and time.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
@@ -180,7 +180,7 @@ def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
 
 
 def _ome_pitch_um(image: str) -> YX | None:
-    """Read the pixel size (y, x) that the element of one image states."""
+    """Read the pixel size (y, x) from the OME element of one image."""
     says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
         pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]
@@ -215,7 +215,7 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
 
 
 def single_sample(pixels: Array) -> Array:
-    """Reduce grey pixels (ny, nx) or (ny, nx, 1 to 4), opaque and with equal colours, to (ny, nx).
+    """Reduce pixels (ny, nx) or (ny, nx, 1 to 4) to (ny, nx). All pixels must be grey and opaque.
 
     Raises:
         InputError: the colours differ, so a pixel has no single value, or pixels are transparent.

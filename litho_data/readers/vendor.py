@@ -61,7 +61,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return SurfaceTopography's names of the formats whose signature the file has."""
+    """Return the formats whose signature the file has, by their names in SurfaceTopography."""
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
@@ -77,7 +77,7 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Return whether the header has a version number of Igor's waves and the right checksum. The usual
+    """Return whether the header has the version number of an Igor wave and a correct checksum. The usual
     version 5 is accepted without a checksum.
     """
     order = "<" if head[1:2] == b"\0" else ">"
@@ -88,8 +88,8 @@ def _is_igor(head: bytes) -> bool:
 
 
 def _recognise(path: Path) -> str:
-    """Return SurfaceTopography's name of the format: the first with the file's signature whose reader opens
-    the file.
+    """Return the format, by its name in SurfaceTopography. Of the formats whose signature the file has, it is
+    the first whose reader can open the file.
 
     Raises:
         InputError: no signature is known, or no reader with that signature can read the file.
@@ -114,8 +114,8 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Refuse a wave that is shorter than its header says, because igor2 trusts the header of version 5 and
-    could read through gigabytes.
+    """Refuse an Igor wave that is shorter than its header states. igor2 trusts headers of version 5, so it
+    could try to read gigabytes.
     """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
@@ -159,7 +159,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
 
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
-    """Load heights with row 0 on top; SurfaceTopography indexes [x, y] with y downwards."""
+    """Load heights with row 0 at the top; SurfaceTopography indexes [x, y] with y downwards."""
     # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with _open(path, kind) as reader:
@@ -190,8 +190,8 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 def _fast_axis(header: dict[str, str]) -> Axis | None:
     """Return ``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
 
-    At other angles the file does not say whether its lines follow the scanner's or the scan's axes. The
-    caller must state the axis.
+    At other angles, the lines may follow either the axes of the scanner or those of the scan. The file does
+    not say which, so the caller must state the axis.
     """
     try:
         angle = float(header["ScanAngle"]) % 180

@@ -1,5 +1,5 @@
-"""Read Wyko ASCII: a header of tab-separated lines, then blocks of numbers in waves or nm; missing pixels are
-marked ``Bad``.
+"""Read Wyko ASCII files. A header with tab-separated cells is followed by blocks of numbers in waves or nm.
+Missing pixels are marked ``Bad``.
 """
 
 from pathlib import Path
@@ -25,7 +25,8 @@ def read_channels(path: Path) -> list[Channel]:
     row by row.
 
     Raises:
-        InputError: the header lacks the sizes or the wavelength, or blocks have other sizes.
+        InputError: the header lacks the sizes or the wavelength, or a block does not have the size that the
+            header states.
     """
     lines = read_text(path).split("\n")
     in_nm = lines[0].removeprefix(_MAGIC).split()[1:2] == ["1"]

@@ -21,13 +21,14 @@ _GRID = 65
 
 @dataclass(frozen=True)
 class Bend:
-    """The displacement of a scan's points: a polynomial of u and v, which run from -1 to 1 over the frame.
+    """The displacement of the points of a scan. It is a polynomial of u and v, which run from -1 to 1 over
+    the frame.
 
     ``amount`` (2, 3) contains the coefficients of u² - 1/3, uv and v² - 1/3, one row for x and one for y. If
-    the scanner creeps, ``amount`` is (2, 11), and also contains those of the Legendre polynomials P₃(u),
-    P₃(v), P₄(u), … P₆(v). All terms are centred, so the best affine fit to a bend over the frame is zero.
-    ``middle`` and ``half`` are the centre and half the size (x, y) of the frame, in the unit of ``amount``; u
-    = (x - middle) / half.
+    the scanner creeps, ``amount`` has the shape (2, 11) and also contains the coefficients of the Legendre
+    polynomials P₃(u), P₃(v), P₄(u), … P₆(v). All terms are centred, so the best affine fit to a bend over the
+    frame is zero. ``middle`` and ``half`` are the centre and half the size (x, y) of the frame, in the unit
+    of ``amount``; u = (x - middle) / half.
     """
 
     amount: Array
@@ -36,7 +37,9 @@ class Bend:
 
     @classmethod
     def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
-        """Make the bend, in µm in the scan's own frame, of a scan of this (ny, nx) shape and (y, x) pitch."""
+        """Make the bend of a scan with this (ny, nx) shape and (y, x) pitch, in µm in the scan's
+        own frame.
+        """
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
         return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
@@ -52,7 +55,7 @@ class Bend:
 
     @classmethod
     def none_yet(cls, shape: Shape) -> Bend:
-        """Make a bend of zero for a scan of this (ny, nx) shape, in the scan's index frame."""
+        """Make a bend of zero in the index frame of a scan with this (ny, nx) shape."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
@@ -62,7 +65,9 @@ class Bend:
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
 
     def scaled(self, factor: float) -> Bend:
-        """Express the same bend in a unit ``1 / factor`` times as long."""
+        """Express the same bend in another unit of length, so that all lengths are multiplied by
+        ``factor``.
+        """
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
@@ -80,7 +85,9 @@ class Bend:
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the points of the scan whose true positions are (x, y); exact if ``slope`` is below 1."""
+        """Return the points of the scan whose true positions are (x, y). They are exact if ``slope`` is below
+        1.
+        """
         at_x, at_y = x, y
         for _ in range(_STEPS):
             shift_x, shift_y = self.shift(at_x, at_y)
@@ -137,7 +144,7 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """Fit by least squares an affine map (3×3) and a bend that together map points (n, 2) to their images.
+    """Fit an affine map (3×3) and a bend, which together map points (n, 2) to their images, by least squares.
 
     The model is ``images`` ≈ affine(``points`` + bend(``points``)). ``middle`` and ``half`` define the bend's
     frame; ``degree`` is 2, or 6 for creep.

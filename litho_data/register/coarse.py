@@ -1,4 +1,6 @@
-"""Find orientation, polarity and a robust affine warp to within a few pixels, by keypoints or correlation."""
+"""Find orientation, polarity and a robust affine warp by keypoints or correlation, accurate to a
+few pixels.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -30,8 +32,8 @@ class CoarseFit:
     """The position of the scan to within a few pixels.
 
     ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
-    ``points`` is None if keypoints were not used or too few match; the fit is then the best correlation over
-    all shifts.
+    ``points`` is None if keypoints were not used or if too few of them match. The fit is then the shift with
+    the best correlation.
     """
 
     orientation: str
@@ -59,7 +61,8 @@ def find_coarse(
         scan: (ny, nx) heights at the layout's pitch, with the bow removed; NaN where not measured.
         layout_level: (ny, nx) integer levels.
         smooth_layout: (ny, nx) topography predicted from the layout with a blur of ``SEARCH_BLUR_PX``.
-        features: whether to match keypoints; on a repeating layout, keypoints would match everywhere.
+        features: whether to match keypoints. This should be false on a repeating layout, where keypoints
+            would match everywhere.
         seed: seed of the robust estimators.
     """
     hypotheses = search_orientation(scan, smooth_layout)

@@ -1,8 +1,8 @@
-"""Register scans that no straight warp fits because the scanner bends the image or creeps.
+"""Register scans of scanners that bend the image or creep, which no straight warp fits.
 
 A bend displaces the image by a quadratic function of position. A scanner that is still settling (creep)
 displaces its lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the
-linear part of this creep. The rest distorts the print by a tenth of the creep and shows in no other way.
+linear part of this creep. The rest distorts the print by a tenth of the creep and leaves no other trace.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
 
     The displacement by creep, along x and along y, is a polynomial of degree 6 in the slow coordinate. It
     adds ten numbers to the affine map. Creep must also predict held-out blocks better than the straight warp.
-    For this, both are fitted to each half of the field (squares of 64 px in a chequerboard), and each fit
-    predicts the other half.
+    For this test, the field is divided into two halves (squares of 64 px in a chequerboard). Both kinds of
+    warp are fitted to each half, and each fit predicts the other half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``; at a quarter of the resolution, its error may be as large
+        straight: the result of ``refine_pyramid``. Its error at a quarter of the resolution may be as large
             as the width of the structures.
-        curve: ``quadratic`` for a bend; for creep, the slow axis of the oriented scan, across its lines.
+        curve: ``quadratic`` for a bend. For creep, it is the slow axis of the oriented scan (0 = x, 1 = y),
+            which runs across the lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -81,8 +82,8 @@ def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) 
     """Subtract from the scan the quadratic surface that the topography does not explain.
 
     Such a surface is quadratic in the scan's frame, but no longer in the layout's frame once the scan is
-    straightened. There it would distort the fit of the bend. The part of the print that is quadratic is
-    included.
+    straightened. In the layout's frame, the surface would distort the fit of the bend. A quadratic part of
+    the print that the topography does not explain is subtracted as well.
     """
     from scipy.ndimage import map_coordinates
 
@@ -124,7 +125,9 @@ class _Images:
     """A scan and the topography with which it is compared, for fitting warps to any choice of pixels."""
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """Use every ``every``-th row and column of the topography; indices count only these."""
+        """Use only every ``every``-th row and column of the topography. Pixel indices refer to this coarser
+        grid.
+        """
         from scipy.ndimage import spline_filter
 
         self._measured = np.isfinite(scan)
@@ -165,7 +168,8 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Return the squared misfit of every pixel; gain and background are fitted to the pixels ``fitted``.
+        """Return the squared misfit of every pixel. Gain and background are fitted only to the pixels in
+        ``fitted``.
 
         The misfit is NaN outside the scan.
         """
@@ -186,7 +190,9 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """Return the terms of the displacement along one axis at points of the scan: 1, u, v and the curve's."""
+    """Return the terms of the displacement along one axis at points of the scan: 1, u, v and the terms of the
+    curve.
+    """
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]
     if curve == "quadratic":

@@ -1,7 +1,7 @@
 """Find areas where a scan does not show the print: dust, collapsed or missing parts, lifted film.
 
-Such an area can shift a least-squares warp by whole pixels. A defect is a connected area where the heights
-differ from any prediction based on the layout by many times the usual misfit.
+Such an area can shift a least-squares warp by whole pixels. A defect is a connected area in which no
+prediction based on the layout fits the heights: the misfit is many times the usual one.
 """
 
 from dataclasses import replace
@@ -48,9 +48,10 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """Find defects and refit the warp without them; return the fit, and the defects or None.
+    """Find defects, and refit the warp without them.
 
-    The defects are bool (ny, nx), on the layout's pixels. If there are none, the plain fit is returned.
+    Return the fit and a mask of the defects, bool (ny, nx) on the layout's pixels. If there are no defects,
+    return the plain fit and None.
 
     Every round finds the defects under the last warp and fits a new warp to the other pixels, starting from
     the robust coarse warp. The rounds end when the corners of the warp no longer move.
@@ -84,7 +85,8 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Return the layout pixels where the scan does not show the print, with a margin, and the largest misfit.
+    """Return a mask of the places where the scan does not show the print, widened by a margin. Also return
+    the largest misfit.
 
     The misfit is the scan on the layout's pixels, minus a free function of the predicted topography
     (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a

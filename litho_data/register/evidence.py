@@ -20,7 +20,8 @@ SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """Shifts of single blocks of the field relative to the warp; arrays (n, 2) of (x, y) in layout pixels.
+    """Shifts of single blocks of the field relative to the warp. All arrays are (n, 2) and contain (x, y) in
+    layout pixels.
 
     ``shift_px`` is the displacement of a block's content from the position that the warp predicts.
     ``held_out_px`` is the same for a warp fitted without the block.
@@ -31,16 +32,18 @@ class BlockShifts:
     held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
-        """Return these percentiles of the target registration error, or NaN if there are no blocks."""
+        """Return the requested percentiles of the target registration error, or NaN if there are no
+        blocks.
+        """
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Return the peak-to-valley range, along one axis, of the blocks' mean shift along ``axis``.
+        """Return the peak-to-valley range of the mean shift of the blocks as a function of their position.
 
-        ``along`` is the axis of the positions (0 = x, 1 = y). With a straight scanner and a sufficient model,
-        the range is only noise. A larger range means that the scanner's axis is not linear or that the
-        scanner creeps, which no warp of the ladder describes.
+        ``axis`` is the axis of the shifts, and ``along`` is the axis of the positions (0 = x, 1 = y). With a
+        straight scanner and a sufficient model, the range is only noise. A larger range means that the
+        scanner's axis is not linear or that the scanner creeps, which no warp of the ladder describes.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
@@ -66,7 +69,8 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """Return the shift of every block relative to the warp, and to a warp fitted without the block.
+    """Return two shifts of every block: relative to the warp, and relative to a warp fitted without the
+    block.
 
     Args:
         registered: (ny, nx) smoothed scan on the layout's pixels, with background removed and gaps filled.
@@ -134,7 +138,9 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Return the sub-pixel position (x, y) of the maximum, or its pixel if it lies on the border."""
+    """Return the position (x, y) of the maximum. It is refined to a fraction of a pixel unless it lies on the
+    border.
+    """
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)
     for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):

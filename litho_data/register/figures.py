@@ -34,7 +34,8 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
-    """Return shift, scale and rotation at the layout's centre; for a bent scan, those of its affine part.
+    """Return the shift, scale and rotation of the warp at the layout's centre. If the scan is bent, these are
+    the values of the affine part of the warp.
 
     The shift is the position of the centre in the scan minus its position in the layout.
     """
@@ -55,7 +56,8 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
     """Return figures of the warp's uncertainty, and the shifts of the blocks.
 
-    The figures come from held-out blocks, a bootstrap, and other shifts and orientations of the scan.
+    The figures come from held-out blocks, from a bootstrap, and from the correlation at other shifts and in
+    other orientations of the scan.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))

@@ -81,10 +81,10 @@ def apply_transform(matrix: Array, points: Array) -> Array:
 
 
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
-    """Return the (rows, columns) to which a 3×3 index matrix maps every pixel of an image.
+    """Return the positions (rows, columns) to which a 3×3 index matrix maps the pixels of an image.
 
-    If the target image has a bend, the matrix gives true positions, and the function returns the points of
-    the bent image at these true positions.
+    If the target image is bent, the matrix gives true positions. The function then returns the points of the
+    bent image that have these true positions.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]
@@ -111,7 +111,7 @@ def nearest(image: Array, rows: Array, columns: Array) -> Array:
 
 
 def lattice(y: Array, x: Array) -> Array:
-    """Return the points (x, y) of a grid with these y and x, row by row, shape (n, 2)."""
+    """Return the points (x, y) of the grid with these y and x coordinates, row by row, as an array (n, 2)."""
     return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
 
 

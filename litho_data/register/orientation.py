@@ -27,7 +27,8 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """Return one hypothesis per orientation and polarity, best first, by correlating low-resolution copies.
+    """Correlate low-resolution copies, and return one hypothesis per orientation and polarity, the best
+    first.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
@@ -63,10 +64,10 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Return the correlation at the best rival shift, divided by the correlation of the registration itself.
+    """Return the largest correlation at a rival shift, divided by the correlation of the registration itself.
 
     A rival is a local maximum of the correlation at a shift of at least a sixteenth of the field. If the
-    topography is given in place of the scan, the result says how strongly the layout repeats.
+    topography is passed in place of the registered scan, the result says how strongly the layout repeats.
     """
     from scipy.ndimage import maximum_filter
 
@@ -83,9 +84,9 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Return the largest correlation, over all shifts, of the rotated, mirrored or inverted scan.
+    """Correlate rotated, mirrored and inverted copies of the registered scan with the topography.
 
-    The registered scan is correlated with the topography.
+    Return the largest correlation over all shifts.
     """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
@@ -145,7 +146,9 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
 
 
 def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Return the spectra of the mask of measured pixels, the heights at unit energy, and their squares."""
+    """Return three spectra: of the mask of measured pixels, of the heights at unit energy, and of the squares
+    of these heights.
+    """
     from scipy.fft import rfft2
 
     measured = np.isfinite(image)

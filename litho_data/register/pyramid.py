@@ -1,4 +1,4 @@
-"""Refine a registration from coarse to fine resolution, and estimate the blur of the print on the way."""
+"""Refine a registration from coarse to fine resolution, and estimate the blur of the print in the process."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -91,7 +91,9 @@ def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Arra
 def match_blur(
     smooth_scan: Array, layout_level: Array, layout_to_scan: Array, bend: Bend | None = None
 ) -> float:
-    """Return the Gaussian sigma, in layout pixels, whose topography correlates best with the aligned scan."""
+    """Return the sigma, in layout pixels, of the Gaussian blur that makes the topography correlate best with
+    the aligned scan.
+    """
     from scipy.ndimage import map_coordinates
 
     grid = warped_grid(layout_to_scan, layout_level.shape, bend)
@@ -150,7 +152,7 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """Return the fit on the lowest rung of the ladder that no higher rung beats on held-out blocks.
+    """Return the fit on the lowest rung of the ladder for which no higher rung is better on held-out blocks.
 
     Args:
         fine: a converged affine fit; the fit on every rung starts from this warp, projected to the rung.
@@ -170,7 +172,8 @@ def climb(fine: FineFit) -> FineFit:
 
 
 def held_out_energy(refinement: Refinement) -> Array:
-    """Return the residual energy (n,) of every block under a fit to the blocks of the other folds.
+    """Return an array (n,) with the residual energy of every block, under a fit to the blocks of the other
+    folds.
 
     The folds interleave, so each fold is spread over the whole field.
     """

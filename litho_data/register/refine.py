@@ -1,9 +1,9 @@
 """Refine a registration to sub-pixel accuracy by maximising the correlation of heights and topography.
 
 Gauss-Newton steps in the inverse compositional form maximise the correlation between the scan and the
-predicted topography over a warp, a gain and a quadratic background at once. G. D. Evangelidis, E. Z.
-Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113; S. Baker, I. Matthews, IJCV 56 (2004),
-doi:10.1023/B:VISI.0000011205.11775.fd.
+predicted topography. A warp, a gain and a quadratic background are fitted at the same time. G. D.
+Evangelidis, E. Z. Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113; S. Baker, I. Matthews, IJCV 56
+(2004), doi:10.1023/B:VISI.0000011205.11775.fd.
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,9 @@ class Refinement:
 
     ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend``, it maps to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, with gaps filled. ``gram`` (cells_y,
-    cells_x, k, k) contains the inner products of the regressors (gain, background, warp) and, last, the scan,
-    for each cell with sides of about ``CELL_PX`` pixels. These sums suffice to refit any part of the field.
+    cells_x, k, k) contains inner products for every cell, whose sides are about ``CELL_PX`` pixels long.
+    Their factors are the regressors (gain, background, warp) and, as the last one, the scan. These sums
+    suffice to refit any part of the field.
     """
 
     model: Model
@@ -83,11 +84,11 @@ def refine(
     Args:
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
-        start: 3×3 index matrix from the layout to the scan, of the kind ``model``. Its error may be as large
-            as the width of the structures.
-        bend: bend of the scan. If given, ``start`` must be an affine map, and warp and bend are evaluated but
-            not refined.
-        max_iterations: largest number of Gauss-Newton steps; 0 only evaluates the start.
+        start: 3×3 index matrix from the layout to the scan; it must be a warp of the kind ``model``. Its
+            error may be as large as the width of the structures.
+        bend: bend of the scan. If it is given, ``start`` must be an affine map, and the warp and the bend are
+            evaluated but not refined.
+        max_iterations: largest number of Gauss-Newton steps; with 0, the start is only evaluated.
         tolerance_px: the iteration ends when a step moves every corner by less than this.
     """
     from scipy.linalg import expm
@@ -128,7 +129,7 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """Return the ``gram`` of a scan that is already aligned with the topography.
+    """Return ``gram``, as in ``Refinement``, for a scan that is already aligned with the topography.
 
     Both are (ny, nx); the scan is NaN where not measured. ``count`` is the number of flows of the warp, see
     ``LADDER`` and ``BENT_COUNT``. ``further`` are additional regressors (ny, nx).
@@ -140,10 +141,10 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
 
 
 def in_blocks(gram: Array) -> Array:
-    """Sum the inner products of the cells over blocks of two by two cells, (blocks_y, blocks_x, k, k).
+    """Sum the inner products over blocks of two by two cells; the result is (blocks_y, blocks_x, k, k).
 
-    Errors of the topography extend over one or two features, so a block is the smallest area that counts as
-    independent.
+    Errors of the topography extend over one or two features. A block is therefore the smallest area that
+    counts as independent.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
@@ -169,7 +170,8 @@ def residual_energy(gram: Array, coefficients: Array) -> Array:
 
 
 def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
-    """Return the displacements (…, n, 2), in layout pixels, that fitted coefficients (…, k) give to points.
+    """Return the displacements (…, n, 2) of points, in layout pixels, under the warp of fitted coefficients
+    (…, k).
 
     The points are (n, 2). The result is not finite where the fitted gain of the topography is 0.
     """
@@ -188,7 +190,8 @@ def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
 
 
 def _regressors(topography: Array, count: int) -> Array:
-    """Return the regressors: topography, quadratic background, and the topography's change by each generator.
+    """Return the regressors: the topography, the quadratic background, and the change of the topography under
+    each generator of the warp.
 
     The shape is (7 + count, ny, nx).
     """

@@ -1,4 +1,4 @@
-"""Resample a scan onto the layout's pixels, once; the heights stay floats, and gaps stay gaps."""
+"""Resample a scan onto the layout's pixels in a single step. Heights remain floats, and gaps remain gaps."""
 
 from functools import lru_cache
 
@@ -36,8 +36,8 @@ def resample_to_layout(
 
     Returns:
         ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
-        valid if it falls between the scan's pixel centres and no gap lies within two pixels, which is the
-        reach of the spline's kernel.
+        valid if it falls between the scan's pixel centres and if no gap lies within two pixels of it. Two
+        pixels are the reach of the spline's kernel.
 
     Raises:
         InputError: the transform is not an invertible 3×3 matrix, or the scan has no measured pixel.
@@ -78,13 +78,16 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the share of white line offsets' variance that remains after resampling across the lines."""
+    """Return the share of the variance of white line offsets that remains after resampling across
+    the lines.
+    """
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Return frequencies (n,) and, for each, the squared error that resampling causes in a wave.
+    """Return frequencies (n,) and the squared errors (n,) that resampling causes in waves of these
+    frequencies.
 
     The frequencies run up to the Nyquist frequency, in cycles/µm. The error is relative to the wave's squared
     amplitude and averaged over sub-pixel positions. Averaging a finely sampled scan over the layout's pixel
@@ -100,7 +103,7 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return the weights (phases, lags) with which scan pixels enter one layout pixel.
+    """Return the weights (phases, lags) that the pixels of a scan have in one pixel of the layout.
 
     The distance of each scan pixel from the layout pixel is lag + phase, in pixels.
     """

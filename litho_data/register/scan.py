@@ -266,7 +266,9 @@ def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> t
 
 
 def _rounded(matrix: Array) -> Array:
-    """Round the matrix to digits with physical meaning, because more digits may differ between machines."""
+    """Round the matrix to the digits that have a physical meaning; further digits may differ between
+    machines.
+    """
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)

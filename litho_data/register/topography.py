@@ -12,7 +12,7 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
 
     Args:
         layout_level: (ny, nx) integer levels.
-        blur_px: Gaussian sigma of the process, layout pixels.
+        blur_px: sigma of the Gaussian that stands for the process, in layout pixels.
 
     Returns:
         (ny, nx) float32 in levels; the gain and offset that turn levels into heights remain free.
@@ -27,7 +27,7 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
 
     Args:
         height: (ny, nx), NaN where not measured.
-        sigma_px: Gaussian sigma, pixels.
+        sigma_px: sigma of the Gaussian, in pixels.
 
     Returns:
         (ny, nx) float64; gaps are filled from their surroundings. Pixels are NaN only where no measured
@@ -48,8 +48,9 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
 def fill_gaps(height: Array) -> Array:
     """Replace every NaN in the heights by extrapolating for three pixels and then holding a constant.
 
-    The first three pixels of a gap are a point reflection of the measured heights about the nearest measured
-    pixel. Slopes therefore continue, and an interpolating spline does not ring at the border.
+    In the first three pixels of a gap, the heights are the measured heights after point reflection about the
+    nearest measured pixel. Slopes therefore continue, and an interpolating spline does not ring at the
+    border.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -80,7 +81,9 @@ def remove_bow(height: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def quadratic_basis(shape: Shape) -> Array:
-    """Return 1, x, y, x², xy and y² on every pixel, read-only (6, ny, nx); x and y run from -1 to 1."""
+    """Return the terms 1, x, y, x², xy and y² on every pixel, as a read-only array (6, ny, nx). The
+    coordinates x and y run from -1 to 1.
+    """
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
     one = np.ones(shape)
@@ -92,7 +95,8 @@ def quadratic_basis(shape: Shape) -> Array:
 def pearson(a: Array, b: Array) -> float:
     """Return the Pearson correlation of two equally long vectors, or 0 if one of them is constant.
 
-    Sums are used in place of a matrix product, so that no digit depends on the number of BLAS threads.
+    Sums are used instead of a matrix product, so that the result does not depend on the number of BLAS
+    threads.
     """
     a, b = (values - values.mean(dtype=float) for values in (a, b))
     energy = float((a * a).sum()) * float((b * b).sum())

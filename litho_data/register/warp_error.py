@@ -1,7 +1,8 @@
-"""Estimate the error of a registration's warp, and the surface in the heights that is not the print.
+"""Estimate the error of a registration's warp, and the surface that the heights contain besides the print.
 
 Gain, quadratic surface and warp are refitted with each block of the field left out in turn (jackknife). The
-spread of these fits includes effects that the topography does not explain, if they differ between blocks.
+spread of these fits also includes effects that the topography does not explain, provided that these effects
+differ between blocks.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ _MAGNIFICATION = 3
 
 @dataclass(frozen=True)
 class WarpError:
-    """The errors of the warp between a scan and its layout, and of the surface that is not the print.
+    """The errors of the warp between a scan and its layout, and of the surface that the heights contain
+    besides the print.
 
     Attributes:
         covariance: covariance (k, k) of the amounts of the flows in ``register.flows``, in the normalised
@@ -51,8 +53,9 @@ class WarpError:
         """Return the mean square of the surface that the heights contain in addition to the print.
 
         The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
-        Levelling wrongly removes the quadratic part of the print and its roughness. The error of the fit
-        estimates this missing part. For levelled heights, the two mean squares are therefore added.
+        Levelling also removes a quadratic surface that belongs to the print and its roughness. The error of
+        the fit is an estimate of this missing surface. For levelled heights, the two mean squares are
+        therefore added.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
@@ -77,12 +80,13 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """Return the errors of a registration's warp, and of the surface in the heights that is not the print.
+    """Return the errors of a registration's warp, and of the surface that the heights contain besides the
+    print.
 
     Args:
         height: (ny, nx) registered heights, NaN where not valid.
         layout_level: (ny, nx) integer levels.
-        blur_px: Gaussian sigma of the topography, layout pixels.
+        blur_px: sigma of the Gaussian blur of the topography, in layout pixels.
         model: the model in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
     """
     shape = height.shape

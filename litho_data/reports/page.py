@@ -1,4 +1,6 @@
-"""Write self-contained HTML reports: a verdict, pictures, tables (also as CSV), and how they were made."""
+"""Write self-contained HTML reports with a verdict, pictures, tables (also as CSV) and a record of their
+origin.
+"""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _FONT_PT, _DPI = 7.0, 300
 
 @dataclass(frozen=True)
 class PaperCopies:
-    """Formats in which a report's figures and, in addition to CSV, its tables are also written."""
+    """Formats of the copies of figures and tables for a paper. Tables are always written as CSV, too."""
 
     figures: Figures | None = None
     tables: Tables = "csv"
@@ -92,7 +92,8 @@ def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digit
     """Write a table beside its CSV file, in the requested format and with ``digits`` decimal places.
 
     Args:
-        frame: the table; ``names``: the titles of its columns.
+        frame: the table.
+        names: titles of its columns.
         csv_path: path of the CSV file, which has full precision.
     """
     if wanted().tables == "csv":

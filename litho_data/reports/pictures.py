@@ -48,7 +48,9 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
 
 
 def svg_address(figure: Figure) -> str:
-    """Return a figure as a data address (SVG), whose ``LIGHT`` colours follow the mode of the screen."""
+    """Return a figure as the data URL of an SVG. Its ``LIGHT`` colours follow the light or dark mode of the
+    screen.
+    """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
@@ -66,7 +68,7 @@ def svg_address(figure: Figure) -> str:
 
 
 def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
-    """Return an image as a data address (PNG), coloured by a matplotlib colour map and transparent at NaN.
+    """Return an image as the data URL of a PNG, coloured by a matplotlib colour map and transparent at NaN.
 
     Args:
         image: (ny, nx), one value per pixel of the picture.

@@ -34,7 +34,7 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
     mean.
 
     Args:
-        height_um: levelled height, µm, any shape; NaN is ignored.
+        height_um: levelled heights in µm, of any shape; NaN is ignored.
         valid: pixels to use; all by default.
 
     Raises:
@@ -83,10 +83,10 @@ def autocorrelation(height_um: Array) -> Array:
 
 
 def effective_samples(height_um: Array) -> float:
-    """Return the effective number of independent heights in a field, pixels / Σ ρ², for its variance.
+    """Return the effective number of independent heights for the variance of a field, pixels / Σ ρ².
 
     For a Gaussian surface, the estimated mean square has the relative variance ``2 Σ ρ² / pixels``. The sum
-    excludes lags beyond a quarter of the field, because ρ² there is only noise of the estimate.
+    excludes lags beyond a quarter of the field, because ρ² consists only of noise there.
     """
     correlation = autocorrelation(height_um)
     rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
@@ -98,7 +98,7 @@ def effective_samples(height_um: Array) -> float:
 
 
 def sq_uncertainty_nm(height_um: Array) -> float:
-    """Return the standard uncertainty of Sq due to the finite field, nm.
+    """Return the standard uncertainty of Sq, in nm, that is due to the finite field.
 
     It is ``Sq / √(2 n_eff)`` for Gaussian heights.
     """

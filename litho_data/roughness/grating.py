@@ -22,7 +22,9 @@ _OVERLAP_VARIANCE = 1 + 2 / 6
 
 @dataclass(frozen=True)
 class Wave:
-    """The fundamental wave of a grating: frequencies along x and y, cycles/µm, and standard uncertainty."""
+    """The fundamental wave of a grating: its frequencies along x and y with their standard uncertainty, in
+    cycles/µm.
+    """
 
     x_per_um: float
     y_per_um: float
@@ -46,7 +48,8 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
     Args:
         height_um: (ny, nx), NaN where not measured.
         pitch_um: stated (y, x) pitch.
-        period_um: known period; the search covers this period times and divided by ``SEARCHED``.
+        period_um: known period. The search covers periods from ``period_um / SEARCHED`` to ``period_um *
+            SEARCHED``.
         axis: the axis along which the grating repeats.
 
     Raises:
@@ -77,14 +80,16 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
 
 def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
-    """Return the displacement along x of a line's middle relative to its ends, and its uncertainty, µm.
+    """Return how far the middle of a line is displaced along x relative to its ends, with the uncertainty, in
+    µm.
 
     If the displacement is b, a pixel at x on a line of length L shows the surface at x + 4 b (x / L) (1 - x /
     L), apart from shift and scale.
 
     Args:
-        height_um: (ny, nx) of a grating along x; ``pitch_um``: stated (y, x).
-        wave: as ``find_wave`` measured it.
+        height_um: heights (ny, nx) of a grating along x.
+        pitch_um: stated (y, x) pitch.
+        wave: the wave of the grating, as measured by ``find_wave``.
     """
     y, x = (np.arange(n) * step for n, step in zip(height_um.shape, pitch_um, strict=True))
     flat = np.nan_to_num(height_um - np.nanmean(height_um))
@@ -120,7 +125,9 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
 
 
 def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
-    """Return the frequency (along, across) of highest power in the searched range within 15° of the axis."""
+    """Return the frequency (along, across) with the highest power in the searched range, at most 15° from the
+    axis.
+    """
     ny, nx = flat.shape
     windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
     power = np.abs(np.fft.fft2(windowed)[:, : nx // 2 + 1]) ** 2
@@ -134,8 +141,8 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """Return the correction to a frequency (along, across), the uncertainty of its part along the axis, and
-    the scatter of the phases in rad.
+    """Return the correction to a frequency (along, across), the uncertainty of the correction along the axis,
+    and the scatter of the phases in rad.
     """
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
@@ -164,7 +171,9 @@ def _line(places: Array, phases: Array) -> tuple[float, float, float]:
 
 
 def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
-    """Return the last column's weight in a least-squares fit, its standard uncertainty, and the scatter."""
+    """Fit values by least squares; return the weight of the last column, its standard uncertainty, and the
+    scatter.
+    """
     design = np.column_stack(columns)
     weights, *_ = np.linalg.lstsq(design, values, rcond=None)
     rest = values - design @ weights

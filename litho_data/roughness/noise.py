@@ -24,7 +24,7 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
     print, so they are not included.
 
     Args:
-        height_um: heights, µm, shape (ny, nx), NaN where not measured.
+        height_um: heights (ny, nx) in µm, NaN where not measured.
         fast_axis: axis along which the tip moved.
 
     Returns:
@@ -56,6 +56,8 @@ def _fine_sd(differences: Array) -> float:
 
 
 def robust_sd(values: Array) -> float:
-    """Estimate a standard deviation from the median absolute deviation, ignoring NaN; NaN without values."""
+    """Estimate a standard deviation from the median absolute deviation. NaN is ignored; without other values,
+    the result is NaN.
+    """
     known = values[np.isfinite(values)]
     return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

@@ -25,14 +25,15 @@ class Spectrum:
 def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
     """Return the one-sided power spectral density along one axis, averaged over the lines.
 
-    The mean and slope of each line are removed. The line is multiplied by a Hann window, for whose power the
-    spectrum is corrected, so that ``Σ density·Δf`` is the mean square of the lines.
+    The mean and slope of each line are removed. Each line is multiplied by a Hann window. The spectrum is
+    corrected for the power of this window, so that ``Σ density·Δf`` is the mean square of the lines.
 
     Args:
-        height_um: finite heights, µm, shape (ny, nx).
-        pitch_um: pitch along the axis, µm.
+        height_um: finite heights (ny, nx) in µm.
+        pitch_um: pitch along the axis, in µm.
         axis: ``x`` along rows, ``y`` along columns.
-        window: whether to remove the slope and use the window; False is for periodic or noise-like surfaces.
+        window: whether to remove the slope and use the window. False is suitable for periodic or noise-like
+            surfaces.
 
     Raises:
         InputError: the surface contains NaN, the lines are shorter than 8 pixels, or the axis is unknown.
@@ -53,7 +54,7 @@ def hann(shape: Shape) -> Array:
 
 
 def lines_nm(height_um: Array, axis: Axis) -> Array:
-    """Return the profiles along an axis as rows, nm.
+    """Return the profiles along an axis, in nm, as the rows of an array.
 
     Raises:
         InputError: the axis is neither x nor y.

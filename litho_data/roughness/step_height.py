@@ -39,9 +39,9 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     profile spans three widths.
 
     Args:
-        height_um: heights, µm, shape (ny, nx); NaN is ignored.
-        left_um: position of the first edge along x, µm from the field's border.
-        right_um: position of the second edge, µm.
+        height_um: heights (ny, nx) in µm; NaN is ignored.
+        left_um: position of the first edge along x, in µm from the field's border.
+        right_um: position of the second edge, in µm from the same border.
 
     Raises:
         InputError: the edges are in the wrong order, or the arms extend beyond the field.
@@ -71,7 +71,7 @@ def stair_steps(
     The height of a step is the difference between two neighbouring treads.
 
     Args:
-        edges_um: positions of the edges along the axis, ascending, µm.
+        edges_um: positions of the edges along the axis in µm, in ascending order.
 
     Raises:
         InputError: the edges are not ascending positions inside the field, or a tread is narrower than 3
@@ -129,7 +129,7 @@ def _summary(step_nm: Array) -> StepHeight:
 
 
 def _independent_lines(values: Array) -> float:
-    """Return the number of independent lines, n / (1 + 2 Σ ρ), summed up to the first negative ρ."""
+    """Return the number of independent lines, n / (1 + 2 Σ ρ). The sum ends before the first negative ρ."""
     deviation = values - values.mean()
     correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
     negative = np.flatnonzero(correlation < 0)
@@ -140,9 +140,10 @@ def _independent_lines(values: Array) -> float:
 def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
     """Find the edges of a step, ridge, groove or row of grooves in a scan, and return their mean height.
 
-    An edge is a place where the median profile, without the slope of the field, changes by at least half of
-    its largest change. ``stair_steps`` measures the heights, whose absolute values are averaged. The edges of
-    one scan share treads, so the mean is given the uncertainty of a single edge.
+    The slope of the field is removed from the median profile. An edge is a place where the change of this
+    profile is at least half as large as its largest change. ``stair_steps`` measures the heights of the
+    steps, and their absolute values are averaged. The steps of one scan share treads and are not independent,
+    so the mean is given the uncertainty of a single step.
 
     Raises:
         InputError: no edge stands out from the profile, or edges are closer than three pixels.

@@ -1,4 +1,4 @@
-"""Find out whether a surface has lines, in which direction they run, and whether they repeat."""
+"""Find the direction and the period of lines on a surface, and test whether they could occur by chance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,8 +47,9 @@ class LinePeriod:
         share: share of the power of the line means that lies in the peak.
         p: probability of such a peak anywhere in a smooth spectrum.
         amplitude_um: amplitude at this period, as a root mean square over the surfaces.
-        coherence: length of the mean of the surfaces' unit phasors at this period; 1 if all have the same
-            phase, about 1 / √F if the phases of F surfaces are independent.
+        coherence: agreement of the phases at this period. Every surface has a phasor of unit length, and the
+            coherence is the length of the mean phasor. It is 1 if all surfaces have the same phase, and about
+            1 / √F if the phases of F surfaces are independent.
     """
 
     period_um: float
@@ -67,7 +68,7 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     P)² / Σ P² is the effective number of frequencies.
 
     Args:
-        heights_um: levelled heights (ny, nx), µm, on square pixels; NaN counts as the mean.
+        heights_um: levelled heights (ny, nx), µm, on square pixels; NaN is replaced by the mean.
 
     Raises:
         InputError: a surface has fewer than 64 rows or columns.
@@ -84,7 +85,9 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
 
 
 def _mean_vector(height_um: Array) -> tuple[complex, float]:
-    """Return the mean double-angle vector of a surface's power, and its variance for an isotropic surface."""
+    """Return the mean double-angle vector of the power of a surface, and the variance that this vector would
+    have on an isotropic surface.
+    """
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
         raise InputError(
@@ -148,7 +151,9 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """Return the level at each frequency, from the surrounding ones, and the probability of such a peak."""
+    """Return the level that the surrounding frequencies give at each frequency, and the probability that the
+    power exceeds it this much by chance.
+    """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)
     level, chance = np.empty(len(power)), np.empty(len(power))

@@ -21,10 +21,11 @@ _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20
 
 @dataclass(frozen=True)
 class Known:
-    """Large objects that each process makes for itself; jobs and results refer to the objects by name.
+    """Large objects that are not sent: every process makes them for itself, and jobs and results refer to
+    them by name.
 
-    ``make`` makes ``objects`` again; it must be importable by name, as a partial is. A process keeps the
-    objects that it made last.
+    ``make`` is a function that makes ``objects`` again. It must be importable by name, or be a partial of
+    such a function. A process keeps only the objects that it made last.
     """
 
     make: Callable[[], Facts]
@@ -33,7 +34,8 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A function that another process runs in the same folder, recording the same command line in results.
+    """A function that runs in another process, but in the same folder as here. Its results record the command
+    line of this process.
 
     ``plugins`` are files of plug-ins to load first; ``software`` is the software that a Dask worker must also
     run.
@@ -129,7 +131,7 @@ def _require_alike(wanted: Facts, folder: str) -> None:
 
 @cache
 def _keep_freed_memory() -> None:
-    """Let a Dask worker reuse freed memory, as other processes do.
+    """Let a Dask worker reuse freed memory, as processes do by default.
 
     Dask starts its workers with MALLOC_TRIM_THRESHOLD_, so that every array above 128 KiB gets new pages.
     Making these pages takes a third of the time of a build.

@@ -37,10 +37,10 @@ _TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that run jobs. ``present`` returns their current number; the errors in ``lost`` mean that a job
-    was lost with its worker.
+    """Workers that run jobs. ``present`` returns the current number of workers. Each error type in ``lost``
+    means that a job was lost because its worker died.
 
-    ``tries`` is the largest number of times that a job is started; ``restart`` is called before lost jobs are
+    ``tries`` is the maximum number of times that a job is started; ``restart`` is called before lost jobs are
     started again.
     """
 
@@ -54,14 +54,14 @@ class Pool(NamedTuple):
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run: in this process, in local processes, or on a Dask cluster. Results are identical bit by
-    bit if each process has the same number of threads.
+    """Where jobs run: in this process, in local processes, or on a Dask cluster. Results are bit-identical if
+    every process has the same number of threads.
 
     Attributes:
         processes: number of local processes, with one thread each unless the environment says otherwise; 1
             means that jobs run in this process.
         dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
-        known: objects in jobs that need not be sent.
+        known: objects that jobs use but that are not sent with them, because each worker makes them itself.
         pool: see ``kept_open``.
     """
 
@@ -76,7 +76,7 @@ class Workers:
 
     @property
     def elsewhere(self) -> bool:
-        """Return whether jobs leave this process."""
+        """Return whether jobs run outside this process."""
         return self.dask is not None or self.processes > 1
 
 
@@ -91,20 +91,21 @@ def run_jobs(
     name: Callable[[J], str] = str,
     apart: bool = False,
 ) -> Generator[tuple[J, R], None, None]:
-    """Yield each job with its result, in the order in which the jobs are finished.
+    """Yield each job with its result, in the order in which the jobs finish.
 
     At most two jobs per worker are in progress, so memory does not grow with the number of jobs. Jobs whose
-    workers died are run again, one at a time and at most twice; Dask repeats them as often as its scheduler
-    allows.
+    local workers died are run again, one at a time and at most twice. On a Dask cluster, the scheduler
+    decides how often such jobs are repeated.
 
     Args:
         function: must be importable by name; jobs and results must be picklable.
-        name: what messages call a job.
-        apart: whether the function starts a process and waits for it. Local workers can then be threads.
+        name: returns the name of a job in messages.
+        apart: whether the function starts a separate process and waits for it. For such functions, local
+            workers are threads.
 
     Raises:
-        InputError: there is no scheduler at the address, a worker has other software or several threads, or
-            the worker of a job died.
+        InputError: there is no scheduler at the address, a worker has different software or several threads,
+            or the worker of a job died.
     """
     if not workers.elsewhere or len(jobs) < (1 if workers.dask else 2):
         yield from ((job, function(job)) for job in jobs)
@@ -127,7 +128,7 @@ def run_jobs(
 def _tried(
     submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
 ) -> Iterator[tuple[int, R]]:
-    """Yield the numbers of jobs with their answers; jobs lost with a worker are tried again, one by one."""
+    """Yield the number and the result of each job. Jobs whose worker died are tried again, one by one."""
     tries: Counter[int] = Counter()
 
     def begin(number: int) -> Future[R]:
@@ -169,8 +170,8 @@ def _tried(
 
 @contextmanager
 def kept_open(workers: Workers) -> Iterator[Workers]:
-    """Yield the same workers, started once for all jobs of the block. If they cannot start, raise the error
-    at once.
+    """Start the workers once and keep them running for the whole ``with`` block. If they cannot start, raise
+    the error at once.
 
     Raises:
         InputError: there is no scheduler at the address, or it has no worker.
@@ -185,7 +186,9 @@ def kept_open(workers: Workers) -> Iterator[Workers]:
 def _windowed(
     submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
 ) -> Iterator[tuple[J, Future[R]]]:
-    """Yield jobs as they finish, with two in progress for each of ``count()`` workers."""
+    """Yield jobs as they finish. ``count()`` is the number of workers, and two jobs per worker are in
+    progress.
+    """
     waiting = iter(jobs)
     running: dict[Future[R], J] = {}
 
@@ -298,8 +301,8 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Check that a scheduler answers at the address. A client that meets another program there waits for a
-    long time and then crashes.
+    """Check that a scheduler answers at the address. If another program listens there, a Dask client would
+    wait for a long time and then crash.
     """
     from distributed.core import rpc
 

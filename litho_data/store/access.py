@@ -1,4 +1,4 @@
-"""Access Zarr groups and arrays with types and checks, and report damaged bytes as one clear error."""
+"""Access Zarr groups and arrays through typed functions that report damaged bytes as one clear error."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def open_root(path: str | Path) -> zarr.Group:
 
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
-    """Return the child group of this name.
+    """Return the child group with this name.
 
     Raises:
-        InputError: there is no group of this name.
+        InputError: there is no group with this name.
     """
     import zarr
 
@@ -55,10 +55,10 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
 
 
 def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Return the child array of this name.
+    """Return the child array with this name.
 
     Raises:
-        InputError: there is no array of this name.
+        InputError: there is no array with this name.
     """
     import zarr
 
@@ -66,10 +66,10 @@ def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
 
 
 def has_child(parent: zarr.Group, name: str) -> bool:
-    """Return whether there is a child of this name.
+    """Return whether there is a child with this name.
 
     Raises:
-        InputError: there is one, but its metadata is damaged.
+        InputError: the child exists, but its metadata is damaged.
     """
     return _child(parent, name) is not None
 

@@ -19,7 +19,7 @@ class StoredScans:
 
     @classmethod
     def of(cls, store: Store, scans: Sequence[PrintedScan]) -> StoredScans:
-        """Make the reference to these scans."""
+        """Make a reference to these scans."""
         return cls(str(store.path), store.sha256, tuple(scan.id for scan in scans))
 
     def read(self) -> list[PrintedScan]:
@@ -38,5 +38,5 @@ class StoredScans:
         return [store.scan(scan_id) for scan_id in self.ids]
 
     def by_id(self) -> dict[str, PrintedScan]:
-        """Return the scans by their ids."""
+        """Return a dict of the scans by id."""
         return {scan.id: scan for scan in self.read()}

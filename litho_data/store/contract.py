@@ -79,20 +79,21 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Facts) -> bool:
-    """Return whether a copy made by xarray, which has no groups, may lack the chunk of this array.
+    """Return whether a copy that xarray made may lack the chunk of this array.
 
-    xarray does not write chunks that contain only fill values. Examples are the order 0 of a single scan, and
-    a column that is empty for all scans of the copy.
+    A copy made by xarray has no groups, and it lacks chunks that contain only fill values, because xarray
+    does not write such chunks. Examples are the order of a single scan if it is 0, and a column that is empty
+    for all scans of the copy.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
 
 
 def file_names(path: Path) -> set[str]:
-    """Return the names, with forward slashes, of all files of a store, which is a folder or a zip file.
+    """Return the names of all files in a store (a folder or a zip file), with forward slashes.
 
     Raises:
-        InputError: a name in the zip file leads out of the store.
+        InputError: a name in the zip file points outside the store.
     """
     if path.is_dir():
         found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
@@ -129,7 +130,9 @@ def _chunks(document: Facts) -> Iterator[str]:
 
 
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    """Return name, pitch, level height, levels, write table and instrument of a store; refuse wrong ones."""
+    """Return the name, pitch, level height, levels, write table and instrument of a store, and refuse invalid
+    values.
+    """
     attributes = dict(root.attrs)
     name = str(attributes.get("name", path.name.partition(".")[0]))
     write = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
@@ -149,7 +152,9 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """Return the arrays over all scans by name; refuse missing arrays, wrong shapes, types or dimensions."""
+    """Return a dict of the arrays over all scans. Refuse a store in which one is missing, or has a wrong
+    shape, type or dimensions.
+    """
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
     if has_child(root, SIGMA.name):
@@ -195,11 +200,11 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     """Return ``scan`` (the ids), ``print``, ``order`` and all optional columns of a store.
 
-    Missing numbers are None, and missing texts "".
+    Missing numbers are returned as None, and missing strings as "".
 
     Raises:
-        InputError: there is no scan, an id repeats or contains a path, a column has another length, or a
-            number is impossible.
+        InputError: there is no scan, an id occurs twice or contains a path, a column does not have one value
+            per scan, or a number is out of range.
     """
     columns: dict[str, list[Any]] = {
         name: [require_plain_name(f"{name} of {path}", str(value)) for value in values_of(root, name)]
@@ -234,7 +239,9 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return the shape (ny, nx) of every scan without padding; refuse one that exceeds the padded field."""
+    """Return the shape (ny, nx) of every scan without padding, and refuse shapes larger than the padded
+    field.
+    """
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
     quality = group_of(root, "quality")
@@ -249,10 +256,11 @@ def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...
 
 
 def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> None:
-    """Refuse a scan with impossible levels, heights or transform, or without any measured pixel.
+    """Refuse a scan if a level or height is out of range, its transform is not invertible, or no pixel was
+    measured.
 
     Raises:
-        InputError: a level, a height or the transform is impossible, or no pixel was measured.
+        InputError: names the value that is refused.
     """
     highest = int(samples["mask_level"].max())
     if highest >= levels:
@@ -275,7 +283,7 @@ def require_manifest(manifest: Facts, path: Path) -> None:
     A manifest that contains only the table of files does not come from a build, and needs fewer entries.
 
     Raises:
-        InputError: names the first entry that is missing or of another kind.
+        InputError: names the first entry that is missing or has the wrong type.
     """
     with damaged(f"manifest of {path}"):
         texts: list[Any] = []
@@ -289,4 +297,4 @@ def require_manifest(manifest: Facts, path: Path) -> None:
             if pitch is not None:
                 PITCH_UM.require("pitch_um", [pitch[0], pitch[1]])
         if not all(isinstance(text, str) for text in texts):
-            raise TypeError("a number in place of a text")
+            raise TypeError("a number where a string is required")

@@ -12,7 +12,7 @@ from litho_data.foundation import InputError
 
 
 class HasPrint(Protocol):
-    """The facts about a scan on which the draw depends: its id and its print."""
+    """The properties of a scan that determine whether it is put into the lock box: its id and its print."""
 
     @property
     def id(self) -> str: ...
@@ -35,7 +35,7 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
         print_ids: the print of each scan, in the same order.
 
     Raises:
-        InputError: an id repeats, or the lists have different lengths.
+        InputError: an id occurs twice, or the lists have different lengths.
     """
     require_unique(ids)
     if len(print_ids) != len(ids):
@@ -52,15 +52,17 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
 
 
 def drawing_key(name: str, seed: int) -> str:
-    """Return a key by which to sort names, in an order that depends only on the seed, not on the machine."""
+    """Return a key that sorts names in a random order. The order depends only on the seed, and it is the same
+    on every machine.
+    """
     return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
 
 def require_unique(ids: Sequence[str]) -> None:
-    """Refuse ids that repeat.
+    """Refuse duplicate ids.
 
     Raises:
-        InputError: names the ids that repeat.
+        InputError: names the duplicate ids.
     """
     if len(set(ids)) != len(ids):
         repeated = sorted({scan_id for scan_id in ids if list(ids).count(scan_id) > 1})

@@ -37,13 +37,13 @@ class Piece:
 
 
 def outputs_of(record: Facts) -> list[Facts]:
-    """Return all outputs of the steps in a scan's record, each with name, hash, shape, …"""
+    """Return all outputs of the steps in a scan's record. Each output states its name, hash, shape, etc."""
     return [output for step in record["steps"] for output in step["outputs"]]
 
 
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
-    """Yield the unfinished store of ``out``, which only one build at a time may use.
+    """Yield the unfinished store of ``out`` and lock it, so that no other build uses it at the same time.
 
     Raises:
         InputError: ``out`` exists but is not a dataset store, cannot be written, or is already being built.
@@ -83,7 +83,8 @@ class PartialStore:
 
         Args:
             root: the root group to which scans are added.
-            keys: for each id to build, a function that returns its key. Scans with other ids are removed.
+            keys: maps each id to build to a function that returns the key of the scan. Scans with other ids
+                are removed.
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):

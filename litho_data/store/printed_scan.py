@@ -16,30 +16,34 @@ class PrintedScan:
     """One printed field: the layout sent to the printer and the height measured on the layout's grid.
 
     Args:
-        id: name of the scan; ``print_id``: the block of fields with which it was printed; ``order``: its
-            position in the writing order.
-        mask_level: layout levels, uint8 (beyond 256 levels uint16), (ny, nx).
+        id: name of the scan. ``print_id`` names the block of fields with which it was printed, and ``order``
+            is its position in the writing order.
+        mask_level: layout levels (ny, nx), uint8, or uint16 if there are more than 256 levels.
         height_um: float32 (ny, nx), µm, NaN where not measured.
         valid: bool (ny, nx), True where the pixel was measured and lies inside the scan.
-        pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
+        pitch_um: pixel pitch of all three arrays, µm. ``level_height_um`` is the nominal height of a level,
+            µm.
         levels: number of levels that the layout may use.
-        scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
+        scan_to_layout: 3 x 3 matrix, float64, that maps (x_um, y_um, 1) from the scan's own frame to the
+            layout frame.
         write: the card's ``[write]`` table; None if the card has none.
-        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose. Each is
-            None if the card does not state it.
-        turned_deg: rotation of the scan relative to the others; ``direction``: 1 trace, -1 retrace; ``tip``:
-            number of the tip; ``pixel_size``: pixel size of the scan relative to the others. Each is None if
-            the card does not state it.
-        bend_um: bend of the scan; ``scan_to_layout`` then acts on the straightened positions.
-        tip_radius_um: radius of the microscope's tip, or its upper bound; None if the store has neither.
-        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um`` apart from the scan's
-            offset; NaN where not valid. None if the store has none.
-        groups: named groups of the card's id pattern other than the print, such as the field, with values.
-        instrument: name of the instrument, if the card's table gives it; ``seen_by``: its kind, which says
-            what the heights are (``Instrument``).
-        surround: what lies around the printed field: ``substrate`` (bare, as the rim of level 0 in the layout
-            shows), ``continues`` (more of the print, so the outermost pixels are not valid) or ``unknown``
-            (the default).
+        field_x_um, field_y_um: position of the scan in its write field, µm. ``dose`` is the relative dose.
+            None means that the card does not state the value.
+        turned_deg: rotation of the scan relative to the other scans. ``direction`` is 1 for trace and -1 for
+            retrace, ``tip`` is the number of the tip, and ``pixel_size`` is the pixel size relative to the
+            other scans. None means that the card does not state the value.
+        bend_um: bend of the scan. If there is one, ``scan_to_layout`` applies to the positions after
+            straightening.
+        tip_radius_um: radius of the microscope's tip, or an upper bound for it; None if the store has
+            neither.
+        height_sigma_um: standard uncertainty of ``height_um``, which excludes the offset of the scan; float32
+            (ny, nx), µm, NaN where not valid. None means that the store does not contain it.
+        groups: values of the named groups in the card's id pattern, such as the field, except the print.
+        instrument: name of the instrument, if the card's table gives it. ``seen_by`` is the kind of
+            instrument, which determines what the heights mean (see ``Instrument``).
+        surround: what lies around the printed field. ``substrate`` means bare substrate, which the layout
+            shows as a rim of level 0. ``continues`` means more of the print, so the outermost pixels are not
+            valid. The default is ``unknown``.
     """
 
     id: str
@@ -82,7 +86,7 @@ class PrintedScan:
 
     @property
     def quarter_turns(self) -> int:
-        """Return how often ``rot90`` rotates the layout's grid to the scan's, 0 to 3, by the registration."""
+        """Return how many quarter turns (``rot90``, 0 to 3) rotate the layout's grid to that of the scan."""
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 

@@ -136,7 +136,8 @@ class Store:
     def _groups(self, scan_id: str) -> dict[str, str]:
         """Return the named groups of the card's id pattern, except ``print``, with their values for one id.
 
-        A pattern with repetitions is not applied, because in a store from elsewhere it might never finish.
+        A pattern with repetitions is not applied. In a store of unknown origin, matching such a pattern might
+        never finish.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -235,12 +236,12 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Return the hash of the dataset as it was first read, which does not depend on chunking."""
+        """Return the hash of the dataset, which is computed once and does not depend on chunking."""
         return self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:
-        """Return name and hash of the dataset, for results that are made from it."""
+        """Return the name and the hash of the dataset, which are recorded in results made from it."""
         return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:
@@ -265,7 +266,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """Return the bend of a scan in its own frame, or None if none is stored."""
+        """Return the bend of a scan in the scan's own frame, or None if no bend is stored."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

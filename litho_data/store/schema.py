@@ -54,7 +54,9 @@ SAMPLE_VARIABLES, (SIGMA,), SCAN_VARIABLES = (
     tuple(Variable(name, tuple(dims.split()), *rest) for name, (dims, *rest) in table.items())
     for table in table_beside(__file__, "variables.toml").values()
 )
-"""The arrays over all scans, their uncertainty, and the arrays of single scans; see ``variables.toml``."""
+"""All arrays of a store: those over all scans, their uncertainty, and those of single scans (see
+``variables.toml``).
+"""
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layouts' grid."""
 # An array with mixed units has no unit as a whole; hashes use 1.
@@ -69,18 +71,19 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Optional numbers per scan from the card's table, with their ranges; NaN where a row has none."""
+"""Optional numbers per scan from the card's table, with their ranges. A number is NaN where the row has none.
+"""
 Instrument = Literal["afm", "profilometer", "confocal", "sem"]
 """Kind of instrument. Heights are measured by a probe (``afm``, ``profilometer``) or by light
 (``confocal``). With ``sem``, they are a film's height times the share of a pixel that it covers, from the
 edges in an electron micrograph."""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
-"""Optional words per scan from the card's table; empty where a row has none."""
+"""Optional words per scan from the card's table. A word is empty where the row has none."""
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:
-    """Return the facts about all scans that enter the dataset's hash.
+    """Return the facts common to all scans that are part of the dataset's hash.
 
     Args:
         geometry: an object with ``pitch_um``, ``level_height_um`` and ``levels``.
@@ -95,11 +98,12 @@ def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[s
 def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
     """Return the hash of all data of a dataset that a model can use.
 
-    The hash does not depend on chunking, padding and metadata texts.
+    The hash does not depend on chunking, padding or descriptive metadata.
 
     Args:
         facts: see ``dataset_facts``.
-        scans: for each scan, in stored order: ``id``, ``print``, ``order``, the optional columns that are not
-            NaN, and ``arrays``, a dict that maps variable names to :meth:`Variable.sample_sha256`.
+        scans: one dict per scan, in stored order. The keys of each dict are ``id``, ``print``, ``order``, the
+            optional columns that are not NaN, and ``arrays``, which maps the name of each variable to its
+            hash (:meth:`Variable.sample_sha256`).
     """
     return record_sha256({"facts": dict(facts), "scans": [dict(scan) for scan in scans]})

@@ -1,4 +1,4 @@
-"""Write a dataset store with one scan per chunk, which suits other tools, and a checksum for each chunk."""
+"""Write a dataset store. Each chunk contains one scan, as suits other tools, and has a checksum."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import zarr
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
-"""Values that pad the arrays of a layout that is smaller than the largest layout."""
+"""Fill values that extend the arrays of smaller layouts to the size of the largest layout."""
 # The arrays that can serve as the OME-Zarr image of a scan, in order of preference.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
@@ -54,7 +54,9 @@ def write_scan_group(
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
-    """Return the OME-NGFF 0.5 description of an image; its axes are named as the array's dimensions."""
+    """Return the OME-NGFF 0.5 description of an image. The axes of the image have the same names as the
+    dimensions of the array.
+    """
     axes = [{"name": _OWN_FRAME[axis], "type": "space", "unit": "micrometer"} for axis in "yx"]
     scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
     dataset = {"path": path, "coordinateTransformations": scale}
@@ -71,9 +73,9 @@ def write_samples(
 
     Args:
         root: an open group.
-        scans: for each scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers
-            and words) and ``arrays`` (names of the arrays that were made from it).
-        load: function that returns the arrays of an id on the layout grid.
+        scans: one dict per scan with ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional
+            numbers and words) and ``arrays`` (names of the arrays that were made from the scan).
+        load: function that takes the id of a scan and returns the arrays of this scan on the layout grid.
         pitch_um: pitch of the layout grid, µm.
     """
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
@@ -118,7 +120,7 @@ def pixel_centres_um(count: int, pitch_um: float) -> Array:
 def write_table(
     root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict[str, Any] | None = None
 ) -> None:
-    """Write a table as a group of one-dimensional arrays over ``dim``, with all texts in UTF-8."""
+    """Write a table as a group of one-dimensional arrays over ``dim``; all strings are encoded in UTF-8."""
     group = root.create_group(name, attributes=attributes or {})
     for column in table.columns:
         values = table[column].to_numpy()
@@ -129,7 +131,7 @@ def write_table(
 
 
 def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str) -> None:
-    """Write a one-dimensional array of UTF-8 texts."""
+    """Write a one-dimensional array of UTF-8 strings."""
     _write(group, name, np.array(values, dtype=object), dim, "string")
 
 
@@ -149,8 +151,8 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
     """Create an array, compressed by Zstandard after a byte shuffle, with a checksum that reveals damage.
 
-    Chunks that contain only fill values are written too. By default they would have no file, which would look
-    like a lost chunk.
+    Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk, so
+    it would look like a lost chunk.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -189,7 +191,9 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
 
 
 def _padded(name: str, sample: Array, shape: Shape) -> Array:
-    """Place a sample in the upper left corner of the common shape, with ``PADDING`` elsewhere."""
+    """Return an array of the common shape, with the sample in the upper left corner and ``PADDING``
+    elsewhere.
+    """
     if sample.shape == shape:
         return sample
     whole = np.full(shape, PADDING[name], dtype=sample.dtype)

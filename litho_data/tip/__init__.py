@@ -1,4 +1,4 @@
-"""Estimate the radius of the microscope's tip from its scans, and find where the tip did not touch."""
+"""Estimate the radius of an AFM tip from scans, and find where the tip did not touch the surface."""
 
 from litho_data.tip.certainty import reconstructed, tip_certain
 from litho_data.tip.estimate import TipEstimate, estimate_tip

@@ -1,9 +1,10 @@
 """Find which pixels of a surface the tip touched, and reconstruct the surface from the image.
 
 The point of contact determines the height in the image. If a valley is more sharply curved than the tip, the
-contact jumps from one side of the valley to the other. The surface in between is not touched, and appears in
-the image as a single pixel, a valley more sharply curved than the tip. Pixels are untouched if such a valley
-sets their highest possible height (Villarrubia 1997, section 5).
+contact jumps from one side of the valley to the other. The tip does not touch the surface in between, which
+appears in the image only as a single pixel where the image is more sharply curved than the tip. If such a
+pixel limits the height that a surface pixel can have, the tip did not touch that surface pixel (Villarrubia
+1997, section 5).
 """
 
 import numpy as np
@@ -32,10 +33,11 @@ _SMOOTHING = 0.25
 
 
 def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Return the pixels of the surface that the tip touched, bool (ny, nx), with a margin of one pixel.
+    """Return a mask, bool (ny, nx), of the pixels that the tip touched. Untouched regions include a margin of
+    one pixel.
 
-    If the radius is only an upper bound, more pixels than necessary count as untouched. Unmeasured pixels are
-    False.
+    If the radius is only an upper bound, some pixels that the tip touched are also marked as untouched.
+    Unmeasured pixels are False.
 
     Args:
         height_um: image (ny, nx), µm, NaN where not measured.
@@ -65,11 +67,11 @@ def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
 
 
 def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Return the highest surface (ny, nx), µm, that gives this image, by eroding the image by the tip.
+    """Erode an image by the tip, and return the highest surface (ny, nx), µm, that gives this image.
 
-    The result equals the true surface where the tip touched, and lies above it elsewhere. Noise is treated as
-    part of the surface. Its valleys widen to the width of the tip, which lowers the result by up to the
-    noise.
+    The result equals the true surface where the tip touched it, and lies above it elsewhere. Noise is treated
+    as part of the surface: erosion widens each downward spike of the noise to the width of the tip, which
+    lowers the result by up to the amplitude of the noise.
 
     Args:
         height_um, pitch_um, radius_um: as for ``tip_certain``.

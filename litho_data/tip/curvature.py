@@ -1,4 +1,6 @@
-"""Estimate the noise of a scan, its curvatures over small discs, and the noise of these curvatures."""
+"""Estimate the noise of a scan, the curvatures of the scan over small discs, and the noise of these
+curvatures.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +18,7 @@ QUIET = 0.17
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations, in µm, of white pixel noise and of one offset per row or per column."""
+    """Standard deviations, in µm, of white pixel noise and of the offsets of whole rows or columns."""
 
     pixel_um: float
     line_um: float
@@ -26,8 +28,8 @@ class Noise:
 def noise_of(height_um: Array) -> Noise:
     """Estimate the noise of a scan (ny, nx), µm, from fourth differences.
 
-    Fourth differences vanish on the parabolas that a tip leaves in the image. If the noise along the columns
-    exceeds that along the rows, the excess is attributed to offsets of whole rows, and vice versa.
+    Fourth differences vanish on the parabolas that a tip leaves in the image. If the noise is larger along
+    the columns than along the rows, the excess is attributed to offsets of whole rows, and vice versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
@@ -35,7 +37,8 @@ def noise_of(height_um: Array) -> Noise:
 
 
 def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
-    """Return the highest principal curvature (ny, nx), 1/µm, of a quadratic fit on a disc at each pixel.
+    """Fit a quadratic surface to a disc around each pixel, and return the highest principal curvature of each
+    fit, (ny, nx), 1/µm.
 
     The result is exact for a quadratic surface, and has the least noise of all linear estimates on the disc.
     It is NaN where the disc extends beyond the scan or contains an unmeasured pixel.
@@ -61,9 +64,10 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Return the standard deviation, 1/µm, of the curvature of a flat scan with this noise.
+    """Return the standard deviation, 1/µm, of the curvature that is measured on a flat surface with this
+    noise.
 
-    The result is the larger value of the two axes.
+    The value is computed along each axis, and the larger one is returned.
     """
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:

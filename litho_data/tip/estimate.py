@@ -1,4 +1,6 @@
-"""Estimate the radius of the tip of one or more scans, or an upper bound, and where the tip did not touch."""
+"""Estimate the radius of the tip, or an upper bound, from scans, and find where the tip did not touch the
+surface.
+"""
 
 import math
 from collections.abc import Sequence
@@ -22,8 +24,8 @@ class ScanUnderTip(Record):
     """The effect of the tip on one scan.
 
     ``certain_fraction`` is the share of pixels that the tip touched. ``resolution_um`` is the wavelength
-    below which the scan may show the tip. Both are None if the scans set no bound on the tip;
-    ``resolution_um`` is also None if the tip does not limit the resolution.
+    below which the scan may show the tip. If the scans set no bound on the radius of the tip, both are None.
+    If the tip does not limit the resolution, ``resolution_um`` is None.
     """
 
     name: str
@@ -37,14 +39,15 @@ class TipEstimate(RunFacts, Result):
     Args:
         kind: ``estimate`` if many places in the scans show the same end of the tip, else ``upper bound``.
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
-        radius_sd_um: standard uncertainty of an estimate; None for a bound.
-        reason: why the radius is only a bound; empty for an estimate.
-        depth_um: range of heights, without tilt and bow, of the scan that determines the radius.
+        radius_sd_um: standard uncertainty of the estimate; None if the radius is only a bound.
+        reason: why the radius is only a bound; empty if it is an estimate.
+        depth_um: range of heights in the scan that determines the radius, after removal of tilt and bow.
         reach_px: √(2 R depth) in pixels, which is the radius of the image of a spike.
         pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
-        window_px: side of the windows in which curvatures were measured; None without a bound.
-        share: share of the sharp places that are about as sharp as the sharpest; high if the tip limits them.
-        pitch_um: (y, x) of the scans.
+        window_px: side length of the windows in which curvatures were measured; None if there is no bound.
+        share: share of the sharp peaks that are about as sharp as the sharpest one. The share is high if the
+            tip limits the sharpness.
+        pitch_um: (y, x) pitch of the scans.
         scans: results for each scan.
     """
 
@@ -68,9 +71,9 @@ class TipEstimate(RunFacts, Result):
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     """Estimate the tip that made one or more scans, such as those of one day.
 
-    The radius comes from the sharpest tops, because no top of an image is more sharply curved than the end of
-    the tip. The result is an estimate only if many tops share the largest curvature and valleys exceed it.
-    Otherwise, the tip may be sharper than anything that it scanned.
+    The radius comes from the sharpest peaks, because no peak in an image is more sharply curved than the end
+    of the tip. The result is an estimate only if many peaks have the same largest curvature and the valleys
+    are more sharply curved. Otherwise, the tip may be sharper than anything that it scanned.
 
     Args:
         scans: scans that all have the same pitch. Levelling has little influence.

@@ -11,9 +11,10 @@ from litho_data.foundation import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A surface (ny, nx), and the row and column (int32) of the image pixel that sets each height.
+    """A reconstructed surface (ny, nx). For each surface pixel, ``row`` and ``column`` (int32) are the
+    position of the image pixel that limits its height.
 
-    Unmeasured (NaN) pixels set no height.
+    Unmeasured image pixels (NaN) are ignored.
     """
 
     surface: Array
@@ -22,7 +23,7 @@ class Eroded(NamedTuple):
 
 
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
-    """Return the highest surface that explains an image (ny, nx), µm, scanned by a paraboloid tip.
+    """Return the highest surface from which a paraboloid tip would produce this image (ny, nx), µm.
 
     ``radius_um`` is the radius of the tip. A paraboloid is the sum of two parabolas, so the minimum is taken
     along one axis after the other. Pixels that are NaN in the image stay NaN.
@@ -41,7 +42,9 @@ def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
 def _erode_rows(
     heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
 ) -> tuple[Array, Array]:
-    """Return the lowest value of height + distance²/2R along each row, and the position of its pixel."""
+    """Return, for each pixel, the minimum of height + distance²/2R over its row, and the place of the
+    minimum.
+    """
     lowest, owner = heights.copy(), places.copy()
     # Beyond this distance, the tip has risen by more than the range of the image.
     reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)

@@ -1,10 +1,10 @@
-"""Estimate the radius of the end of a tip from the sharpest tops of its images.
+"""Estimate the radius of the end of a tip from the sharpest peaks in its images.
 
-With a paraboloid tip, the image plus x²/2R is convex along every line. No top has a curvature above 1/R, and
+With a paraboloid tip, the image plus x²/2R is convex along every line. No peak has a curvature above 1/R, and
 every corner and spike that is sharper than the tip appears with exactly this curvature. The distribution of
-an image's curvatures therefore has an upper edge. The edge is clear if the tip sets it; if the surface sets
-it, the distribution ends in a thin tail. Curvatures are measured along the lines of the scan, where the
-offsets of lines do not matter.
+the curvatures in an image therefore has an upper edge. If the tip limits the curvatures, the edge of the
+distribution is sharp. If the surface limits the curvatures, the distribution ends in a thin tail. Curvatures
+are measured along the scan lines, because the offset of a line does not change the curvature along it.
 """
 
 from collections.abc import Sequence
@@ -21,22 +21,22 @@ _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
 # A window with a half side of a third of the reach averages over as many pixels as still fit on the image of
 # an edge. Half sides of up to 0.45 of the reach are allowed.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The edge is placed so that 98 % of the curvatures that exceed half of it lie below it. Noise raises it by
+# The edge is placed so that 98 % of the curvatures above half the edge lie below the edge. Noise raises it by
 # 1.4 standard deviations of the noise.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
 # Share of a line that is excluded at each end, because the scan is unreliable near the turning points.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Smallest share, among the tops above 0.4 of the edge, of those above 0.8 of it. On surfaces that no tip
-# limits, the share is at most 0.16.
+# Peaks above 0.8 of the edge must make up at least this share of the peaks above 0.4 of the edge. On
+# surfaces that no tip limits, the share is at most 0.16.
 _TIP_SHARE = 0.25
-# The tip is the same everywhere in a scan, but the sharpest tops of a surface are in a few places. The share
+# The tip is the same everywhere in a scan, but the sharpest peaks of a surface are in a few places. The share
 # is therefore multiplied by the share of the scan's 5 x 5 parts whose own edge exceeds 0.9 of the whole
 # scan's edge, and the product must reach 0.13. Of the estimates that are more than 10 % too blunt, this limit
 # rejects most on rounded bumps, but only one in twenty on steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# If the tip limits the image, valleys are sharper than tops. On other surfaces and in most noise, they are
+# If the tip limits the image, valleys are sharper than peaks. On other surfaces and in most noise, they are
 # not.
 _SHARPER_VALLEYS = 1.2
 # Relative scatter of the estimates for known tips, beyond the scatter among the parts of a scan, and number
@@ -47,11 +47,11 @@ _SPAN = (0.5, 99.5)
 
 @dataclass(frozen=True)
 class PeakRadius:
-    """The radius of a tip, µm, as an estimate or an upper bound; None if there is no bound.
+    """The radius of a tip, µm: an estimate or an upper bound, or None if there is no bound.
 
     ``reason`` says why the radius is only a bound, and is empty for an estimate. ``sd_um`` is the standard
-    uncertainty; a bound exceeds the radius found by twice this value. ``depth_um`` is the range of heights.
-    For ``window_px`` and ``share``, see ``TipEstimate``.
+    uncertainty; a bound is the radius found plus twice this value. ``depth_um`` is the range of heights.
+    ``window_px`` and ``share`` are explained in ``TipEstimate``.
     """
 
     radius_um: float | None
@@ -63,7 +63,8 @@ class PeakRadius:
 
 
 def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
-    """Estimate the radius of the tip from one scan, or give an upper bound with the reason for it.
+    """Estimate the radius of the tip from one scan, or return an upper bound and the reason why it is only a
+    bound.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured. Tilt and bow have little influence.
@@ -85,7 +86,7 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
         if half >= _HALF_OF_REACH * tops.reach_px(depth_um, pitch_um):
             break
     if chosen is None:
-        return PeakRadius(None, 0.0, "no top rises clearly above the noise", depth_um, None, None)
+        return PeakRadius(None, 0.0, "no peak rises clearly above the noise", depth_um, None, None)
     parts = [edge for edge in chosen.edges(2) if edge > 0]
     spread = float(np.std(parts, ddof=1) / np.mean(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.0
     radius_um, doubt = 1 / chosen.edge, chosen.doubt(depth_um, pitch_um)
@@ -96,7 +97,8 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 
 
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
-    """Combine scans of one tip: return the mean estimate, or the lowest bound if there is no estimate.
+    """Combine the results of several scans with one tip. Return the mean of the estimates, or the lowest
+    bound if there is no estimate.
 
     Estimates far above the lowest estimate come from rounded surfaces and are discarded. If the lowest bound
     lies clearly below the mean estimate, the bound is returned instead.
@@ -118,7 +120,7 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 
 @dataclass(frozen=True)
 class _Tops:
-    """Curvatures (ny, nx), 1/µm, in windows of one size: positive at tops, NaN where there is no window."""
+    """Curvatures (ny, nx), 1/µm, in windows of one size; positive at peaks, NaN where no window fits."""
 
     half_px: int
     noise: float
@@ -131,7 +133,7 @@ class _Tops:
         return near / max(sharp, 1)
 
     def edges(self, count: int) -> list[float]:
-        """Return the edge of the curvatures in each of count x count parts of the scan."""
+        """Divide the scan into count x count parts, and return the edge of the curvatures in each part."""
         return [
             _edge(part, self.noise)
             for rows in np.array_split(self.curvature, count, axis=0)
@@ -142,7 +144,9 @@ class _Tops:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
     def doubt(self, depth_um: float, pitch_um: YX) -> str:
-        """Return the reason why the edge may not come from the tip, or an empty text if there is none."""
+        """Return the reason why the edge may not come from the tip, or an empty string if there is no such
+        reason.
+        """
         reach = self.reach_px(depth_um, pitch_um)
         if reach < _SMALLEST_REACH_PX:
             return (
@@ -157,18 +161,19 @@ class _Tops:
             )
         if self.share < _TIP_SHARE:
             return (
-                f"only {self.share:.0%} of the sharp tops are about as sharp as the sharpest, so the surface "
-                "limits them, not the tip"
+                f"only {self.share:.0%} of the sharp peaks are about as sharp as the sharpest, so the "
+                "sharpness is limited by the surface, not by the tip"
             )
         agreeing = sum(edge > _AGREEMENT * self.edge for edge in self.edges(_PARTS))
         if self.share * agreeing < _EVERYWHERE * _PARTS**2:
             return (
-                f"only {agreeing} of {_PARTS**2} parts of the scan have tops about as sharp as the sharpest, "
-                f"and only {self.share:.0%} of the sharp tops are, so the surface may limit them"
+                f"only {agreeing} of {_PARTS**2} parts of the scan contain a peak about as sharp as the "
+                f"sharpest, and only {self.share:.0%} of the sharp peaks are about as sharp, so the "
+                "surface may limit the sharpness"
             )
         valleys = _edge(-self.curvature, self.noise)
         if valleys < _SHARPER_VALLEYS * self.edge:
-            return "valleys are no sharper than tops, as on a surface that no tip limits"
+            return "valleys are no sharper than peaks, as on a surface that no tip limits"
         return ""
 
 
@@ -183,7 +188,7 @@ def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops
 
 
 def _along_lines(lines: Array, weights: Array) -> Array:
-    """Return the second derivative along the lines, averaged over the lines of a window.
+    """Return the second derivative along the scan lines, averaged over the lines in each window.
 
     The result is NaN where the window contains an unmeasured pixel.
     """

@@ -9,12 +9,13 @@ _SHARE = 0.5
 
 
 def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
-    """Return the wavelength below which the scan may show the tip instead of the surface, µm.
+    """Return the wavelength, µm, below which the scan may show the shape of the tip instead of the surface.
 
     Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is computed at the
     distance λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result is the largest
     λ at which this curvature reaches half of 1/R (Sanner et al., Scale-dependent roughness parameters for
-    topography analysis, arXiv:2106.16103). Noise counts as peaks, so the result is an upper bound.
+    topography analysis, arXiv:2106.16103). Noise peaks are not distinguished from peaks of the surface, so
+    the result is an upper bound.
 
     Args:
         height_um: (ny, nx), µm, NaN where not measured.
@@ -22,8 +23,8 @@ def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> f
         radius_um: radius of the tip.
 
     Returns:
-        The wavelength, or None if no peak is that sharp at any distance, so that the tip does not limit the
-        scan.
+        The wavelength. None means that no peak reaches this curvature at any distance, so the tip does not
+        limit the resolution.
     """
     found = [
         _along(np.moveaxis(height_um, axis, 0), pitch, _SHARE / radius_um)

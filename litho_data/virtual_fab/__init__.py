@@ -1,4 +1,6 @@
-"""Simulate a printer and an AFM from physics, without any code of the models that are tested on them."""
+"""Simulate a printer and an AFM from physics. The simulation shares no code with the models that are tested
+on it.
+"""
 
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import jobs_of_card

@@ -21,10 +21,11 @@ def scan_surface(
     job: Job,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the height, in µm, that the microscope reports for a surface given at its pixels.
+    """Return the heights, in µm, that the microscope reports for a surface sampled at the pixels of the scan.
 
     The fast axis is x, and the top line is scanned first. Lines run from left to right, or from right to left
-    in retrace. With smaller pixels, the tip moves more slowly, so the same lag in time is a shorter length.
+    in retrace. With smaller pixels, the tip moves more slowly, so the same time lag corresponds to a shorter
+    distance.
 
     Args:
         surface_um: true height at the pixels of the scan, µm.
@@ -59,7 +60,7 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Return the path of a paraboloid tip with radii along y and x, ``max_u h(x − u) − u²/2R``.
+    """Return the height ``max_u h(x − u) − u²/2R`` of a paraboloid tip whose radii along y and x are given.
 
     The tip may touch the surface between two pixels.
     """
@@ -129,7 +130,7 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Add scars along the fast axis and single-pixel spikes; both have either sign."""
+    """Add scars along the fast axis and single-pixel spikes, each with a random sign."""
     scarred = height.copy()
     ny, nx = height.shape
     for _ in range(rng.poisson(scars_per_row * ny)):

@@ -1,4 +1,4 @@
-"""Define the area that is simulated around one layout, and spectral blurs on this area."""
+"""Define the canvas, which is the area simulated around one layout, and spectral blurs on it."""
 
 from dataclasses import dataclass
 
@@ -49,17 +49,17 @@ class Canvas:
 
 
 def frame_layout(level: Array) -> Array:
-    """Add the guard frame, into which the outermost levels of the layout continue."""
+    """Add the guard frame around a layout by repeating the outermost levels."""
     return np.pad(level, GUARD_PX, mode="edge")
 
 
 def cut_layout(array: Array) -> Array:
-    """Cut out the part of a canvas array that belongs to the layout."""
+    """Return the part of a canvas array that lies inside the layout."""
     return array[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX]
 
 
 def set_layout(array: Array, inner: Array) -> Array:
-    """Return a copy of a canvas array in which ``inner`` replaces the part of the layout."""
+    """Return a copy of a canvas array in which ``inner`` replaces the values inside the layout."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed

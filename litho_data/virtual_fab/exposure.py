@@ -41,7 +41,7 @@ def accumulate_dose(
         canvas: the canvas that is written.
         printer: spot and slicing.
         knobs: effects on the dose.
-        relative_dose: two-photon dose of this print relative to the recipe's.
+        relative_dose: two-photon dose of this print relative to the dose of the recipe.
         order: position in the print order, from −0.5 (first) to 0.5 (last).
         scan_index: number of the scan, used for random draws that differ from scan to scan.
     """
@@ -113,9 +113,10 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
     Doses add up where fields overlap.
 
     Args:
-        starts: the first row of every row of fields, and the first column of every column of fields.
-        offset_px: (y, x) displacement of every field, shape (fields along y, fields along x, 2). The dose of
-            a displaced pixel is divided among the four pixels that it covers.
+        starts: the first pixel row of each row of fields, and the first pixel column of each column of
+            fields.
+        offset_px: (y, x) displacement of every field, pixels; an array of shape (fields along y, fields along
+            x, 2). The dose of a displaced pixel is divided among the four pixels that it covers.
     """
     written = np.zeros_like(nominal)
     ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
@@ -157,7 +158,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Return the effective dose if each slice must pass the threshold separately."""
+    """Return the effective dose for a resist in which each slice must reach the threshold by itself."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):

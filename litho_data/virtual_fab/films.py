@@ -1,7 +1,8 @@
-"""Simulate films that are written by an electron beam or through a lens, etched and imaged by SEM.
+"""Simulate films that are exposed by an electron beam or through a lens, then etched and imaged by SEM.
 
-The simulation shares no code with the models. Scattering is a product of spectra. A lens sums the images from
-all points of the light source. Etching shifts the distance from the edge.
+The simulation shares no code with the models. Electron scattering is computed as a product of spectra. The
+image behind a lens is the sum of the images from all points of the light source. Etching shifts all edges by
+the same distance.
 """
 
 from __future__ import annotations
@@ -75,7 +76,9 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine that prints films: process, pixel pitch, beam (sd) or lens, film and resist threshold."""
+    """A machine that prints films, described by its process, pixel pitch, beam (standard deviation) or lens,
+    film thickness and resist threshold.
+    """
 
     process: Literal["e-beam", "projection"]
     pitch_um: float
@@ -101,7 +104,8 @@ FILM_PRINTERS = {
 class FilmTruth(Result):
     """The record ``films.json``.
 
-    Beside it, ``<id>.npy`` contains the distances from the edge of each film, in layout pixels.
+    Next to it, one file ``<id>.npy`` per film contains the distances from the edge of the film, in layout
+    pixels.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
@@ -131,7 +135,7 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Return the distance from the film's edge at 4 × 4 points per pixel of a binary layout.
+    """Return the distance from the edge of the film, at 4 × 4 points in each pixel of a binary layout.
 
     Distances are in layout pixels and positive on the film. The layout is periodic.
     """
@@ -179,7 +183,7 @@ def simulate_films(
     from the edges.
 
     Raises:
-        InputError: the process is unknown, or the folder contains files of another kind.
+        InputError: the process is unknown, or the folder contains other files.
     """
     import cv2
 
@@ -212,9 +216,10 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """Make a random layout with a bare rim, uint8 (ny, nx) of 0 and 1, whose features the process resolves.
+    """Make a random layout of 0 and 1, uint8 (ny, nx), with a bare rim and features that the process can
+    resolve.
 
-    A higher ``finer`` makes the features smaller; the films of a run use 0, 1 and 2 in turn.
+    A larger value of ``finer`` makes the features smaller; the films of a run use 0, 1 and 2 in turn.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)
@@ -225,7 +230,9 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
-    """Return the intensity behind a mask, averaged over the points of a round source; 1 for an open mask."""
+    """Return the intensity of the image of a mask, averaged over the points of a round source. The intensity
+    is 1 for an open mask.
+    """
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)
     sides = np.linspace(-1, 1, _SOURCE_POINTS)

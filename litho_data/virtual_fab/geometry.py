@@ -74,7 +74,9 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """Sample a surface, given on the canvas, at the pixels of the scan; the result has ``frame.shape``."""
+    """Interpolate a surface on the canvas at the pixels of the scan. The result has the shape
+    ``frame.shape``.
+    """
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
     # In retrace, the nonlinearity of the piezo has the opposite sign.
@@ -93,7 +95,7 @@ def sample_surface(
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
-    """Draw a random second-order polynomial without its affine part, whose rms is 1 on average."""
+    """Draw a random second-order polynomial without an affine part; its rms is 1 on average."""
     y, x = frame.unit_axes
     c = rng.standard_normal(3)
     # Over the square, the two Legendre terms have a variance of 1/5 each, and the product one of 1/9.

@@ -1,4 +1,4 @@
-"""Define the fields of a run: random layouts in print blocks, and reference scans for a noise analysis."""
+"""Define the fields of a run: random layouts in print blocks, and reference fields for a noise analysis."""
 
 import re
 from collections.abc import Iterator
@@ -32,8 +32,8 @@ class Plan:
         count: number of fields.
         size_px: (ny, nx) of a layout.
         fields_per_print: number of fields in one print block.
-        write_field_um: side of the write field that all fields of a print share. If None, each field has its
-            own write field, centred on it.
+        write_field_um: side of the write field that all fields of a print share. None places each field at
+            the centre of a write field of its own.
         references: whether to add print 0: a bare substrate, a flat print and a five-step print.
     """
 
@@ -54,7 +54,7 @@ class Plan:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
 
     def scan_id(self, block: int, field: int) -> str:
-        """Return the name of a field, padded with zeros so that sorted names are in print order."""
+        """Return the name of a field, with zero-padded numbers, so that sorted names are in print order."""
         blocks = -(-self.count // self.fields_per_print)
         return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
 
@@ -103,7 +103,9 @@ def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
 
 
 def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
-    """Yield a bare substrate, a flat print of the middle level, and steps of one level each."""
+    """Yield jobs for a bare substrate, a flat print of the middle level, and a staircase with steps of one
+    level.
+    """
     middle = (printer.levels - 1) // 2
     flat = np.full(plan.size_px, middle, np.uint8)
     stairs = np.arange(plan.size_px[1]) * _STEPS // plan.size_px[1] + 1
@@ -114,19 +116,19 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Make jobs that print and scan the layouts of a dataset card as the card's table says.
+    """Make jobs that print and scan the layouts of a dataset card in the way that its table states.
 
-    If the table says how a scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``), rows that
-    have the same print and layout are scans of the same printed field.
+    The table may state how each scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``). Rows
+    with the same print and layout are then scans of the same printed field.
 
     Args:
         path: path of the card.
-        first: number of the first scan; the random draws for a scan or print depend on its number.
+        first: number of the first scan. The random values for a scan or print depend on its number.
         printer: the printer to use; the default printer if None.
 
     Raises:
-        InputError: the card is invalid or has no layout files, or the printer has another pitch or level
-            height than the layouts.
+        InputError: the card is invalid or has no layout files, or the pitch or level height of the printer
+            differs from that of the layouts.
     """
     card = load_card(path)
     printer = printer or Printer()

@@ -26,19 +26,21 @@ class Job:
     Args:
         id: name of the scan.
         level: uint8 layout, shape (ny, nx).
-        index: number of the scan in its set; the random draws depend on it.
+        index: number of the scan in its set, on which its random values depend.
         order: position in the print order, from −0.5 (first) to 0.5 (last).
-        dose: two-photon dose relative to the recipe's.
+        dose: two-photon dose relative to the dose of the recipe.
         field_um: (y, x) centre of the layout in its write field, µm.
         write_field_um: side of the write field, µm; None for a field as large as the layout.
-        use: purpose of the scan. Nothing is printed for ``substrate``, nor for ``grating``, which is a
-            calibration standard.
+        use: purpose of the scan. Nothing is printed for ``substrate`` or for ``grating``, a calibration
+            standard.
         grating_um: period of the grating, µm.
-        print_index: number of the print in its set, if prints are scanned more than once; None: ``index``.
+        print_index: number of the print in its set, if prints are scanned more than once. None means that
+            ``index`` is also the number of the print.
         turned_deg: rotation of the print under the microscope, a multiple of 90.
         direction: 1 for trace, -1 for retrace.
         tip: number of the tip; every tip after the first is new and sharp.
-        pixel_size: pixel size of the scan, in pixels of the layout; the time per pixel does not change.
+        pixel_size: pixel size of the scan, in pixels of the layout. The time per pixel does not depend on
+            this size.
     """
 
     id: str
@@ -60,7 +62,8 @@ class Job:
     def printed(self) -> int:
         """Return the number of the print.
 
-        The random draws of the print depend on this number, and those of the scan on ``index``.
+        The random values of the print depend on this number, and the random values of the scan depend on
+        ``index``.
         """
         return self.index if self.print_index is None else self.print_index
 
@@ -113,7 +116,7 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
 
 
 def _bars(at_um: Array, period_um: float) -> Array:
-    """Return 1 on bars that are half a period wide, 0 between them, and straight flanks in between."""
+    """Return a profile that is 1 on bars half a period wide and 0 between the bars, with straight flanks."""
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
 

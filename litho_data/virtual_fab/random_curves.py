@@ -17,7 +17,7 @@ _SMOOTH_UM = 0.06
 
 
 def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
-    """Draw line-shaped roughness (ny, nx) along x, whose variance is 1 on average."""
+    """Draw line-shaped roughness (ny, nx) along x with a mean variance of 1."""
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
 
@@ -59,7 +59,7 @@ def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator)
 
 
 def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw a random sum of eight plane waves with about this period, whose variance is 1 on average."""
+    """Draw a random sum of eight plane waves with periods near ``period_um``; the mean variance is 1."""
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)
     phase = rng.uniform(0, 2 * np.pi, waves)

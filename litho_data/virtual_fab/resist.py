@@ -64,7 +64,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Apply the shrinkage that exceeds that of plain drying."""
+    """Apply the additional shrinkage that the knobs cause, beyond that of plain drying."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:

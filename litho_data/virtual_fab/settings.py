@@ -52,12 +52,12 @@ class Microscope:
     Args:
         margin_px: number of pixels by which a scan extends beyond the layout on each side, per 512 px of
             layout.
-        rotation_deg: largest rotation, degrees.
+        rotation_deg: largest rotation angle, degrees.
         scale: largest relative error of each lateral scale.
         shear: largest shear.
         shift_um: largest shift along each axis, µm.
-        files: format of the scan files: ``text-matrix`` (only heights, in metres) or ``gsf`` (with size and
-            unit).
+        files: format of the scan files, either ``text-matrix`` (only heights, in metres) or ``gsf`` (with
+            size and unit).
     """
 
     margin_px: float = 14.0
@@ -77,15 +77,15 @@ class Microscope:
 class Noise:
     """The default noise, as standard deviations in nm.
 
-    A flat print shows the quadrature sum of ``roughness_nm``, ``line_nm`` and ``pixel_nm``; a bare substrate
-    shows that of ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
+    On a flat print, the noise is the quadrature sum of ``roughness_nm``, ``line_nm`` and ``pixel_nm``. On a
+    bare substrate, it is that of ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
 
     Args:
         roughness_nm: line-shaped roughness of printed surfaces.
         substrate_nm: roughness of the bare substrate.
-        line_nm: one offset per scan line.
+        line_nm: offset of each scan line.
         pixel_nm: uncorrelated pixel noise.
-        datum_nm: one offset per scan.
+        datum_nm: offset of each scan.
     """
 
     roughness_nm: float = 15.9
@@ -102,7 +102,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Preset:
-    """Named settings of a run, which arguments of the caller override.
+    """Named settings of a run. Arguments that the caller passes override these settings.
 
     Args:
         count: number of scans.
@@ -136,10 +136,10 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """Return the preset of this name.
+    """Return the preset with this name.
 
     Raises:
-        InputError: there is no preset of this name.
+        InputError: there is no preset with this name.
     """
     require_known("preset", name, PRESETS)
     return PRESETS[name]

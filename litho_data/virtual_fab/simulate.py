@@ -1,4 +1,4 @@
-"""Run the virtual fab, and write raw files as a laboratory would deliver them and, separately, the truth."""
+"""Run the virtual fab. Write raw files as a laboratory would deliver them, and write the truth separately."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -54,25 +54,27 @@ def simulate(
         count: number of scans with random layouts.
         size_px: size of a layout, pixels (one number, or ny and nx).
         seed: seed of every random draw of the run.
-        knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
+        knobs: effects beyond plain printing, as settings or in the form ``name=strength[@seed]``.
         cause: an effect of your own that is not a knob; the truth file does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
         microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or your own values.
         fields_per_print: number of fields in one print block.
-        write_field_um: side of the write field that the fields of a print share, µm; None: each has its own.
+        write_field_um: side of the write field that the fields of a print share, µm. None gives each field
+            its own write field.
         references: whether to add scans of a bare substrate, a flat print and a five-step print.
         jobs: your own layouts instead of random ones; arguments about random layouts are then ignored.
-        plan_of: hash of the dataset from which the layouts were planned, for the card.
-        print_pattern: pattern of ids that says to which print a scan belongs, for the card.
+        plan_of: hash, to be written to the card, of the dataset from which the layouts were planned.
+        print_pattern: pattern, to be written to the card, that finds the print of a scan in the id of the
+            scan.
 
     Raises:
         InputError: a knob is unknown or its strength is out of range, the plan is impossible, or the folder
-            contains a run with other settings or something else.
+            contains a run with different settings or unrelated files.
     """
     if references and jobs is not None:
         raise InputError(
             "references cannot be added to your own layouts",
-            wanted="layouts of your own for the references, with their use in the card's table",
+            wanted="reference layouts among your own layouts, and their use in the card's table",
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -167,7 +169,7 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
 
 
 def _described(job: Job) -> dict[str, Any]:
-    """Return all fields of a job, with a hash in place of the layout."""
+    """Return the attributes of a job as a dict in which a hash replaces the layout."""
     return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
@@ -189,7 +191,9 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """Write the card's table, with columns on how scans were made if any scan has unusual values."""
+    """Write the card's table. The columns that say how scans were made are added only if a scan differs from
+    the default.
+    """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
     write_table(raw, columns, [row[: len(columns)] for row in rows])

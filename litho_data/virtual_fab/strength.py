@@ -38,8 +38,8 @@ def strength_for_rms(
 ) -> KnobStrength:
     """Find the strength at which a knob changes the noise-free scans by ``rms_nm``.
 
-    The rms is that of `knob_rms_nm`. It grows with the strength, so an interval search within the knob's
-    range finds the strength.
+    The rms is computed by `knob_rms_nm`. The rms grows with the strength, so an interval search within the
+    range of the knob finds the strength.
 
     Args:
         name: name of the knob.
@@ -108,11 +108,12 @@ def search_strength(
 
 
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
-    """Return the rms change, in nm, that a knob causes in noise-free scans, without per-scan terms.
+    """Return the rms change, in nm, that a knob causes in noise-free scans after the per-scan terms are
+    removed.
 
-    Scans are aligned with the layout, so a warp counts through the heights that it changes. The per-scan
-    terms are the least-squares fit of {1, P, x, y, x², xy, y²} to each scan's change, where P is the scan
-    without the knob.
+    Scan pixels coincide with layout pixels, so a warp is measured by the changes in height that it causes.
+    The per-scan terms are the least-squares fit of {1, P, x, y, x², xy, y²} to each scan's change, where P is
+    the scan without the knob.
     """
     mean_squares = []
     for job in jobs:
@@ -123,7 +124,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Return ``change`` minus its least-squares fit by the prediction and a quadratic surface."""
+    """Fit the prediction and a quadratic surface to ``change`` by least squares, and return the residual."""
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )

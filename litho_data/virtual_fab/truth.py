@@ -1,4 +1,6 @@
-"""Record what the build of a simulated run must not know: knobs, warps, clean prints and noise floors."""
+"""Record the truth about a simulated run, which its dataset build must not know: knobs, warps, clean prints
+and noise floors.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class KnobTruth(Record):
 
 
 class ScanTruth(Record):
-    """One scan: its position, its datum, and the error that even perfect models of printer and AFM leave."""
+    """One scan: its position, its datum, and the error that would remain even with perfect models of printer
+    and AFM.
+    """
 
     id: str
     use: str
@@ -64,8 +68,9 @@ class ScanTruth(Record):
 class Truth(Result):
     """The record `truth.json` of a simulated run.
 
-    Beside it, ``prints/<id>.npy`` is each print without roughness and ``surfaces/<id>.npy`` with roughness,
-    as heights in µm on the layout grid. ``settings`` contains further settings of the run.
+    Next to it, ``prints/<id>.npy`` contains the print of each scan without roughness, and
+    ``surfaces/<id>.npy`` contains the print with roughness. Both files contain heights in µm on the layout
+    grid. ``settings`` contains further settings of the run.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -81,7 +86,9 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Return the offset and the size of one scan's noise, nm; ``floor_full`` also excludes tilt and bow."""
+    """Return the offset and the size, in nm, of the noise in one scan. The ``floor_full`` values also exclude
+    tilt and bow.
+    """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
     return {

@@ -41,14 +41,15 @@ def score(
         list[str] | None,
         typer.Option(
             help="judge: NAME=MODEL, MODEL or `none`; MODEL may be the truth/ folder of a virtual fab; "
-            "repeatable. Without a judge, scan or photograph, the zoo's models of the same printer judge"
+            "repeatable. Without a judge, scan or photograph, the zoo's models of the same printer are "
+            "the judges"
         ),
     ] = None,
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="how the judges treat the element: thin, or thick (wave propagation method); by default, "
-            "as in the design"
+            help="how the judges treat the element: thin, or thick (wave propagation method); the default is "
+            "that of the design"
         ),
     ] = None,
     stream: Annotated[
@@ -59,7 +60,8 @@ def score(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design as models predict its print, as an AFM measures it, or as a camera sees it.
+    """Score a design by the print that models predict, an AFM scan of the print, or a photograph of its
+    image.
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
@@ -93,11 +95,13 @@ def export(
     out: Out,
     given: Given,
     format: Annotated[Format, typer.Option(help="format of the file for the printer")] = "png16",
-    pitch_um: Annotated[float, typer.Option(help="side of a pixel of NAME.npy, µm")] = 0.1,
-    level_height_um: Annotated[float, typer.Option(help="height of a level of NAME.npy, µm")] = 0.1,
+    pitch_um: Annotated[float, typer.Option(help="side length of a pixel in NAME.npy, µm")] = 0.1,
+    level_height_um: Annotated[float, typer.Option(help="height of a level in NAME.npy, µm")] = 0.1,
     dose_curve: Annotated[
         Path | None,
-        typer.Option(help="CSV of the printed height_um of each grey; by default, grey is linear in height"),
+        typer.Option(
+            help="CSV with the printed height_um of each grey value; the default is a linear relation"
+        ),
     ] = None,
     marks: Annotated[
         bool,
@@ -107,7 +111,7 @@ def export(
         ),
     ] = False,
 ) -> None:
-    """Write a layout as a file for the printer, with a sidecar file that states heights and size.
+    """Write a layout as a file for the printer, and a sidecar file that states the heights and the size.
 
     Example: litho-design export hologram --format stl --out files
     """

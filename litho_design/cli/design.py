@@ -1,4 +1,4 @@
-"""The commands that design, and `settings`; each parses its options, calls one function and prints the
+"""The design commands and `settings`. Each command parses its options, calls one function and prints the
 result.
 """
 
@@ -67,14 +67,14 @@ Robust = Annotated[
 Objects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: picture or folder of pictures to image instead of the drawings; repeatable"
+        help="computational lens: image, or folder of images, that replaces the built-in drawings; repeatable"
     ),
 ]
 HeldOutObjects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="computational lens: picture or folder of pictures used only for scores; repeatable. By "
-        "default, the last quarter of --objects in order of name, but at least two",
+        help="computational lens: image, or folder of images, used only for scores; repeatable. The default "
+        "is the last quarter of --objects, sorted by name, but at least two images",
         hidden=True,
     ),
 ]
@@ -138,7 +138,7 @@ def correct(
     relief: Annotated[
         str,
         typer.Argument(
-            help="grey picture, float TIFF of heights in µm, or a drawing: lens, blaze, staircase"
+            help="greyscale image, float TIFF of heights in µm, or a drawing: lens, blaze, staircase"
         ),
     ],
     model: Model,
@@ -232,7 +232,7 @@ def compare(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design with every arm and print with every judge, to measure the design-to-manufacturing gap.
+    """Make a design with every arm and print it with every judge, to measure the design-to-manufacturing gap.
 
     Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
     """
@@ -272,7 +272,9 @@ def _settings(
     task: str,
     spread_of: Path | None = None,
 ) -> S:
-    """Merge preset, settings file, measured spreads and command line; later ones override earlier ones."""
+    """Merge the preset, the settings file, the measured spreads and the command line. Each source overrides
+    those before it.
+    """
     made = make(given.over(make({}), task))
     if spread_of is None:
         return made

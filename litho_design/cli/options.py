@@ -31,7 +31,8 @@ Extrapolate = Annotated[
 BandPx = Annotated[
     int,
     typer.Option(
-        help="largest number of rows in a band, px; with --large or --stream, memory grows with its square",
+        help="largest number of rows in a band. With --large or --stream, the memory needed grows with the "
+        "square of this number",
         min=8,
         hidden=True,
     ),
@@ -103,7 +104,7 @@ def takes_settings(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command an option for each setting that defines one, plus ``--set`` and ``--config``.
 
-    The command receives these settings as its argument ``given``, a ``Given``.
+    The command receives these settings as a ``Given`` object in its argument ``given``.
 
     Args:
         presets: settings, one record per task; the help shows their values as defaults.
@@ -145,10 +146,10 @@ def takes_settings(
 
 
 def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all fields of record classes, and pass it one record of each class by
-    name.
+    """Give a command one option for each field of some record classes. The command receives one record of
+    each class as a keyword argument.
 
-    The command gets None for a record if none of its options was given.
+    A record is None if none of its options was given.
     """
     found = {
         part: {name: leaf_of(field, f"{part}.{name}") for name, field in kind.__pydantic_fields__.items()}
@@ -191,8 +192,8 @@ def _made(kind: type[Any], leaves: Mapping[str, Leaf], values: Mapping[str, Any]
 
 
 def as_toml(settings: BaseModel) -> str:
-    """Return the text of a settings file for ``--config``, with each setting's meaning, unit, choices and
-    option.
+    """Return the text of a settings file for ``--config``, which states the meaning, unit, choices and option
+    of each setting.
     """
     lines: list[str] = []
     # Each table is written once, even if its settings are not adjacent.
@@ -213,7 +214,7 @@ def as_toml(settings: BaseModel) -> str:
 
 
 def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
-    """Make one option for a setting that one or several presets have."""
+    """Make one option for a setting that occurs in one or more presets."""
     leaf, kind = same[0], same[0].kind
     if get_origin(kind) is UnionType:
         kind = get_args(kind)[0]
@@ -239,7 +240,7 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """Describe a setting for the help of its option, beginning in lower case."""
+    """Return the help text of an option, which begins with a lower-case letter."""
     return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
 
 

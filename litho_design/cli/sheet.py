@@ -1,5 +1,5 @@
-"""The commands `litho-design sheet new` and `read`, which make one sheet of prints for a lab and read its
-scans.
+"""The commands `litho-design sheet new`, which makes one sheet of prints for a lab, and `sheet read`, which
+evaluates its scans.
 """
 
 from __future__ import annotations

@@ -1,1 +1,3 @@
-"""The printer as an optical element for your own programs: free levels go in, a modulated wave comes out."""
+"""The printer as an optical element for your own programs. The element takes free levels and returns a
+modulated wave.
+"""

@@ -31,11 +31,11 @@ class Element(nn.Module):
     """A printed element for your own program: ``element(field, wavelength_um)`` returns the wave behind the
     element.
 
-    The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and kept
-    within the layout's range, with a straight-through gradient. A frozen model prints the levels, surrounded
-    by its guard ring. The printed height h becomes the phase 2 pi (n(wavelength) - surroundings) h /
-    wavelength. The wave therefore always belongs to a printable layout. ``whole = False`` leaves the levels
-    unrounded, for the first steps of a search.
+    The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and
+    clipped to the range of the layout; a straight-through estimator gives the gradient of this step. A frozen
+    model prints the levels, surrounded by its guard ring. The printed height h becomes the phase 2 pi
+    (n(wavelength) - surroundings) h / wavelength. The wave therefore always belongs to a printable layout.
+    For the first steps of a search, ``whole = False`` leaves the levels unrounded.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
@@ -43,18 +43,18 @@ class Element(nn.Module):
         resin: name of a resin, or a function from the wavelength in µm to its refractive index.
         surroundings: refractive index above the relief.
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
-        kind: ``thin``, or ``thick`` to compute the wave through the relief, in air, by the wave propagation
-            method.
-        tile_px: elements larger than this are printed in overlapping tiles. The backward pass
-            recomputes the tiles, so memory grows with the tile, not with the element. None prints in one
-            piece.
+        kind: ``thin`` or ``thick``. For ``thick``, the wave is propagated through the relief by the wave
+            propagation method; the relief must be in air.
+        tile_px: side of the overlapping tiles in which larger elements are printed. The backward pass
+            recomputes the tiles, so the memory needed depends on the tile and not on the element. None prints
+            the element in one piece.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
     Raises:
-        InputError: ``load_printer`` refuses the model, the printer has no gradients, the index of the resin
-            is not above that of the surroundings, tiles are requested for a model that depends on the
-            position, or a thick element is not in air.
+        InputError: ``load_printer`` refuses the model, the printer has no gradients, or the refractive index
+            of the resin does not exceed that of the surroundings. The error is also raised if tiles are
+            requested for a model that depends on the position, or a thick element is not in air.
     """
 
     def __init__(
@@ -84,13 +84,13 @@ class Element(nn.Module):
         self.whole = True
 
     def forward(self, field: Tensor, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
-        """Return the wave behind the element that ``field`` illuminates, complex (..., size, size).
+        """Illuminate the element with ``field``, and return the wave behind it, complex (..., size, size).
 
         Args:
             field: the wave on the pixels of the layout, complex (..., size, size).
             wavelength_um: wavelength in vacuum.
-            height_um: a known print (size, size), such as a measured one, to use instead of the print of the
-                levels.
+            height_um: heights of a known print (size, size), for example measured heights. These heights
+                replace those that the model predicts for the levels.
         """
         height = self.height_um() if height_um is None else height_um
         self._check_map("field", field)
@@ -139,29 +139,31 @@ class Element(nn.Module):
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
-        """Set the free levels to those of a layout (size, size), whose levels may be fractions."""
+        """Set the free levels to those of a layout (size, size), whose levels need not be integers."""
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
-        """Start from the levels that print a target phase (size, size), in radian, up to a constant phase."""
+        """Start from the levels whose print gives a target phase (size, size), in radians, apart from a
+        constant.
+        """
         self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
         wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
         self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
 
     def as_torchoptics(self, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0) -> Any:
-        """Return the same element as a ``PolychromaticModulationElement`` of torchoptics (extra
-        ``torchoptics``).
+        """Return this element as a ``PolychromaticModulationElement`` of torchoptics, which needs the package
+        extra ``torchoptics``.
 
         Args:
-            z, offset: position of the element, in the unit of length of your program.
-            unit_um: this unit of length in µm; 1e6 for metres.
+            z, offset: position of the element, in the unit of length that your program uses.
+            unit_um: that unit of length in µm, for example 1e6 if your program uses metres.
 
         Raises:
-            InputError: torchoptics is not installed, or the element is thick, so that no complex factor
-                describes it.
+            InputError: torchoptics is not installed, or the element is thick and therefore not described by a
+                complex factor.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement

@@ -10,12 +10,13 @@ from torchoptics.utils import wavelength_or_default
 
 
 class PrintedElement(PolychromaticModulationElement):
-    """An ``Element`` on a plane of torchoptics; the fields that it modulates must have its shape and spacing.
+    """An ``Element`` on a plane of torchoptics. A field that it modulates must have the same shape and
+    spacing as the element.
 
     Args:
         element: the printed element, whose parameters become those of this module.
         z, offset: as in torchoptics.
-        unit_um: the unit of length of torchoptics, µm.
+        unit_um: the unit of length that is used in torchoptics, in µm.
     """
 
     def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
@@ -25,5 +26,7 @@ class PrintedElement(PolychromaticModulationElement):
         self.element, self.unit_um = element, unit_um
 
     def modulation_profile(self, wavelength: Any = None) -> Tensor:
-        """Return the complex transmission (size, size) at a wavelength, in the unit of torchoptics."""
+        """Return the complex transmission (size, size) at a wavelength, which is given in the unit of
+        torchoptics.
+        """
         return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

@@ -1,4 +1,4 @@
-"""Write layouts as DXF (R12, ASCII) with closed polylines; the name of a layer is the grey value of its
+"""Write layouts as DXF (R12, ASCII) with closed polylines. Each layer is named after the grey value of its
 level.
 """
 
@@ -16,7 +16,9 @@ _BAND_PX = 128
 
 
 def write_dxf(path: Path, levels: LevelRows, pitch_um: float, greys: Sequence[int]) -> int:
-    """Write each level whose grey is not 0 as disjoint rectangles, in µm with y up; return their number."""
+    """Write each level whose grey value is not 0 as disjoint rectangles, in µm with y upwards. Return the
+    number of rectangles.
+    """
     count = 0
     with open(path, "w", encoding="ascii") as stream:
         # $INSUNITS 13: micrometres.

@@ -55,7 +55,7 @@ _BAND_PX = 128
 
 @dataclass(frozen=True)
 class _Source:
-    """A layout to export: levels (ny, nx), geometry, hash, and the design that the levels come from."""
+    """A layout to export: its levels (ny, nx), geometry and hash, and the design from which it comes."""
 
     levels: LevelRows
     layout: LayoutSettings
@@ -86,10 +86,11 @@ def export(
             which are rounded to the nearest level.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; it may already hold exports of the same layout in other formats.
-        pitch_um, level_height_um: side of a pixel and height of a level of an array; designs and elements
-            have their own.
+        pitch_um, level_height_um: pixel side and level height, used only for an array; designs and elements
+            have their own values.
         dose_curve: CSV with the columns ``grey,height_um``, which gives the printed height of each grey
-            value, for the grey formats bmp, png16 and dxf. Without it, grey is linear in height.
+            value, for the greyscale formats bmp, png16 and dxf. Without it, the grey value is linear in
+            height.
         marks: add an orientation mark and a flat witness area beside the element (see ``with_marks``).
         job: changes to ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
 
@@ -97,8 +98,9 @@ def export(
         Path of the exported file.
 
     Raises:
-        InputError: the design is incomplete, the format cannot hold it or would need too much memory, no
-            printer can do the job, the element is too small for marks, or the folder holds something else.
+        InputError: the design is incomplete, the format cannot represent it or would need too much memory, or
+            no printer can do the job. The error is also raised if the element is too small for marks, or the
+            folder contains other files.
     """
     require_known("format", format, _SUFFIX)
     made = changed(PrintJob(), job)
@@ -109,7 +111,7 @@ def export(
     if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:
         got = f"{format} of {levels.shape[0]} x {levels.shape[1]} px"
         raise InputError(
-            "format of a large element", got=got, wanted="tiff or gds, which are written in pieces"
+            "format of a large element", got=got, wanted="tiff or gds, which are written in parts"
         )
     found: Marks | None = None
     if marks:
@@ -147,7 +149,7 @@ def export(
         record.write(temporary).rename(sidecar_path(file))
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
-            raise AssertionError(f"{format} export does not read back as it was written")
+            raise AssertionError(f"the {format} file does not contain the layout that was exported")
         # The sidecar comes last: until then, the file has no sidecar or an outdated one, and is refused.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
@@ -155,7 +157,7 @@ def export(
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """Return the level map of an exported file, uint8 (ny, nx) with row 0 on top, and the file's sidecar.
+    """Return the level map of an exported file, uint8 (ny, nx) with row 0 at the top, and the file's sidecar.
 
     Raises:
         InputError: there is no sidecar, or the file was changed after the export.

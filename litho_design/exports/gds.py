@@ -1,5 +1,5 @@
-"""Write layouts as GDSII, one band of rows at a time, with one layer per level and one cell per distinct
-block.
+"""Write layouts as GDSII, one band of rows at a time. The file has one layer per level, and blocks that are
+equal share one cell.
 """
 
 from __future__ import annotations
@@ -30,16 +30,18 @@ def write_gds(
     layers: GdsLayers,
     parts: Mapping[str, Box] | None = None,
 ) -> int:
-    """Write rectangles (unit 1 µm, grid 1 nm, y up); return the number of rectangles in the file.
+    """Write rectangles in units of 1 µm on a grid of 1 nm, with y upwards. Return the number of rectangles in
+    the file.
 
     Layer k contains {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0). Runs
     along a row are merged with equal runs in the rows below, so every shape is a rectangle. The cell LAYOUT
-    refers to one cell per part. The cell of a part refers to one cell per 128 rows, and these cells refer to
-    blocks of 128 pixels. Equal blocks share a cell. Only the shapes of one block are in memory at a time.
+    references one cell for each part. The cell of a part references one cell for every 128 rows, which in
+    turn references the cells of blocks 128 pixels wide. Equal blocks share a cell. Only the shapes of one
+    block are in memory at a time.
 
     Args:
-        parts: first and last row, and first and last column, of each part, by name. By default, the only part
-            is ELEMENT, the whole map.
+        parts: maps the name of each part to its first and last row and its first and last column. By default,
+            the whole map is one part, named ELEMENT.
     """
     import gdstk
 
@@ -73,7 +75,7 @@ def write_gds(
 
 
 def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]:
-    """Return the rectangles of one block, whose lower left corner is the origin."""
+    """Return the rectangles of one block. The origin is the lower left corner of the block."""
     from gdstk import rectangle
 
     highest = int(levels.max())
@@ -88,10 +90,10 @@ def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]
 
 
 def rectangles(masks: np.ndarray) -> np.ndarray:
-    """Return disjoint rectangles that cover boolean masks (n, ny, nx), as mask, top, bottom, left, right (m,
-    5).
+    """Cover boolean masks (n, ny, nx) with disjoint rectangles. Return an array (m, 5) whose columns are the
+    number of the mask, top, bottom, left and right.
 
-    The rectangles exclude the row ``bottom`` and the column ``right``.
+    The row ``bottom`` and the column ``right`` lie just outside the rectangle.
     """
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)

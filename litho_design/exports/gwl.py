@@ -1,5 +1,5 @@
-"""Write layouts as GWL for Nanoscribe printers, with a line of resist for each run of pixels in a row and
-slice.
+"""Write layouts as GWL for Nanoscribe printers. In each slice, every run of pixels in a row is written as
+lines.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ _PIEZO_UM = 300.0
 
 
 def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
-    """Write the slices of each field from the pedestal upwards, field by field; return the number of lines.
+    """Write one field after the other, each from the lowest slice of the pedestal upwards. Return the number
+    of lines.
 
-    A slice is written at the middle of its thickness, and a row at the middle of its hatching distance. A
-    line of resist runs along x from edge to edge of the pixels that reach the slice. Coordinates x and y are
-    those of the element, with y up; in galvo mode, they are relative to the middle of the field, to which the
-    stage moves.
+    The lines of a slice lie at the middle of its thickness. Across the lines, each line lies at the middle of
+    its hatching distance. A line runs along x from the first edge to the last edge of a run of pixels that
+    reach the slice. The origin of x and y is the lower left corner of the element, and y points upwards. In
+    galvo mode, the stage moves to the middle of each field, which is then the origin.
 
     Raises:
-        InputError: the level height or pedestal is not a whole number of slices, the pitch is not a whole
-            number of hatching distances, the laser powers do not match the number of levels, or the element
-            exceeds the range of the piezo.
+        InputError: the level height or the pedestal is not a multiple of the slicing distance, or the pitch
+            is not a multiple of the hatching distance. The error is also raised if there are too few laser
+            powers for the levels, or the element exceeds the range of the piezo.
     """
     height, width = levels.shape
     gwl, slicing_um, hatching_um = job.gwl, job.slicing_um, job.hatching_um
-    thick = _whole("slices per level, level_height_um over slicing_um", level_height_um / slicing_um)
-    base = _whole("slices in the pedestal, pedestal_um over slicing_um", job.pedestal_um / slicing_um)
-    rows_per_px = _whole("hatching distances per pixel, pitch_um over hatching_um", pitch_um / hatching_um)
+    thick = _whole("slices per level (level_height_um / slicing_um)", level_height_um / slicing_um)
+    base = _whole("slices in the pedestal (pedestal_um / slicing_um)", job.pedestal_um / slicing_um)
+    rows_per_px = _whole("hatching distances per pixel (pitch_um / hatching_um)", pitch_um / hatching_um)
     if gwl.mode == "piezo" and max(height, width) * pitch_um > _PIEZO_UM:
         size = f"an element of {max(height, width) * pitch_um:g} µm"
         raise InputError(
@@ -77,7 +78,9 @@ def _head(job: Gwl) -> str:
 
 
 def _runs(mask: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Yield the row, begin and end of each run of a mask (ny, nx), lowest row first."""
+    """Yield the row, the start and the end of each run of True pixels in a mask (ny, nx), beginning with the
+    lowest row.
+    """
     edges = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)[::-1]
     row, begin = np.nonzero(edges > 0)
     end = np.nonzero(edges < 0)[1]
@@ -99,5 +102,5 @@ def _powers(job: Gwl, highest: int) -> tuple[float, ...]:
 
 def _whole(what: str, count: float) -> int:
     if abs(count - round(count)) > 1e-6 or round(count) < 1:
-        raise InputError(what, got=f"{count:.4g}", wanted="a whole number, at least one")
+        raise InputError(what, got=f"{count:.4g}", wanted="a whole number of at least one")
     return round(count)

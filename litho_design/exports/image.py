@@ -1,4 +1,4 @@
-"""Write layouts as images whose grey is linear in height or follows a dose curve."""
+"""Write layouts as images whose grey values are linear in height or follow a dose curve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _CLASSIC_BYTES = 2**32 - 2**24
 
 
 def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
-    """Return the grey of each level, linear in height, with as many grey values per level as ``bits`` allow.
+    """Return grey values that are linear in the height of the levels, with the largest step that ``bits``
+    allow.
 
     Raises:
         InputError: there are more levels than grey values.
@@ -33,14 +34,16 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
-    """Return the grey values whose measured heights equal those of the levels, up to a constant height.
+    """Return the grey values whose measured heights, apart from a constant offset, equal the heights of the
+    levels.
 
     Args:
-        curve: CSV with the columns ``grey`` and ``height_um``, both rising, for example from a dose matrix.
+        curve: CSV with the columns ``grey`` and ``height_um``, for example from a dose matrix. The values in
+            both columns must increase from row to row.
 
     Raises:
-        InputError: the file is not such a table, a level lies beyond the measured heights, or two levels have
-            the same grey.
+        InputError: the file is not such a table, the height of a level is outside the measured range, or two
+            levels have the same grey value.
     """
     try:
         table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))
@@ -49,20 +52,22 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
     except (OSError, ValueError, IndexError):
         rising = False
     if not rising:
-        wanted = "a CSV with the rising columns grey and height_um"
+        wanted = "a CSV with the columns grey and height_um, both increasing"
         raise InputError("dose curve", got=str(curve), wanted=wanted)
     heights = height_um[0] + np.arange(layout.levels) * layout.level_height_um
     found = np.rint(np.interp(heights, height_um, grey)).astype(int).tolist()
     if heights[-1] > height_um[-1] + 1e-9 or len(set(found)) < layout.levels:
-        got = f"{np.ptp(height_um):.3g} µm of heights for {heights[-1] - heights[0]:.3g} µm of levels"
-        raise InputError("dose curve", got=got, wanted="a curve with a different grey for every level")
+        got = (
+            f"a height range of {np.ptp(height_um):.3g} µm, but levels over {heights[-1] - heights[0]:.3g} µm"
+        )
+        raise InputError("dose curve", got=got, wanted="a curve with a different grey value for every level")
     if found[0] < 0 or found[-1] >= 2**bits:
         raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
     return found
 
 
 def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
-    """Write a 16-bit grey PNG, or an 8-bit BMP with a CSV of grey and height."""
+    """Write a 16-bit greyscale PNG, or an 8-bit BMP and a CSV that gives the height of each grey value."""
     import cv2
 
     kind = np.uint8 if path.suffix == ".bmp" else np.uint16
@@ -75,10 +80,11 @@ def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_heig
 
 
 def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float) -> None:
-    """Write a TIFF with its resolution and two pages: 16-bit levels, and float32 nominal heights in µm.
+    """Write a TIFF that states its resolution and has two pages: 16-bit levels, and float32 nominal heights
+    in µm.
 
-    The file is written strip by strip. If a TIFF cannot hold the pages, it is a BigTIFF compressed by
-    deflate.
+    The file is written strip by strip. If the pages are too large for a classic TIFF, the file is a BigTIFF
+    with deflate compression.
     """
     import tifffile
 

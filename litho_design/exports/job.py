@@ -1,4 +1,4 @@
-"""Settings of a print job beyond the layout: format, base, slices and lines."""
+"""Settings of a print job that the layout does not contain: format, base, slices and lines."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Gwl(Record):
 
 
 class PrintJob(Record):
-    """Settings of a print job: only STL and GWL print the base, but every sidecar records base, slicing and
-    hatching.
+    """Settings of a print job. The base is printed only from STL and GWL files, but every sidecar records the
+    base, the slicing and the hatching.
     """
 
     pedestal_um: float = setting(

@@ -23,11 +23,11 @@ _FLAT_UM = 4.0
 
 
 class Marks(Record):
-    """Positions of element, mark and witness in an exported map, in pixels: first and last row, first and
-    last column.
+    """Positions of the element, the orientation mark and the witness area in an exported map. Each position
+    is the first and last row and the first and last column, in pixels.
 
     ``witness_height_um`` is the height above the ground that the design's model predicts for the middle of
-    the witness.
+    the witness area.
     """
 
     element_px: Box
@@ -37,7 +37,7 @@ class Marks(Record):
     witness_height_um: float
 
     def parts(self) -> dict[str, Box]:
-        """Return the positions of element, mark and witness by name."""
+        """Return a dict of the positions of the element, the mark and the witness area."""
         return {"ELEMENT": self.element_px, "ORIENTATION": self.orientation_px, "WITNESS": self.witness_px}
 
 
@@ -46,18 +46,18 @@ def with_marks(
 ) -> tuple[np.ndarray, Marks]:
     """Add an F and a square of the highest level to the right of a level map (size, size).
 
-    F and square are at least the printer's reach away from the element and from each other, so that none of
-    the three changes the print of another. All of them consist of whole cells.
+    The F, the square and the element are separated by at least the reach of the printer, so none of them
+    changes the print of another. The element and both marks consist of whole cells.
 
     Args:
         guard_um: reach of the printer, µm.
-        level_heights_um: printed height of a wide field of each level.
+        level_heights_um: height to which a wide field of each level is printed.
 
     Returns:
         The wider map, uint8 (size, width), and the positions of the parts.
 
     Raises:
-        InputError: the element has fewer rows than mark and witness need together.
+        InputError: the element has too few rows for both the mark and the witness area.
     """
     cell = 1 if layout.symmetry == "radial" else layout.cell_px
 

@@ -13,8 +13,8 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx) in memory or on disk, with row 0 on top; its rows are sliced like those of an
-    array.
+    """A level map (ny, nx) in memory or on disk, with row 0 at the top. The rows of the map can be sliced
+    like those of an array.
     """
 
     @property
@@ -30,7 +30,8 @@ class RingRows:
     """The level map of a lens of rings; only the requested rows are computed.
 
     Args:
-        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture have the last level.
+        ring_level: level of each pixel along the radius, uint8. Beyond the aperture, the corners have the
+            last of these levels.
     """
 
     ring_level: np.ndarray

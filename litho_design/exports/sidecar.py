@@ -21,8 +21,8 @@ _OF_DESIGN = ("printer", "stroke", "out_of_distribution", "predicted", "settings
 
 
 class Sidecar(Result):
-    """The contents of <file>.json beside an exported file; fields about a design are None if there is no
-    design.
+    """The contents of the file <file>.json that accompanies an exported file. The fields that describe a
+    design are None if there is no design.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/export/2"
@@ -68,14 +68,14 @@ class Sidecar(Result):
 
 
 def cell_of(layout: LayoutSettings) -> int:
-    """Return the side, in pixels, of the square cells of a layout; it is 1 for a ring layout, which has
-    none.
+    """Return the side, in pixels, of the square cells of a layout. For a ring layout, which has no cells,
+    return 1.
     """
     return 1 if layout.symmetry == "radial" else layout.cell_px
 
 
 def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, Any]:
-    """Return the fields of the sidecar for a map of this shape."""
+    """Return the fields of the sidecar that describe a map of this shape."""
     return {
         "shape_px": shape_px,
         "pitch_um": layout.pitch_um,
@@ -89,7 +89,9 @@ def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, An
 
 
 def of_job(job: PrintJob, format: Format) -> dict[str, Any]:
-    """Return the fields of the sidecar for a print job; fields of other formats are None."""
+    """Return the fields of the sidecar that describe a print job. Fields that apply only to other formats are
+    None.
+    """
     return {
         **job.model_dump(include={"pedestal_um", "slicing_um", "hatching_um"}),
         "gds_layers": job.gds_layers if format == "gds" else None,

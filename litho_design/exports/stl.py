@@ -1,5 +1,5 @@
-"""Write layouts as a closed solid (binary STL, µm), with two triangles per cell and walls that meet at
-corners.
+"""Write a layout as a closed solid (binary STL, µm). The top of each cell consists of two triangles, and
+walls meet at the corners of cells.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def write_stl(
     Every edge belongs to two faces, even where columns touch only along an edge; see ``step_solid``.
 
     Args:
-        levels: integer levels per cell (ny, nx), with row 0 on top; in the file, y points up.
+        levels: integer levels per cell (ny, nx), with row 0 at the top. In the file, y points upwards.
         cell_um: side of one cell.
         pedestal_um: height of the base under level 0; must be positive.
 
@@ -57,15 +57,15 @@ def write_stl(
 def step_solid(levels: np.ndarray) -> np.ndarray:
     """Return the triangles (m, 3, 3) of the solid that has one column per cell, as x y z, float32.
 
-    Every edge belongs to two faces, which traverse it in opposite directions. For this, a wall has a corner
-    at the height of each top among the four columns around each of its ends.
+    Every edge belongs to two faces, which traverse it in opposite directions. To achieve this, each end of a
+    wall has a vertex at the height of every column top that meets there.
 
     Args:
         levels: non-negative integers (ny, nx); y increases with the row.
 
     Returns:
-        x and y are in cells and z in levels, -1 for the underside; triangles run counter-clockwise as seen
-        from outside.
+        Corners of triangles, with x and y in cells and z in levels (-1 for the underside). Seen from outside,
+        the corners of a triangle run counter-clockwise.
     """
     cells = np.pad(np.asarray(levels, np.int16), 1, constant_values=_BELOW)
     around = np.stack([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=-1)
@@ -88,8 +88,8 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Return positions (n, 3) of points (n, 2), given as row and column; some points are moved towards a
-    cell.
+    """Return the positions (n, 3) of points (n, 2), which are given as row and column. The points marked in
+    ``moved`` are shifted towards a cell.
     """
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)

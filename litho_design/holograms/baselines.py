@@ -1,4 +1,4 @@
-"""Compute baselines of a hologram: the scores of a black image and of ideal elements on the same grid."""
+"""Compute baselines for a hologram: the scores of a black image and of ideal elements on the same grid."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssi
 def hologram_baselines(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
 ) -> dict[str, dict[str, float]]:
-    """Return by name the scores of a black image and of ideal elements in the optics of ``bench``.
+    """Return a dict of the scores that a black image and ideal elements have in the optics of ``bench``.
 
-    ``diffraction-limited`` is an element with free amplitude and phase, found by forty Gerchberg-Saxton
-    steps, whose image has a flat phase. ``continuous phase`` has one phase per cell, without printer and
-    levels. Its search starts from Gerchberg-Saxton and takes a hundred descent steps on the design's own
-    loss, which is among the scores. ``weighted GS`` has one phase per cell from forty weighted
-    Gerchberg-Saxton steps.
+    ``diffraction-limited`` is an element with free amplitude and phase whose image has a flat phase, found by
+    forty Gerchberg-Saxton steps. ``continuous phase`` has one arbitrary phase per cell and needs neither a
+    printer nor levels. The search for these phases starts from Gerchberg-Saxton and takes a hundred descent
+    steps on the loss of the design. This loss is one of the scores. ``weighted GS`` also has one phase per
+    cell, found by forty weighted Gerchberg-Saxton steps.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -56,8 +56,8 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Return the largest power on the signal {T > 0.5} that a search over phases finds, starting from a
-    print.
+    """Search for the phases that put the most power on the signal {T > 0.5}, starting from a print, and
+    return this power.
 
     Each step is u <- exp(j arg P^H S P u), where S selects the signal; every pixel has its own phase. P^H S P
     is positive, so no step reduces the power, and the result is never below that of the print.
@@ -97,7 +97,9 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
-    """Return the phases of the cells, in radian, that have the lowest loss, and this loss."""
+    """Search for the phases of the cells that have the lowest loss. Return these phases, in radians, and the
+    loss.
+    """
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
         counted=counted,

@@ -79,13 +79,14 @@ def hologram_score(
     """Score the summed intensity of the waves in the image plane against the target image.
 
     The signal is S = {T > 0.5}. Before the comparison, the image is scaled by c = sum(I T) / sum(I^2). SSIM
-    uses an 11 px Gaussian window, sigma 1.5 and data range 1, on c I clipped to [0, 1].
+    is computed on c I, clipped to [0, 1], with an 11 px Gaussian window, sigma 1.5 and a data range of 1.
 
     Args:
-        waves: share of the light of each wave, and its complex field (m, m) in the image plane for unit
-            incident power, 1/µm.
-        element: complex field (n, n) just behind the element, on the same pixels; its mean gives the zero
-            order, the share of power that goes straight on as a plane wave.
+        waves: one pair for each wave, namely the share of the light in this wave, and the complex field (m,
+            m) of the wave in the image plane for unit incident power, 1/µm.
+        element: complex field (n, n) just behind the element, on the same pixels. The mean of this field
+            determines the zero order, which is the share of the power that continues undiffracted as a plane
+            wave.
         target: real (m, m) in [0, 1].
         grid: geometry of the waves.
     """
@@ -105,7 +106,7 @@ def hologram_score(
 
 
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
-    """Return a real target (m, m) at the resolution of an element of the same size.
+    """Blur a real target (m, m) to the resolution of an element of the same size.
 
     The target is convolved with the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
     where NA is the sine of the angle from the axis to the edge. The target is dark beyond the window.
@@ -122,8 +123,8 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Return the share of the power behind the element that belongs to its mean, the undiffracted plane
-    wave.
+    """Return the share of the power behind the element that is in the undiffracted plane wave (the mean of
+    the field).
     """
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)
@@ -135,8 +136,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM between the waves' light, as a camera records it, and the target on the camera's
-    pixels.
+    """Return the SSIM between the image that a camera records of the waves, and the target sampled on the
+    camera's pixels.
     """
     import cv2
 
@@ -159,7 +160,8 @@ def through_aperture(
 ) -> Tensor:
     """Return the field after an ideal objective, which removes spatial frequencies above NA / wavelength.
 
-    The window is mirrored once, because the transform is periodic and would otherwise join opposite edges.
+    The field is extended by its mirror image before the Fourier transform, because the transform is periodic
+    and would otherwise join opposite edges.
     """
     rows, columns = field.shape
     mirrored = torch.cat([field, field.flip(0)], 0)

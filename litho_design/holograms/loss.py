@@ -14,8 +14,8 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Return the mask (size, size) of the pixels near the target's light, which count in the error; None if
-    all count.
+    """Return a mask (size, size) of the pixels near the target's light. Only these pixels count in the error.
+    Return None if all pixels count.
     """
     if not settings.signal_window_um:
         return None
@@ -37,9 +37,9 @@ def hologram_loss(
     Args:
         share: share of the incident power on each pixel (size, size).
         target: target intensity in [0, 1], (size, size).
-        counted: pixels that count in the error, bool (size, size); None for all.
-        total: function that sums over the pixels of the whole image, if the other arguments cover only a part
-            of it; otherwise None.
+        counted: mask of the pixels that count in the error, bool (size, size); None if all pixels count.
+        total: function that sums over the pixels of the whole image, needed only if the other arguments cover
+            a part of the image.
     """
     total = total or torch.sum
     efficiency = total(share[target > 0])

@@ -23,9 +23,9 @@ class HologramLoss(Record):
 
     With ``signal_window_um``, only pixels within this distance of the target's light count in the error. The
     error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
-    doi:10.1364/OE.16.002176). ``scale`` says how the image is matched to the target: ``paper`` divides by the
-    mean over the target's light, and ``least-squares`` uses the factor with the smallest error. The
-    efficiency is the share of the incident power on pixels whose target is above zero.
+    doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target: ``paper`` divides
+    it by its mean over the target's light, and ``least-squares`` multiplies it by the factor that gives the
+    smallest error. The efficiency is the share of the incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
@@ -50,21 +50,22 @@ class HologramSettings(DesignSettings):
 def hologram_settings(
     variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> HologramSettings:
-    """Return a preset for a hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
+    """Return a preset for a hologram, changed by ``changes``, such as ``{"layout.size_px": 256}``.
 
-    ``paper``: as stated in the paper (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
-    iterations at 0.1, expected levels). ``authors``: as in the published code, which has 12 levels,
-    temperature 1, wavelength 0.633 and index step 0.545. After more than ten iterations without progress the
-    rate falls to a tenth. The code's efficiency term is constant and therefore left out.
-    docs/from_the_authors_code.md lists what is not reproduced of that code. ``default``: one height per cell
-    from a Gerchberg-Saxton start, followed by a polish of the printable layout.
+    ``paper`` has the settings that the paper states: 13 levels, Gumbel-Softmax at temperature 0.5, a random
+    start, 1000 Adam iterations at a rate of 0.1, and expected levels. ``authors`` has the settings of the
+    published code: 12 levels, temperature 1, wavelength 0.633 and index step 0.545. After more than ten
+    iterations without progress, the rate is reduced to a tenth. The efficiency term in the code is constant,
+    so it is omitted here. docs/from_the_authors_code.md lists what is not reproduced of that code.
+    ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes the
+    printable layout.
 
     Args:
         variant: the preset; a ``variant`` among the changes overrides it.
         changes: values by dotted path, or nested mappings as in a settings file.
 
     Raises:
-        InputError: a change names an unknown setting, or a value that the setting does not accept.
+        InputError: a change names an unknown setting, or gives a value that the setting does not accept.
     """
     return preset(_preset, variant, changes)
 

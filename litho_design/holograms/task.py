@@ -31,14 +31,14 @@ class HologramTask(Task):
 
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
-        printer: frozen model, or nominal heights.
-        inputs: ``target``, the target image at the size of the element, as ``load_target`` returns it with
-            its record.
+        printer: a frozen model, or the printer of nominal heights.
+        inputs: contains ``target``, the target image at the size of the element. ``load_target`` returns this
+            image and its record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
-        InputError: the target has another size or lacks dark or bright pixels, the start is for lenses, or
-            the spreads exceed the range of the propagator.
+        InputError: the target does not have the size of the element or lacks dark or bright pixels, the
+            requested start works only for lenses, or the spreads exceed the range of the propagator.
     """
 
     name = "hoe"
@@ -115,8 +115,8 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Return the signal efficiency of the continuous phase with the most power, found by a search from
-        the print.
+        """Search from the print for the continuous phase that puts the most power on the signal, and return
+        the signal efficiency.
         """
         return best_signal_efficiency(self.bench, height_um, self.target)
 
@@ -143,7 +143,7 @@ def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
     near_um = math.floor(near_um / digit_um) * digit_um
     return [
         f"the image will be blurred: the strokes of the target are about {stroke_um:.2g} µm wide, but an "
-        f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm draws no detail finer than "
+        f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm resolves no detail finer than "
         f"λz/D = {finest_um:.2g} µm; use --distance-um {near_um:.2g} or less, a larger --size-px, or "
         "bolder strokes"
     ]
@@ -154,7 +154,7 @@ def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
         raise InputError(
             "size_px of a hologram",
             got=layout.size_px,
-            wanted=f"at least {SSIM_WINDOW_PX}, the window of SSIM",
+            wanted=f"at least {SSIM_WINDOW_PX}, the side of the SSIM window",
         )
     wanted = (layout.size_px, layout.size_px)
     if target.shape != wanted:

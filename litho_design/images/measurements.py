@@ -14,8 +14,8 @@ Levelling = Literal["none", "plane", "bow"]
 
 @dataclass(frozen=True)
 class MeasuredSource:
-    """A height map of the printed part. Give unit and size (one side, or y and x) if the file does not state
-    them.
+    """A height map of the printed part. If the file does not state the unit and the size, pass ``unit`` and
+    ``size_um`` (one side, or y and x).
 
     Use ``aligned`` for elements that look the same at several positions or in several orientations, such as a
     lens cap or a blaze.
@@ -45,8 +45,8 @@ class MeasuredSource:
     )
     tip_um: float | None = setting(
         None,
-        "Radius of the tip whose widening of the surface is removed (by default, estimated from the scan; "
-        "0 removes nothing)",
+        "Radius of the tip, used to remove the widening that the tip causes (by default, the radius is "
+        "estimated from the scan; 0 removes nothing)",
         unit="µm",
         option="--scan-tip-um",
     )
@@ -54,8 +54,8 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of a hologram's image, or of an object through a lens; its counts increase with the
-    light.
+    """A photograph of a hologram's image, or of an object through a lens. The counts of the photograph
+    increase with the light.
     """
 
     path: Path = setting(
@@ -71,7 +71,7 @@ class PhotoSource:
     )
     imaged: str | None = setting(
         None,
-        "Object in front of the lens: one of the design's objects by name, or a picture",
+        "Object in front of the lens: the name of one of the design's objects, or an image file",
         option="--camera-object",
     )
     orientation: str = setting(
@@ -82,8 +82,8 @@ class PhotoSource:
     )
     power_counts: float | None = setting(
         None,
-        "Summed counts, without dark level, of all light on the element at the same exposure; needed "
-        "for efficiencies",
+        "Sum of the counts, minus the dark level, that all light on the element gives at the same exposure; "
+        "needed for efficiencies",
         option="--camera-power",
     )
     pitch_sd: float = setting(

@@ -1,5 +1,5 @@
-"""Estimate the white noise of a measured map, and the uncertainty of a score that the measurement's
-uncertainty causes.
+"""Estimate the white noise of a measured map, and how the uncertainty of a measurement propagates to its
+scores.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ def white_noise(values: np.ndarray) -> float:
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Return the noise of a photograph (ny, nx): its sd in the dark, and its sd as a share of the light.
+    """Return two standard deviations of the noise in a photograph (ny, nx): that in the dark, and that
+    relative to the light.
 
-    The second part covers, for example, speckle, which is proportional to the light.
+    The second value includes noise that is proportional to the light, such as speckle.
 
-    The variance of the highest frequencies is fitted as (sd in the dark)^2 + (share)^2 times the squared
-    light.
+    The variance at the highest frequencies is fitted by dark^2 + (share * light)^2, where ``dark`` and
+    ``share`` are the two standard deviations.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -47,14 +48,14 @@ def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
 
 
 def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Hann window of a map, and the mask of the frequencies that contain only noise."""
+    """Return a Hann window for a map, and a mask of the frequencies that contain only noise."""
     along = [np.abs(np.fft.fftfreq(count)) > _NOISE_BAND for count in shape]
     return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:
-    """Return the standard deviation of every figure of ``measured``: its rms change over variants of the
-    measurement.
+    """Return the standard deviation of every figure in ``measured``, computed as the rms change of the figure
+    over variants of the measurement.
     """
     return {name: float(np.sqrt(np.mean(found**2))) for name, found in _changes(score, measured, variants)}
 
@@ -62,12 +63,13 @@ def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iter
 def freed_of_noise(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return figures corrected for the bias from noise, and the standard deviation of each figure.
+    """Correct figures for the bias that noise causes. Return the corrected figures, and the standard
+    deviation of each.
 
-    The measurement already contains noise, and the variants add as much again. Their mean change therefore
-    estimates the change that the measurement's own noise caused (bias correction by bootstrap, Efron and
-    Tibshirani 1993, chapter 10). Variants come in pairs of opposite noise, so a figure that is linear in the
-    noise is not changed.
+    The measurement already contains noise, and each variant adds the same amount of noise again. The mean
+    change of a figure over the variants therefore estimates how much the noise in the measurement changed the
+    figure (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). The variants come in pairs
+    with opposite noise, so figures that are linear in the noise are not corrected.
     """
     changes = dict(_changes(score, measured, variants))
     figures = {name: getattr(measured, name) - float(found.mean()) for name, found in changes.items()}
@@ -77,7 +79,7 @@ def freed_of_noise(
 def _changes(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the changes of every figure of ``measured`` over variants of the measurement."""
+    """Yield how every figure in ``measured`` changes over variants of the measurement."""
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
     for name, value in measured.model_dump(exclude_none=True).items():
         yield name, np.array([one[name] for one in scores]) - value

@@ -44,13 +44,15 @@ _TIE = 0.03
 
 
 class CameraRecord(Record):
-    """Source and processing of a photograph; ``imaged`` is the object in front of a lens.
+    """Source and processing of a photograph. If the photograph was taken through a lens, ``imaged`` is the
+    photographed object.
 
     ``orientation`` is the operation that brings the photograph into the orientation of the image;
-    ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the noise (sd) in the
-    dark, and ``noise_share`` the additional noise as a share of the light. ``vignetting_sd`` is the possible
-    loss of light in the camera's corners. ``blur_um`` is the fitted blur (sd) beyond that of the expected
-    image, and ``gamma`` the fitted exponent of the counts as a power of the light.
+    ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the standard deviation of
+    the noise in the dark, and ``noise_share`` is that of the additional noise, relative to the light.
+    ``vignetting_sd`` is the possible loss of light in the camera's corners. ``blur_um`` is the standard
+    deviation of the fitted blur in addition to that of the expected image. The counts are proportional to a
+    power of the light, and ``gamma`` is the fitted exponent.
     """
 
     name: str
@@ -86,8 +88,8 @@ class CameraRecord(Record):
         if self.ambiguous:
             others = ", ".join(self.ambiguous)
             found.append(
-                f"ambiguous: the photograph fits equally well after {others}, so a mirrored print "
-                "would go unnoticed"
+                f"ambiguous: the photograph fits equally well if the operation is {others}, so a mirrored "
+                "print would go unnoticed"
             )
         if self.coverage < 1:
             found.append(
@@ -100,20 +102,21 @@ class CameraRecord(Record):
             )
         if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
             found.append(
-                f"counts seem to grow as the light to the power {self.gamma:.2f}; check that the file is raw"
+                f"counts seem to be proportional to the light to the power {self.gamma:.2f}; check that the "
+                "file is raw"
             )
         return found
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph and the position of the image on it.
+    """A photograph, and the position of the expected image on it.
 
     Attributes:
-        counts: cleaned, upright counts without the dark level (ny, nx).
+        counts: counts (ny, nx) of the cleaned, upright photograph, minus the dark level.
         window_to_photo: projective map (3, 3) from window pixels to photograph pixels.
-        side_px: side of the window, in its pixels.
-        pitch_um: side of a pixel of the window.
+        side_px: side of the window, in window pixels.
+        pitch_um: side length of a window pixel.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
         expected: expected counts (m, m), used for pixels that lie beyond the photograph.
@@ -128,22 +131,22 @@ class Photograph:
     expected: np.ndarray
 
     def image(self) -> np.ndarray:
-        """Return the photograph resampled on the window (m, m), in counts per camera pixel, which noise may
-        make negative.
+        """Return the photograph resampled on the window (m, m), in counts per camera pixel. Some counts may
+        be negative because of noise.
         """
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
-        """Express ``image`` as shares of the light on the element, whose summed counts are
-        ``power_counts``.
+        """Express ``image`` as shares of the light on the element. ``power_counts`` is the sum of the counts
+        that this light gives.
         """
         # The factor is the number of photograph pixels per window pixel, in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Yield pairs of equally plausible images that differ in noise, dark level, position, size and
-        vignetting.
+        """Yield pairs of images that are as plausible as the measured one, with different noise, dark level,
+        position, size and vignetting.
         """
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
@@ -184,22 +187,23 @@ def photographed_image(
 ) -> Photograph:
     """Register a photograph to the image that the design expects.
 
-    The dark level is subtracted, and single hot or dead pixels are replaced by their neighbours' median. Then
-    a model of the camera (shifted, rotated and, if needed, tilted) is fitted by least squares to the expected
-    image, with free gain and background. The scale is free only if the pitch has an uncertainty. A scale that
-    is always free would attribute an image that the print made too large to the camera. All eight
-    orientations are tried, and a photograph that fits another orientation better than ``orientation`` is
-    refused.
+    The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
+    neighbours. Then a model of the camera is fitted to the expected image by least squares. The model may be
+    shifted and rotated and, if needed, tilted; its gain and background are free. The scale is free only if
+    the pitch has an uncertainty. If the scale were always free, a print that makes the image too large would
+    be mistaken for a camera with a different scale. All eight orientations are tried. A photograph that fits
+    another orientation better than ``orientation`` is refused.
 
     Args:
-        wanted: expected image (m, m), at any scale; ``wanted_pitch_um``: side of its pixels, µm.
-        source: grey image of any bit depth, whose counts are proportional to the light. If the dark level is
-            unknown, it is chosen so that the darkest pixels are as bright as expected.
+        wanted: expected image (m, m), in any unit. ``wanted_pitch_um`` is the side of its pixels, µm.
+        source: greyscale image of any bit depth whose counts are proportional to the light. If the dark level
+            is unknown, it is chosen so that the darkest pixels have the expected brightness.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
 
     Raises:
-        InputError: the file is not an image, the pitch is not positive, the orientation is unknown, or the
-            photograph is overexposed, not linear, unlike the expected image, mirrored or rotated.
+        InputError: the file is not an image, the pitch is not positive, or the orientation is unknown. The
+            error is also raised if the photograph is overexposed, not linear, unlike the expected image,
+            mirrored or rotated.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
@@ -274,8 +278,8 @@ def photographed_image(
 
 
 def _saturated(raw: np.ndarray) -> float:
-    """Return the share of pixels at the top of the file's range, or of 12 or 14 bits if counts pile up
-    there.
+    """Return the share of saturated pixels. A pixel is saturated at the end of the range of 8, 10, 12, 14 or
+    16 bits, or at another maximum at which counts pile up.
     """
     top = int(raw.max())
     ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
@@ -286,12 +290,14 @@ def _saturated(raw: np.ndarray) -> float:
 
 
 def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | None) -> np.ndarray:
-    """Divide a photograph by that of uniform light, scaled to a mean of 1; the dark level is kept."""
+    """Divide a photograph by a photograph of uniform light, which is scaled to a mean of 1. The dark level is
+    preserved.
+    """
     from scipy.ndimage import gaussian_filter
 
     flat = read_grey(flat_file, "photograph of uniform light")[0].astype(np.float32)
     if flat.shape != photo.shape or dark_level is None or not np.median(flat) > dark_level:
-        wanted = f"{photo.shape} px, brighter than a given --camera-dark-level"
+        wanted = f"{photo.shape} px, and counts above a --camera-dark-level that is also given"
         raise InputError("photograph of uniform light", got=f"{flat.shape} px", wanted=wanted)
     light = gaussian_filter(flat - dark_level, 2.0)
     even: np.ndarray = (photo - dark_level) * (light.mean() / light.clip(min=0.05 * light.max()))
@@ -299,8 +305,8 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
 
 
 def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
-    """Return the dark level at which the darkest pixels of the photograph are as bright as expected, and its
-    sd.
+    """Return the dark level at which the darkest pixels have the expected brightness, and its standard
+    deviation.
     """
     import cv2
 
@@ -316,7 +322,7 @@ def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float
 def _check_orientation(
     photo: np.ndarray, wanted: np.ndarray, scale: float, pitch_sd: float, asked: str, photo_file: str | Path
 ) -> list[str]:
-    """Return other orientations that fit as well as the requested one.
+    """Return the other orientations that fit as well as the requested one.
 
     Raises:
         InputError: another orientation fits better, or none fits.
@@ -340,7 +346,7 @@ def _check_orientation(
     if found[asked] < found[best] - _TIE:
         raise InputError(
             f"photograph {photo_file}",
-            got=f"an image that fits after {best} (correlation {found[best]:.2f}), not after {asked} "
+            got=f"an image that fits better after {best} (correlation {found[best]:.2f}) than after {asked} "
             f"({found[asked]:.2f})",
             wanted="an upright photograph",
             hint=f"if the camera and not the print caused this, use --camera-orientation {best}",
@@ -358,8 +364,8 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
 
 
 def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
-    """Replace pixels that are far from the median of their 3 x 3 neighbourhood, relative to the image's
-    spread.
+    """Replace outliers by the median of their 3 x 3 neighbourhood. Outliers deviate from this median by much
+    more than most pixels.
     """
     import cv2
 
@@ -375,8 +381,8 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fitted camera: the map (3, 3) from window to photograph pixels, properties, and standard
-    deviations.
+    """A fitted camera: the map (3, 3) from window to photograph pixels, and its other parameters with their
+    standard deviations.
     """
 
     window_to_photo: np.ndarray
@@ -390,8 +396,8 @@ class _Fit:
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
-    """Fit the camera whose photograph of the expected image is closest to ``photo``; with ``further``, also
-    fit tilt and light.
+    """Fit the camera whose photograph of the expected image is closest to ``photo``. With ``further``, also
+    fit its tilt and the relation between counts and light.
     """
     import cv2
 
@@ -467,11 +473,11 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
 
 
 def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
-    """Return the covariance of a least-squares fit with correlated neighbours, from the scatter between
-    tiles.
+    """Return the covariance of a least-squares fit whose residuals are correlated between neighbours. The
+    covariance is computed from the scatter between tiles.
 
-    A print unlike the expected one is displaced differently from place to place, so each tile counts as one
-    observation (White 1980).
+    If the print differs from the expected print, its apparent displacement varies from place to place. Each
+    tile therefore counts as one observation (White 1980).
     """
     tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
     number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
@@ -504,8 +510,8 @@ def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, fl
 
 
 def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
-    """Return the map (3, 3) from window to photograph pixels for a camera's shift (px), rotation, log scale
-    and two tilts.
+    """Return the map (3, 3) from window to photograph pixels for a camera pose, which is a shift (px), a
+    rotation, the logarithm of the scale and two tilts.
     """
     turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
     centre = (np.array(shape[1::-1]) - 1) / 2
@@ -531,7 +537,9 @@ def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Return the shift (x, y) of ``moving`` (n, n) in whole pixels, at the maximum of the correlation."""
+    """Return the shift (x, y) of ``moving`` (n, n), in whole pixels, at which its correlation with
+    ``reference`` is largest.
+    """
     correlation = correlate(moving - moving.mean(), reference - reference.mean(), method="fft")
     y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)
     return np.array([x, y]) - (len(reference) - 1)

@@ -15,16 +15,16 @@ def matched_scale(image: Tensor, target: Tensor) -> Tensor:
 
 
 def si_psnr_db(image: Tensor, target: Tensor) -> float:
-    """Return the PSNR, -10 log10 mean((c I - T)^2), which does not depend on the image's scale; the peak is 1
-    by definition.
+    """Return the scale-invariant PSNR, -10 log10 mean((c I - T)^2), where c is ``matched_scale``. The peak
+    value is 1 by definition.
     """
     error = (matched_scale(image, target) * image - target).square().mean()
     return float(-10 * torch.log10(error.clamp(min=1e-30)))
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """Return the RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the target's
-    light.
+    """Return the RMSE between I / I_avg and T, where I_avg = sum(I T) / sum(T) is the mean of I over the
+    target's light.
     """
     average = (image * target).sum() / target.sum()
     return (image / average - target).square().mean().sqrt()
@@ -41,8 +41,8 @@ def ssim(image: Tensor, target: Tensor) -> float:
 
 
 def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the SSIM at each pixel of images in [0, 1], with a window of 11 px and sigma 1.5 (Wang et al.
-    2004).
+    """Return the SSIM of two images in [0, 1] at each pixel, with a window of 11 px and sigma 1.5 (Wang et
+    al. 2004).
     """
     from skimage.metrics import structural_similarity
 
@@ -59,8 +59,8 @@ def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
-    """Return SI-PSNR and SSIM of an image (m, m) against its target and against the target at the element's
-    resolution.
+    """Return the SI-PSNR and the SSIM of an image (m, m) relative to its target, and relative to the target
+    at the resolution of the element.
     """
     figures = {}
     for name, wanted in (("", target), ("_resolved", resolved)):
@@ -71,10 +71,10 @@ def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float
 
 
 def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
-    """Return ``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME`` of an estimate (n, n) of an object (n, n) in
-    [0, 1].
+    """Compare an estimate (n, n) with the true object (n, n) in [0, 1], and return ``mae_NAME``,
+    ``psnr_NAME_db`` and ``ssim_NAME``.
 
-    PSNR and SSIM clip the estimate to that range.
+    For PSNR and SSIM, the estimate is clipped to [0, 1].
     """
     clipped = estimate.clamp(0, 1)
     error = (clipped - wanted).square().mean().clamp(min=1e-12)
@@ -86,7 +86,9 @@ def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
 
 
 def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
-    """Return the shares of light in an image (m, m) and its uniformity; the signal is {T > 0.5}."""
+    """Return the shares of the light in an image (m, m), and the uniformity of the image on the signal {T >
+    0.5}.
+    """
     lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
     return {

@@ -1,4 +1,4 @@
-"""Draw target images, or read them from pictures; their values are in [0, 1] on a square grid."""
+"""Draw target images, or read them from image files. Their values are in [0, 1] on a square grid."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROWS = 256
 
 
 class TargetRecord(Record):
-    """Source of a picture, and how it was fitted to the square."""
+    """Source of an image, and how the image was fitted to the square."""
 
     name: str
     sha256: str
@@ -30,7 +30,7 @@ class TargetRecord(Record):
 
     @classmethod
     def of_file(cls, path: Path, notes: Sequence[str]) -> TargetRecord:
-        """Make the record of a file and its conversions, one phrase each."""
+        """Make the record of a file. ``notes`` lists its conversions, one phrase each."""
         return cls(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
 
     @classmethod
@@ -45,24 +45,25 @@ ImagedObject = str | TargetRecord
 
 
 def object_name(item: ImagedObject) -> str:
-    """Return the name of the drawing or of the picture's file."""
+    """Return the name of the drawing or of the image file."""
     return item if isinstance(item, str) else item.name
 
 
 @dataclass(frozen=True)
 class Target:
-    """A target image, float32 (size, size) in [0, 1] with row 0 on top, and its record."""
+    """A target image, float32 (size, size) in [0, 1] with row 0 at the top, and its record."""
 
     pixels: np.ndarray
     record: TargetRecord
 
 
 def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Target:
-    """Load a target image of ``size_px``: a drawing by name, a picture by path, or an array.
+    """Load a target image of ``size_px``. The source is the name of a drawing, the path of an image, or an
+    array.
 
     Args:
-        source: text, ring, chart, spots or letters; an image file, whose grey values are fitted to the
-            square; or an array (size_px, size_px) in [0, 1], used unchanged.
+        source: text, ring, chart, spots or letters; an image file, which is converted to grey values and
+            fitted to the square; or an array (size_px, size_px) in [0, 1], which is used unchanged.
 
     Raises:
         InputError: the source is neither a drawing nor a readable image, or the image has no light.
@@ -83,8 +84,8 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:
-    """Return the stroke width of a target (size, size) in [0, 1], px: the median width along the middle lines
-    of its strokes.
+    """Return the stroke width, px, of a target (size, size) in [0, 1], which is the median of the widths
+    along the centre lines of the strokes.
     """
     import cv2
 
@@ -168,7 +169,8 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
-    """Read a picture as grey (ny, nx) with the values of its file, and list the conversions, one phrase each.
+    """Read an image as greyscale (ny, nx) without rescaling its values, and list the conversions, one phrase
+    each.
 
     Raises:
         InputError: the file does not exist or is not a readable image.
@@ -191,12 +193,12 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
 
 
 def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
-    """Read a picture as grey, place it on a black square, and divide it by its brightest value.
+    """Read an image as greyscale, place it on a black square, and divide it by its brightest value.
 
     Args:
-        path: a file of any format and bit depth that OpenCV reads; grey values are used as brightness.
+        path: a file of any format and bit depth that OpenCV can read; grey values are used as brightness.
         size_px: side of the square.
-        what: name of the picture in error messages.
+        what: name of the image in error messages.
 
     Returns:
         float32 (size, size) in [0, 1], and the conversions, one phrase each.

@@ -21,8 +21,8 @@ from litho_design.tasks.design import DESIGNS
 
 
 class GapEntry(Record):
-    """One design (arm, seed) printed by one judge; ``designed`` contains the figures that the arm itself
-    expects.
+    """The design of one arm and seed, printed by one judge. ``designed`` contains the figures that the arm
+    itself expects.
     """
 
     arm: str
@@ -105,7 +105,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """Return the differences of the given figures between every pair of arms, under each judge."""
+    """Return how the given figures differ between every pair of arms, under each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))

@@ -34,7 +34,7 @@ from litho_design.tasks.task import Task, registered_task
 
 
 class LoadedDesign:
-    """The layout of a design folder with its optics and scores, for any task.
+    """A design read from its folder: the layout, its optics and its scores, for any task.
 
     Attributes:
         folder: folder of the design.
@@ -46,15 +46,16 @@ class LoadedDesign:
         bench: the optics, which turn a height map into an image or a PSF.
 
     Args:
-        folder: a design folder; its arrays are checked against the hashes in the record. A lens of rings has
-            levels and heights along a radius instead of a plane.
+        folder: a design folder; its arrays are checked against the hashes in the record. For a lens of rings,
+            levels and heights are given along a radius, not over a plane.
         device: where prints and waves are computed.
-        element: ``thin`` or ``thick`` instead of the design's own (see ``Optics``).
-        band_px: largest number of rows of a band, if a large hologram is printed and scored band by band.
+        element: ``thin`` or ``thick``, if it is not to be the kind that the design states (see ``Optics``).
+        band_px: largest number of rows in a band, if a large hologram is to be printed and scored band by
+            band.
 
     Raises:
         InputError: the folder is incomplete or was altered, the task is not registered here, this machine
-            does not have the device, or bands are requested for anything but a thin hologram.
+            does not have the device, or bands are requested for something other than a thin hologram.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def image(self, height_um: Tensor) -> np.ndarray:
-        """Return the image or PSF behind a print, as the share of the incident power per pixel."""
+        """Return the image or PSF behind a print. Each pixel gives its share of the incident power."""
         return self.bench(height_um).cpu().numpy()
 
     def score(self, height_um: Tensor) -> Record:
@@ -124,7 +125,7 @@ class LoadedDesign:
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """Scale an image to its target, as reports show it; a PSF becomes the square root of PSF over
+        """Scale an image to its target, to show it in reports. A PSF is shown as the square root of PSF /
         peak.
         """
         return self.task.display(image)
@@ -136,7 +137,7 @@ class LoadedDesign:
 
     @property
     def frame_um(self) -> float:
-        """Return the side of a lens's objects or, for another task, of the image, µm."""
+        """Return the side, µm, of the objects of a lens or, for other tasks, the side of the image."""
         if not isinstance(self.task, LensTask):
             return self.window_um
         imaging = self.task.settings.imaging

@@ -34,9 +34,9 @@ class MeasuredRecord(Record):
     """The scan, its agreement with the expected print, and its processing.
 
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
-    ``tilt_um_per_um`` (x, y) and ``bow_um``, the range of the curved part over the element, were removed.
-    ``noise_um`` is the residual at frequencies at which no print has structure. ``defect_share`` is the share
-    of the element that shows dust or scars instead of the print.
+    ``tilt_um_per_um`` (x, y) is the tilt that was removed, and ``bow_um`` is the range, over the element, of
+    the bow that was removed. ``noise_um`` is the residual at spatial frequencies at which prints have no
+    structure. ``defect_share`` is the share of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -58,7 +58,9 @@ class MeasuredRecord(Record):
     tip_change_um: float
 
     def remarks(self) -> list[str]:
-        """Return remarks on what was removed and on the orientation of the scan, one phrase each."""
+        """Return remarks on what was removed from the scan and how it was rotated or flipped, one phrase
+        each.
+        """
         found = [] if not self.warning else [self.warning]
         found += ["the scan was used without registration"] if self.aligned else []
         if self.orientation != "identity":
@@ -71,12 +73,14 @@ class MeasuredRecord(Record):
                 f"a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm were removed"
             )
         if self.defect_share:
-            found.append(f"dust or scars on {100 * self.defect_share:.2g} % of the element were left out")
+            found.append(
+                f"dust or scars cover {100 * self.defect_share:.2g} % of the element and were excluded"
+            )
         if self.tip_um:
             change = f"{1000 * self.tip_change_um:.0f} nm rms"
             found.append(
-                f"the widening by a tip of {1000 * self.tip_um:.0f} nm radius was removed, which changed the "
-                f"heights by {change}"
+                f"the widening caused by a tip with a radius of {1000 * self.tip_um:.0f} nm was removed, "
+                f"which changed the heights by {change}"
             )
         return found
 
@@ -87,7 +91,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase. The zero is therefore
     set so that the medians of the measured and the designed print agree. Tilt and bow of the scanner are
     fitted together with the designed print, so that no part of the shape of the design is removed. Unmeasured
-    pixels take their values from the designed print.
+    pixels are filled with the heights of the designed print.
 
     Args:
         loaded: the design.
@@ -158,8 +162,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """Remove the widening by the tip from a scan; return the scan, and the tip's radius and the rms change of
-    heights, µm.
+    """Remove from a scan the widening that the tip caused. Return the scan, the radius of the tip, µm, and
+    the rms change of the heights, µm.
     """
     from litho_data.tip import estimate_tip, paraboloid_erosion
 
@@ -177,8 +181,8 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 
 
 def _defects(off_um: np.ndarray) -> np.ndarray:
-    """Return a mask of dust and scars from ``off_um`` (ny, nx), the deviation of a print from its expectation
-    without tilt and bow.
+    """Return a mask of dust and scars. ``off_um`` (ny, nx) is the deviation of a print from the expected
+    print, after tilt and bow are removed.
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
@@ -195,7 +199,9 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
 
 class _Placed(NamedTuple):
-    """A scan on the pixels of the layout (ny, nx): heights, measured pixels, transform and uncertainties."""
+    """A scan resampled on the pixels of the layout (ny, nx): heights, mask of measured pixels, orientation,
+    warning and position uncertainty.
+    """
 
     height_um: np.ndarray
     valid: np.ndarray
@@ -236,8 +242,8 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan: their map (ny, nx), µm, with zero mean, the slopes (x, y), and the range of the
-    bow.
+    """Tilt and bow of a scan. ``map_um`` (ny, nx) is their sum and has zero mean; the other fields are the
+    slopes (x, y) of the tilt and the range of the bow.
     """
 
     map_um: np.ndarray
@@ -268,7 +274,9 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield equally plausible prints (ny, nx), µm, that differ in noise, position, height scale and tip."""
+    """Yield prints (ny, nx), µm, that are as plausible as the measured one, with different noise, position,
+    height scale and tip.
+    """
     from scipy.ndimage import shift
 
     from litho_data.tip import paraboloid_erosion

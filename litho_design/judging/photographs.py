@@ -32,7 +32,7 @@ _BLUR_SD = 0.3
 
 
 class PhotoScore(Record):
-    """The figures of a photographed image, with efficiencies only if the incident power is known."""
+    """The figures of a photographed image. Efficiencies are included only if the incident power is known."""
 
     si_psnr_db: float
     ssim: float
@@ -48,9 +48,9 @@ class PhotoScore(Record):
 class LensPhotoScore(Record):
     """Error, PSNR and SSIM of one photographed object; each image is scaled to minimise its error.
 
-    ``direct`` is the photograph itself. ``design`` is its deconvolution with the PSF that the design
-    expected, and ``calibrated`` its deconvolution with the PSF of the measured print (None without a
-    measurement).
+    ``direct`` is the photograph itself. ``design`` is the photograph deconvolved with the PSF that the design
+    expected. ``calibrated`` is the photograph deconvolved with the PSF of the measured print, or None if the
+    print was not measured.
     """
 
     mae_direct: float
@@ -66,8 +66,8 @@ class LensPhotoScore(Record):
 
 @dataclass(frozen=True)
 class PhotoVerdict:
-    """The figures of a photograph with their uncertainties, the photograph's record, and pictures by
-    title.
+    """The figures of a photograph and their uncertainties, the record of the photograph, and a dict of images
+    by title.
     """
 
     figures: Record
@@ -116,9 +116,9 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
-            got=f"an SI-PSNR that noise and dark level make uncertain by {uncertainty['si_psnr_db']:.2f} dB",
+            got=f"an uncertainty of {uncertainty['si_psnr_db']:.2f} dB in SI-PSNR from noise and dark level",
             wanted=f"at most {_LARGEST_SD_DB} dB",
-            hint="use a longer exposure or the mean of several, and give --camera-dark-level",
+            hint="use a longer exposure or the mean of several exposures, and give --camera-dark-level",
         )
     pictures = {f"photograph {photo.record.name}": image.clip(0)}
     return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)
@@ -132,8 +132,8 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Return the figures of a registered photograph (m, m) against its target and the target at the element's
-    resolution.
+    """Compare a registered photograph (m, m) with its target and with the target at the resolution of the
+    element, and return the figures.
     """
     share = torch.from_numpy(image).double()
     found = likeness(share, target, resolved) | light_figures(share, target)
@@ -148,8 +148,9 @@ def score_lens_photo(
     """Score a photograph of a known object taken through a printed lens.
 
     ``photographed_image`` cleans the photograph and registers it to the image that the design expects of this
-    object, on sensor pixels. Then the photograph is deconvolved by Richardson-Lucy with the design's number
-    of iterations. The image of the object must be as large as in the design; otherwise, the PSFs do not fit.
+    object, on sensor pixels. Then the photograph is deconvolved by the Richardson-Lucy algorithm with the
+    number of iterations of the design. The image of the object must be as large as in the design; otherwise,
+    the PSFs do not apply.
 
     Args:
         loaded: the design of a lens.
@@ -198,7 +199,7 @@ def score_lens_photo(
 
 
 def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
-    """Return the object of a photograph, (n, n) in [0, 1], and its name or record."""
+    """Return the object (n, n) in [0, 1] that a photograph shows, and its name or record."""
     settings = task.settings.imaging
     items = (*settings.objects, *settings.test_objects)
     names = [object_name(item) for item in items]

@@ -1,5 +1,5 @@
-"""Score a design as predicted by models, as measured or as photographed; it is always the printable layout
-that is scored.
+"""Score a design by the print that models predict, by a measured print, or by a photograph. The score is
+always that of the printable layout.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ class JudgedScore(Record):
     uncertainty: dict[str, float] | None = None
 
     def remarks(self) -> list[str]:
-        """Return remarks on how a measurement was processed and what is uncertain about it, one phrase
-        each.
-        """
+        """Return remarks on the processing of a measurement and on its uncertainties, one phrase each."""
         return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
@@ -101,9 +99,10 @@ class Judgement:
 
     Attributes:
         scores: one per judge.
-        pictures: by title, the target image, and the image or PSF (m, m) behind each print, as reports show
-            them; all are ``side_um`` wide.
-        photos: by title, object, photograph and reconstructions (n, n) of a lens; all are ``frame_um`` wide.
+        pictures: maps titles to images (m, m) as shown in reports: the target image, and the image or PSF
+            behind each print. These images are ``side_um`` wide.
+        photos: for a lens, maps titles to images (n, n): the object, the photograph and the reconstructions.
+            These images are ``frame_um`` wide.
     """
 
     scores: list[JudgedScore]
@@ -119,13 +118,15 @@ def judge_design(
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
 ) -> Judgement:
-    """Score the layout of a design as predicted by models, as measured, and as photographed.
+    """Score the layout of a design by the predictions of models, a measured print and a photograph.
 
     Args:
-        judges: printers; any with the weights of the design's own model is marked as not independent.
+        judges: printers. A printer with the same weights as the model of the design is marked as not
+            independent.
         scan: a measured height map of the printed part.
-        camera: a photograph of the printed hologram's image, or of an object through the printed lens; with
-            ``scan``, it is also deconvolved with the PSF of the measured print.
+        camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
+            ``scan`` is given, the photograph of an object is also deconvolved with the PSF of the measured
+            print.
 
     Raises:
         InputError: a measurement does not match the design.

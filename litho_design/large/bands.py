@@ -1,4 +1,4 @@
-"""Bands of rows, in which a large element is printed and transformed.
+"""Divide a large element into bands of rows, in which it is printed and transformed.
 
 The bands depend only on the layout. An element has the same bands, numbered in the same way, whether one
 process or many compute them.
@@ -23,14 +23,14 @@ BAND_PX = 512
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a square element, and which of them this process holds.
+    """The bands of a square element, and the subset that this process holds.
 
     Args:
         size_px: side of the element.
-        most_px: largest number of rows of a band. All bands have the same number of rows, except that the
-            last may have fewer.
+        most_px: largest number of rows of a band. All bands have the same number of rows, except the last,
+            which may have fewer.
         ranks: the processes.
-        cell_px: side of a free cell; no band cuts a cell.
+        cell_px: side of a free cell. No cell is divided between two bands.
 
     Raises:
         InputError: there are more processes than bands.
@@ -52,7 +52,7 @@ class Bands:
 
     @property
     def band_px(self) -> int:
-        """Return the number of rows of every band but the last."""
+        """Return the number of rows in each band. The last band may have fewer."""
         count = -(-self.size_px // self.most_px)
         return -(-self.size_px // (count * self.cell_px)) * self.cell_px
 
@@ -62,7 +62,7 @@ class Bands:
         return -(-self.size_px // self.band_px)
 
     def rows(self, rank: int | None = None) -> range:
-        """Return the rows of the element that a process holds; the default is this process."""
+        """Return the rows of the element that the process ``rank`` holds. By default, it is this process."""
         own = self.ranks.share(self.count, rank)
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
@@ -88,8 +88,8 @@ class Bands:
             )
 
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
-        """Return the rows of this process (rows, x) with ``halo`` rows of both neighbours, and zeros beyond
-        the element.
+        """Return the rows of this process (rows, x), extended on both sides by ``halo`` rows of the
+        neighbouring process, or by zeros at the edge of the element.
 
         At most two bands contribute to the gradient of a row, so the order of summation has no effect.
         """

@@ -1,5 +1,5 @@
-"""The task of a hologram in bands, which differs from that in one piece by holding only this process's
-rows.
+"""The task of designing a hologram in bands. In contrast to the task in one piece, each process holds only
+its own rows.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 class BandedHologram(HologramTask):
     """A hologram whose rows several processes share; each process computes the loss of the whole element.
 
-    All processes run this task with the same arguments and can write to the same folder. The resulting layout
-    does not depend on the number of processes.
+    All processes run this task with the same arguments, and all of them must be able to write to the same
+    folder. The resulting layout does not depend on the number of processes.
 
     Args:
         settings: settings of the hologram; ``only`` checks the settings of the search.
@@ -66,7 +66,7 @@ class BandedHologram(HologramTask):
         record: source of the target.
 
     Raises:
-        InputError: a large element does not support the light or the printer.
+        InputError: the settings of the light, or the printer, are not supported for a large element.
     """
 
     in_one_piece = False
@@ -98,8 +98,8 @@ class BandedHologram(HologramTask):
         self.bands.check_halo(printer.halo_px)
 
     def inputs_sha256(self) -> str:
-        """Return a text that identifies the bands, because they decide how sums are rounded, and therefore
-        the layout.
+        """Return a string that identifies the bands. The bands determine how sums are rounded, and thereby
+        affect the layout.
         """
         return f"bands of {self.bands.band_px}"
 
@@ -134,7 +134,9 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays that all processes share; only the first process receives the hashes."""
+        """Write the arrays to which all processes contribute. The hashes are returned only to the first
+        process.
+        """
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
@@ -171,18 +173,19 @@ class BandedBench(nn.Module):
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the share of the incident power on the pixels (rows, size) of this process, from its
-        heights, µm.
+        """Return the shares of the incident power on the pixels (rows, size) that this process holds in the
+        image plane. ``height_um`` contains the heights of its rows.
         """
         field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
         return intensity_share(self.propagator(field), self.rows)
 
 
 def only(settings: Record, values: dict[str, Any]) -> None:
-    """Refuse settings, by path, that a large element does not support.
+    """Refuse settings that a large element does not support. ``values`` maps the path of each setting to the
+    only value allowed.
 
     Raises:
-        InputError: the value of a setting differs from that in ``values``.
+        InputError: a setting has a different value.
     """
     for path, wanted in values.items():
         given: Any = settings
@@ -194,8 +197,8 @@ def only(settings: Record, values: dict[str, Any]) -> None:
 
 
 def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
-    """Write arrays from the rows (rows, size) of each process; the first process returns their SHA-256 by
-    file name.
+    """Write arrays from the rows (rows, size) of each process. The first process returns a dict of the
+    SHA-256 by file name; the others return an empty dict.
     """
     size, rows, hashes = bands.size_px, bands.rows(), {}
     for name, values in arrays.items():

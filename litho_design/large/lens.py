@@ -28,8 +28,8 @@ from litho_design.tasks.task import Task
 
 
 class RadiusMap(CellMap):
-    """Map free rings to the pixels of one radius, (..., rings) to (..., pixels), as ``CellMap`` does for a
-    plane.
+    """Map values of free rings (..., rings) to the pixels of one radius (..., pixels), as ``CellMap`` does
+    for a plane.
     """
 
     area: Tensor
@@ -59,7 +59,7 @@ class RingLens(DirectLensTask):
         tile_px: length of the tiles in which the strip is printed.
 
     Raises:
-        InputError: a lens of rings does not support the settings or the printer.
+        InputError: the settings or the printer are not supported for a lens of rings.
     """
 
     in_one_piece = radial = False
@@ -77,7 +77,7 @@ class RingLens(DirectLensTask):
         require_reach(printer)
 
     def inputs_sha256(self) -> str:
-        """Return a constant, because the layout depends only on the settings."""
+        """Return a constant, because the layout depends only on the settings and on no other input."""
         return "rings"
 
     def make_cells(self) -> CellMap:
@@ -89,8 +89,8 @@ class RingLens(DirectLensTask):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the same bench, because its matrix takes time to compute; the search covers only the lens as
-        modelled.
+        """Return the existing bench, because its matrix takes long to compute. The search therefore considers
+        only the lens as modelled.
         """
         return self.bench
 

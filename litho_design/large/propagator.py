@@ -1,8 +1,9 @@
 """Propagate a wave to a parallel plane by a Fourier transform that several processes share.
 
-Each process transforms its own rows. One exchange then gives every process whole columns, which it
-transforms, multiplies and transforms back. A second exchange returns the rows (Takahashi, Fast Fourier
-Transform Algorithms for Parallel Computers, ch. 8: the transposed form of the two-dimensional transform).
+Each process transforms its own rows. The processes then exchange data, so that each of them has whole
+columns, which it transforms, multiplies by the transfer function and transforms back. A second exchange
+restores the rows. The method is the transposed form of the two-dimensional transform (Takahashi, Fast Fourier
+Transform Algorithms for Parallel Computers, ch. 8).
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ _COLUMNS = 256
 
 
 class BandedPropagator:
-    """A propagator like that of ``make_propagator`` between equal grids, for a field whose bands of rows
-    several processes share.
+    """A propagator between equal grids, like the one that ``make_propagator`` returns, for a field whose rows
+    are divided among several processes.
 
-    Field and result are the rows of this process, complex64 (rows, size). The kernel is even along both axes,
-    so only half of each column of its transform is kept.
+    The field and the result contain only the rows of this process, complex64 (rows, size). The kernel is even
+    along both axes, so only half of each column of its transform is kept.
 
     Args:
-        pitch_um: pixel, µm.
+        pitch_um: side of a pixel, µm.
         optics: wavelength, distance and kind of propagation.
         bands: bands of the element.
 
@@ -84,7 +85,9 @@ class BandedPropagator:
         return carried
 
     def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
-        """Transform the rows band by band, and exchange them for whole columns (size, own columns)."""
+        """Transform the rows of this process band by band, exchange them with the other processes, and return
+        whole columns (size, own columns).
+        """
         bands, ranks = self.bands, self.bands.ranks
         rows = self._room(len(bands.rows()), self.length)
         for band in bands.own():
@@ -97,7 +100,9 @@ class BandedPropagator:
         return got.reshape(bands.size_px, width)
 
     def _to_rows(self, columns: Tensor) -> Tensor:
-        """Exchange the process's columns (size, columns) for its rows (rows, length)."""
+        """Exchange the columns (size, columns) of this process with the other processes, and return its rows
+        (rows, length).
+        """
         bands, ranks = self.bands, self.bands.ranks
         if ranks.count == 1:
             return columns
@@ -136,8 +141,8 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space; for small elements, its period must exceed their
-        side.
+        """Compute the transfer function of free space. For small elements, its period must be larger than the
+        side of the element.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]

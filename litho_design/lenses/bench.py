@@ -26,7 +26,9 @@ CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """The common part of the benches for a plane and for rings: aperture, focal window and perfect lens."""
+    """Base class of the benches for a plane and for rings, with the aperture, the focal window and the
+    perfect lens.
+    """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
@@ -37,8 +39,8 @@ class LensOptics(nn.Module):
 
     @property
     def numerical_aperture(self) -> float:
-        """Return the sine of the angle, seen from the focus, between the axis and the edge of the aperture
-        along x or y.
+        """Return the sine of the angle, as seen from the focus, between the axis and the edge of the aperture
+        in the direction of x or y.
         """
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
@@ -79,7 +81,9 @@ class LensBench(LensOptics):
         self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the PSF of a height map (size, size), µm: share of the incident power per window pixel."""
+        """Return the PSF of a height map (size, size), µm. Each window pixel gives its share of the incident
+        power.
+        """
         field = element_field(height_um, self.grid, self.optics, self.aperture)
         return intensity_share(self.propagator(field), self.window)
 
@@ -90,7 +94,7 @@ class LensBench(LensOptics):
 
 
 class RadialLensBench(LensOptics):
-    """Compute the same PSF from the height along the central row, for ring layouts and circular apertures."""
+    """Compute the PSF of a ring layout with a circular aperture from the heights along a radius."""
 
     lower: Tensor
     share: Tensor
@@ -124,11 +128,12 @@ class RadialLensBench(LensOptics):
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
-    """Return the mean intensity in the central box, divided by that in the rest of an image plane as large as
-    the element.
+    """Return the mean intensity in the central box, divided by the mean intensity in the rest of an image
+    plane as large as the element.
 
-    All light outside the box counts as background, wherever it goes: (1 - box) is spread over the area of the
-    element. A ratio computed only within the PSF window would reward light sent outside the window.
+    All light outside the box counts as background, even if it misses this image plane: its share (1 - box) is
+    spread over the area of the element. A ratio computed only within the PSF window would reward light sent
+    outside the window.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()
@@ -146,11 +151,11 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 
 
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
-    """Return sensor images (n, size, size), which are psf * object plus read and photon noise drawn from
-    ``seed``.
+    """Return sensor images (n, size, size). Each is the convolution of an object with the PSF, plus read
+    noise and photon noise drawn with ``seed``.
 
-    Photon noise is Gaussian too, with the variance of Poisson noise. The gradient treats its standard
-    deviation as constant.
+    Photon noise is drawn from a Gaussian distribution with the variance of Poisson noise. For the gradient,
+    its standard deviation counts as constant.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)

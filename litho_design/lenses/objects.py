@@ -33,7 +33,7 @@ def object_stack(
             the objects.
 
     Raises:
-        InputError: the pixels of a picture are missing or have another size.
+        InputError: the pixels of a picture are missing or do not have this size.
     """
     border, brought, frames = size_px // _BORDER_SHARE, iter(pictures), []
     for item in objects:
@@ -54,24 +54,25 @@ def with_objects(
 ) -> tuple[LensSettings, dict[str, np.ndarray]]:
     """Return the ``settings`` of a computational lens, with your own pictures as objects.
 
-    A path is a picture, or a folder whose files, except hidden ones, are all pictures. Without ``held_out``,
-    the last quarter of the pictures in order of name, but at least two, are held out of the design and only
-    scored. Without ``objects``, the design uses the drawings.
+    A path is either a picture or a folder that contains only pictures and hidden files. Without ``held_out``,
+    the pictures are sorted by name, and the last quarter, but at least two of them, are not used in the
+    design and serve only for scores. Without ``objects``, the design uses the drawings.
 
     Returns:
-        The settings, which contain the name, SHA-256 and conversion of each picture, and the pixels as inputs
-        of the task. Without paths, the settings are unchanged and there are no inputs.
+        The settings and the inputs of the task. The settings contain the name, the SHA-256 and the
+        conversions of each picture, and the inputs contain the pixels. Without paths, the settings are
+        unchanged and there are no inputs.
 
     Raises:
-        InputError: the task images no objects, a file is not a picture, a picture has no light or is given
-            twice, or there are too few pictures.
+        InputError: the task does not image objects, a file is not a picture, a picture has no light or is
+            given twice, or there are too few pictures.
     """
     if not objects and not held_out:
         return settings, {}
     if settings.task != "computational":
         raise InputError(
             "objects",
-            got=f"the {settings.task} task, which images no objects",
+            got=f"the {settings.task} task, which does not image objects",
             wanted="the computational task",
             hint="otherwise, leave out --objects and --held-out-objects",
         )
@@ -101,11 +102,16 @@ def with_objects(
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
-    """Return one sentence that names the objects if some are pictures; otherwise, return an empty list."""
+    """If some objects are pictures, return a list with one sentence that names all objects; otherwise, return
+    an empty list.
+    """
     if all(isinstance(item, str) for item in (*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))
-    return [f"the design uses the objects {kept}; {tested} are held out; the record lists their conversions"]
+    return [
+        f"the objects of the design are {kept}; the held-out objects are {tested}; the record lists how "
+        "pictures were converted"
+    ]
 
 
 def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:

@@ -19,7 +19,7 @@ _TEST_SEEDS = range(1000, 1003)
 
 
 class LensScore(Record):
-    """The score of a PSF; powers are shares of the power on the aperture, and lengths are in µm."""
+    """The score of a PSF. Powers are relative to the power on the aperture, and lengths are in µm."""
 
     focusing_efficiency: float = Field(description="share of the aperture's power within the focusing radius")
     focusing_radius_um: float = Field(description="focusing radius: 3 x ideal FWHM, µm")
@@ -42,8 +42,12 @@ class ImagingScore(Record):
     """
 
     mae_direct: float = Field(description="MAE of the sensor image of test objects, at the best scale")
-    mae_design: float = Field(description="MAE of test objects, deconvolved with the designed PSF")
-    mae_calibrated: float = Field(description="MAE of test objects, deconvolved with the print's own PSF")
+    mae_design: float = Field(
+        description="MAE of the images of test objects after deconvolution with the designed PSF"
+    )
+    mae_calibrated: float = Field(
+        description="MAE of the images of test objects after deconvolution with the print's own PSF"
+    )
     mae_calibrated_sd: float = Field(
         description="standard deviation of mae_calibrated over objects and noise seeds"
     )
@@ -82,7 +86,7 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 
 
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
-    """Return the diameter, µm, of a circle as large as the area that lies above half the maximum.
+    """Return the diameter, µm, of the circle whose area equals that of the region above half the maximum.
 
     The PSF is interpolated fourfold (zero-padded spectrum), so that its pixels do not limit the result.
     """
@@ -103,7 +107,7 @@ def mtf(psf: Tensor) -> Tensor:
 
 
 def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
-    """Return the MTF at one frequency, cycles/µm, as the mean of both axes, interpolated linearly between
+    """Return the MTF at one frequency, cycles/µm: the mean over both axes, with linear interpolation between
     samples.
     """
     curve = mtf(psf)
@@ -122,7 +126,7 @@ def imaging_score(
     ``ImagingScore``).
 
     Args:
-        psf, design_psf: (window, window), share of the incident power per window pixel.
+        psf, design_psf: (window, window), share of the incident power on each pixel of the window.
     """
     real, expected = (sensor_psf(one, settings.pixel_px).float() for one in (psf, design_psf))
     draws = []
@@ -138,13 +142,13 @@ def imaging_score(
 
 
 def black_images(objects: Tensor) -> dict[str, float]:
-    """Return the figures of black images."""
+    """Return the imaging scores of reconstructions that are black everywhere."""
     black = dict.fromkeys(("direct", "design", "calibrated"), torch.zeros_like(objects))
     return _of_images(_means(_similarities([black], objects)))
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Return, for each figure, its values over all draws and objects."""
+    """Return the values of every figure for all draws and objects."""
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):
         for image, wanted in zip(images, objects, strict=True):
@@ -162,4 +166,4 @@ def _of_images(figures: Mapping[str, float]) -> dict[str, float]:
 
 
 class ImagingLensScore(LensScore, ImagingScore):
-    """PSF and imaging figures of a computational lens."""
+    """The score of the PSF and of the images of a computational lens."""

@@ -31,9 +31,10 @@ LensTaskName = Literal["direct", "computational"]
 class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
-    ``window_px`` pixels of the layout's pitch are computed around the focus. With ``path="radial"``, the
-    search uses a strip through the centre and the ring propagator instead of the whole plane. The radial path
-    needs a circular aperture and a ring layout; scores always use the plane.
+    The PSF window around the focus is ``window_px`` pixels wide; its pixels have the pitch of the layout.
+    With ``path="radial"``, the search uses a strip through the centre and the ring propagator instead of the
+    whole plane. The radial path needs a circular aperture and a ring layout; scores are always computed on
+    the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})
@@ -49,10 +50,10 @@ class ImagingSettings(Record):
     """Settings of computational imaging: sensor, noise, reconstruction, and objects for the design and the
     test.
 
-    An object is the name of a drawing or the record of a picture (see ``with_objects``). ``read_noise`` is
-    the standard deviation relative to a white object behind a lens that focuses all light; the paper does not
-    state its read noise. The image of an object is ``object_px * pixel_px`` pixels of the layout wide, and
-    light outside the PSF window does not contribute to it.
+    An object is given by the name of a drawing or by the record of a picture (see ``with_objects``).
+    ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses all light;
+    the paper does not state its read noise. The image of an object has a width of ``object_px * pixel_px``
+    layout pixels. Light outside the PSF window does not contribute to this image.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
@@ -67,7 +68,7 @@ class ImagingSettings(Record):
     )
     read_noise: float = setting(0.01, "Read noise, relative to a white object", ge=0)
     photon_noise: float = setting(
-        0.0, "Photon noise: variance over signal, both relative to a white object", ge=0
+        0.0, "Photon noise: ratio of variance to signal, both relative to a white object", ge=0
     )
     loss: Literal["l1", "smooth-l1"] = setting(
         "l1", f"Image error in the search: l1, or smooth-l1, which is quadratic below {SMOOTH_BELOW}"
@@ -113,25 +114,28 @@ class LensSettings(DesignSettings):
 def lens_settings(
     task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> LensSettings:
-    """Return a preset for a lens with ``changes`` by path; all presets have rings, a width of 120 µm and a
-    focal length of 400 µm.
+    """Return a preset for a lens, with ``changes`` by path.
 
-    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square aperture. The
-    rings come from the published code, as the text does not mention them. The paper's display, 36 mm wide at
-    140 mm, is imaged 102.9 µm wide on the sensor: 103 pixels of 1 µm. The PSF window is equally wide. We
-    chose the pixel of 1 µm, which samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: the
-    published code has 12 levels, rings as wide as the diagonal of a pixel, temperature 1, 2000 iterations at
-    a rate of 1 that is halved every 25 iterations, and smooth L1. It has read and photon noise, its own
-    wavelength and index step, and objects as wide as the lens. docs/from_the_authors_code.md lists what is
-    not reproduced of that code. ``default``: a circular aperture, the Fresnel phase as start, and the ring
-    path in the search.
+    All presets have layouts of rings, a width of 120 µm and a focal length of 400 µm.
+
+    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at a learning rate of 3,
+    and a square aperture. The rings come from the published code, as the text does not mention them. The
+    display of the paper is 36 mm wide at a distance of 140 mm, so its image on the sensor is 102.9 µm wide:
+    103 pixels of 1 µm. The PSF window has the same width. We chose pixels of 1 µm, because they sample the
+    cut-off frequency at NA 0.15 (a period of 2.1 µm) without aliasing. ``authors``: the published code has 12
+    levels, rings as wide as the diagonal of a pixel, temperature 1 and smooth L1. Its 2000 iterations begin
+    with a learning rate of 1, which is halved every 25 iterations. The code includes read and photon noise,
+    and it has its own wavelength and index step. Its objects are as wide as the lens.
+    docs/from_the_authors_code.md lists the parts of that code that are not reproduced. ``default``: a
+    circular aperture, the Fresnel phase as start, and the ring path in the search.
 
     Args:
-        task: focus light, or image and deconvolve; a ``task`` among the changes overrides it.
+        task: ``direct`` focuses light, and ``computational`` images objects and deconvolves the images; a
+            ``task`` among the changes takes precedence.
         variant, changes: as for ``hologram_settings``.
 
     Raises:
-        InputError: a change names an unknown setting, or a value that the setting does not accept.
+        InputError: a change names an unknown setting, or gives a setting a value that it does not accept.
     """
     return preset(_preset, variant, {"task": task, **(changes or {})})
 

@@ -54,17 +54,18 @@ def lens_task(settings: LensSettings, printer: Printer, **given: Any) -> LensTas
 
 
 class LensTask(Task):
-    """The task of designing a lens, for ``run_design``; the common part of direct and computational lenses.
+    """The base class of the tasks of direct and computational lenses, which ``run_design`` runs.
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
         ensemble: further models in the loss, as for ``Task``.
-        inputs: pixels of the objects that are pictures, as ``with_objects`` returns them.
+        inputs: pixels of those objects that are pictures, as returned by ``with_objects``.
 
     Raises:
-        InputError: the search is radial but the layout has no rings or the aperture is square, the start is
-            for holograms, an object has no pixels, or the spreads exceed the range of the propagator.
+        InputError: a radial search is combined with a layout without rings or with a square aperture; the
+            start is only for holograms; an object has no pixels; or the spreads exceed the range of the
+            propagator.
     """
 
     starts = ("random", "fresnel")
@@ -132,8 +133,9 @@ class LensTask(Task):
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose print is nearest to a perfect lens, computed on the CPU so that sums over
-        rings are reproducible.
+        """Return the levels whose print is nearest to a perfect lens.
+
+        The levels are computed on the CPU, so that sums over rings are reproducible.
         """
         phase = fresnel_lens_phase(self.cells.cpu(), self.settings.layout.pitch_um, self.settings.optics)
         self.cells.to(self.printer.device)
@@ -154,7 +156,7 @@ class LensTask(Task):
         return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self.bench.ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Return the square root of the PSF over its peak."""
+        """Return the PSF as an image for reports: sqrt(PSF / peak)."""
         return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
@@ -214,7 +216,7 @@ class ComputationalLensTask(LensTask):
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Add the errors of black images to the baselines."""
+        """Return the baselines of every lens, and the imaging scores of black images."""
         return super().baselines() | {"black image": black_images(self.tested)}
 
 
@@ -234,10 +236,10 @@ def _narrow_window(bench: LensBench) -> list[str]:
 
 @lru_cache(maxsize=8)
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
-    """Return the ring of each pixel of a strip that consists of two central rows, from ring 0 to the
-    aperture, and a halo on all sides.
+    """Return the number of the ring to which each pixel of a strip along the radius belongs.
 
-    Beyond the last of the ``rings``, the strip repeats that ring.
+    The strip consists of two central rows of pixels, from ring 0 to the edge of the aperture, and of a halo
+    on all sides. Pixels beyond the last of the ``rings`` are assigned to the last ring.
     """
     along = torch.arange(-halo_px, layout.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5

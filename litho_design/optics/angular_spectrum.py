@@ -1,4 +1,4 @@
-"""Propagate with the band-limited angular spectrum, at distances too short for the sampled
+"""Propagate with the band-limited angular spectrum method, for distances that are too short for the sampled
 Rayleigh-Sommerfeld kernel.
 """
 
@@ -23,15 +23,15 @@ class ASMPropagator(KernelPropagator):
     """Propagate a complex field to a parallel plane with the transfer function of free space.
 
     H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so evanescent waves decay instead of
-    becoming NaN. The sampled H has a period, up to 4096 pixels, that is long enough to keep its steepest rays
-    from wrapping around. Frequencies whose rays are steeper than the period allows are removed (after
-    Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). Only the samples of the kernel at separations
-    that occur between the two grids are stored, so padding costs nothing after construction. A negative
-    distance propagates waves backwards and drops evanescent ones.
+    becoming NaN. Because H is sampled, the field repeats with a period. Up to 4096 pixels, this period is
+    long enough to keep the steepest rays from wrapping around. Frequencies whose rays are too steep for the
+    period are removed (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). The kernel is stored
+    only at the separations that occur between the two grids, so a longer period costs nothing after
+    construction. A negative distance propagates waves backwards and drops evanescent ones.
 
-    With pixels larger than half a wavelength, the steepness of rays is limited, and the result is exact for
-    waves within the band of the pixels. With smaller pixels, rays up to grazing incidence exist. Then 1 % of
-    the wave of a rough element is missing or wrapped, and ``RSPropagator`` is the better choice.
+    If pixels are larger than half a wavelength, their band limits the angles of the rays, and the result is
+    exact for waves within this band. Smaller pixels admit rays up to grazing incidence. In this case, 1 % of
+    the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of equal pitch; shape and origin are free.
@@ -66,8 +66,10 @@ class ASMPropagator(KernelPropagator):
 
 @dataclass(frozen=True)
 class SpectrumAxis:
-    """One axis of the spectrum: frequencies (cycles/µm), mask of those kept, samples of the kernel, and shift
-    between the grids.
+    """One axis of the spectrum of a wave between two grids.
+
+    ``frequency`` is in cycles/µm, and ``inside`` is the mask of the frequencies that are kept. ``kept``
+    contains the indices of the stored kernel samples, and ``start_um`` is the shift between the grids.
     """
 
     frequency: Tensor

@@ -1,4 +1,4 @@
-"""Convolve by FFT and compute only the samples that are kept; the gradient does the same."""
+"""Convolve by FFT; the convolution and its gradient compute only the samples that are kept."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from litho_design.optics.sampling import fast_length
 class KernelPropagator(nn.Module):
     """Propagate a field from one plane to another by convolution with a kernel.
 
-    The grid of the kernel is finer than those of source and target by integer factors.
+    The grid of the kernel may be finer than the grids of the source and the target; the factors are integers.
 
     Args:
         kernel: complex128 (ky, kx) at the separations of ``wrapped_order``.
-        finer: kernel pixels per pixel of the source, and per pixel of the target, each (y, x).
+        finer: numbers of kernel pixels per source pixel (y, x) and per target pixel (y, x).
         dtype: torch.complex64 or torch.complex128.
     """
 
@@ -54,18 +54,16 @@ class KernelPropagator(nn.Module):
 
 
 def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
-    """Return the shape of a grid with pixels ``finer`` times as fine, from the first to the last pixel
-    centre.
-    """
+    """Return the shape of the grid that spans the same pixel centres with pixels ``finer`` times as fine."""
     rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
     return rows, columns
 
 
 def wrapped_order(here: int, there: int) -> Tensor:
-    """Return the separations, in pixels, between a source of ``here`` and a target of ``there`` pixels;
-    negative ones come last.
+    """Return the separations, in pixels, between ``here`` source pixels and ``there`` target pixels along an
+    axis.
 
-    Unused entries repeat a used separation.
+    Negative separations come last. Unused entries repeat a used separation.
     """
     length = fast_length(here + there - 1)
     index = torch.arange(length)
@@ -88,11 +86,11 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
 
 
 class _Convolution(torch.autograd.Function):
-    """A convolution, whose adjoint is the same operation with the conjugate transfer function and exchanged
-    shapes.
+    """A convolution, whose adjoint is a convolution with the conjugate transfer function, with input and
+    output shapes exchanged.
 
-    The gradient is written out because autograd would keep padded copies and transform the rows that are
-    cropped.
+    The gradient is implemented explicitly, because autograd would keep padded copies and transform rows that
+    are cropped afterwards.
     """
 
     @staticmethod

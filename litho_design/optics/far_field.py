@@ -17,15 +17,16 @@ class FarFieldPropagator(nn.Module):
     """Propagate a field to the focal plane of an ideal lens.
 
     U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx, where position p corresponds to the sine p / f.
-    The sum is exact for any two grids and uses one matrix per axis; pixels are squares (Goodman, Fourier
-    Optics, ch. 5).
+    The sum is exact for any two grids and uses one matrix per axis. Pixels are treated as squares, not as
+    points (Goodman, Fourier Optics, ch. 5).
 
     Args:
         source, target: grids of the two planes, µm; any shapes and pitches.
         distance_um: focal length f.
 
     Raises:
-        InputError: the image is wider than λ f / pitch, beyond which the light of a sampled element repeats.
+        InputError: the image is wider than λ f / pitch; beyond this width, the light of a sampled element
+            repeats.
     """
 
     along_y: Tensor

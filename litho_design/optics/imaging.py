@@ -16,8 +16,9 @@ _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """Blur an object x to psf * x on its frame. Outside the frame it is dark; the operation is linear and
-    does not wrap around.
+    """Convolve an object with a PSF; the object and its image lie on the same frame.
+
+    The object is dark outside the frame. The operation is linear and does not wrap around.
 
     The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
@@ -53,7 +54,7 @@ class Blur:
 
 
 def bin_pixels(image: Tensor, factor: int) -> Tensor:
-    """Sum blocks of ``factor`` x ``factor`` pixels to the power per coarse pixel, (..., ny / f, nx / f)."""
+    """Return the sums over blocks of ``factor`` x ``factor`` pixels, (..., ny / factor, nx / factor)."""
     blocks = image.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor))
     return blocks.sum((-3, -1))
 
@@ -62,12 +63,12 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tens
     """Estimate the object behind a recorded image.
 
     Each step is e <- e * H^T (b / H e) / (H^T 1), from a flat start with the right flux (Richardson 1972,
-    Lucy 1974). The division by H^T 1 makes the result correct at the borders and for a PSF with any sum: the
-    estimate approaches the object itself, and sum(H e) = sum(b) after every step.
+    Lucy 1974). Because of the division by H^T 1, the result is correct at the borders and for a PSF with any
+    sum. The estimate approaches the object itself, and sum(H e) = sum(b) after every step.
 
     Args:
         recorded: image (..., ny, nx); negative values (read noise) count as dark.
-        psf: real (k, k) of odd sides, on the same pixels.
+        psf: real (k, k) with odd k, on the same pixels.
 
     Returns:
         Estimate (..., ny, nx); gradients flow to both arguments. For large images, the backward pass

@@ -16,8 +16,9 @@ _SELLMEIER = {"ip-dip-2019": ((1.2899, 1.1283e-2), (6.0569e-2, 7.7762e-2), (1.18
 
 
 def refractive_index(resin: Resin, wavelength_um: float) -> float:
-    """Return the refractive index of a resin; it is 1 at all wavelengths for ``constant``, because only
-    differences matter.
+    """Return the refractive index of a resin.
+
+    For ``constant``, the index is 1 at all wavelengths, because only differences of the index matter.
     """
     if resin == "constant":
         return 1.0

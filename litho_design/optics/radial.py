@@ -82,7 +82,9 @@ def _ring_matrix(
 def _half_circle(
     source_radius_um: float, target_radius_um: Tensor, distance_um: float, wavelength_um: float
 ) -> tuple[Tensor, float]:
-    """Return midpoints on (0, pi), dense enough for the fastest phase change around any ring."""
+    """Return midpoint angles on (0, pi) and their step, which resolves the fastest phase change around any
+    ring.
+    """
     target = float(target_radius_um.max())
     far = math.hypot(source_radius_um + target, distance_um)
     near = math.hypot(source_radius_um - target, distance_um)

@@ -21,9 +21,9 @@ class RSPropagator(KernelPropagator):
 
     U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with h = z / (2 pi r^2) (1/r - j k) exp(j k r),
     r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In this time convention, exp(+j k r) runs outwards
-    (Goodman, Fourier Optics, ch. 3). The sum is exact: the kernel is centred and spans all separations.
-    Unequal pitches must have a ratio of small integers; the kernel is then sampled on the coarsest pixels
-    that divide both.
+    (Goodman, Fourier Optics, ch. 3). The sum is exact: the kernel is centred and spans all separations. If
+    the two pitches differ, their ratio must be a ratio of small integers; the kernel is then sampled at the
+    largest pitch that divides both.
 
     Args:
         source, target: grids of the two planes, origin and pitch in µm.
@@ -32,8 +32,8 @@ class RSPropagator(KernelPropagator):
         dtype: torch.complex64 or torch.complex128; kernels are computed in double precision.
 
     Raises:
-        InputError: the distance is below the sampling limit, or the pitches have no ratio of integers up to
-            16.
+        InputError: the distance is below the sampling limit, or the pitches are not in a ratio of integers up
+            to 16.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return the numbers of equal parts into which the first and second pitch must be divided, given their
+    """Return into how many equal parts the first and the second pitch must be divided to match, given their
     ratio.
 
     Return None if too many parts are needed.

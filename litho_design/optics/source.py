@@ -1,4 +1,4 @@
-"""Light from an extended or broadband incoherent source, instead of one plane wave of one colour."""
+"""Represent an extended or broadband incoherent source by monochromatic plane waves."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
-    """Return the share of the light, and the optics, of plane waves of one colour whose images add up to that
-    of the source.
+    """Return monochromatic plane waves whose images add up to that of the source.
 
-    Colours sample a Gaussian spectrum by Gauss-Hermite quadrature. Directions are spread evenly on a disc of
-    sines around the direction of ``optics``. The images of neighbouring waves are closer than lambda z / D,
-    the finest detail of an element of side D. For a point source of one colour, the only part is ``optics``
-    itself.
+    Each wave is given by its share of the light and its optics. The wavelengths are the nodes of a
+    Gauss-Hermite quadrature over a Gaussian spectrum. Directions are spread evenly over a disc of sines
+    around the direction of ``optics``. The images of neighbouring waves lie closer together than lambda z /
+    D, the finest detail of an element of side D. For a monochromatic point source, there is only one wave,
+    with the given ``optics``.
 
     Args:
         size_um: side of the element.
@@ -69,22 +69,22 @@ def _checked(count: int, what: str) -> int:
     if count > _MOST:
         raise InputError(
             f"{what} of the source",
-            got=f"{count} waves, because an element of this size resolves so many",
+            got=f"{count} waves, because an element of this size resolves that many",
             wanted=f"at most {_MOST}",
         )
     return count
 
 
 def require_one_wave(optics: Optics, what: str) -> None:
-    """Refuse an extended, broadband or near source where only one plane wave is computed.
+    """Refuse an extended, broadband or near source for computations that use a single plane wave.
 
     Raises:
-        InputError: the source is not a distant point source of one colour.
+        InputError: the source is not a distant, monochromatic point source.
     """
     if optics.bandwidth_um or optics.source_sine or optics.source_distance_um:
         raise InputError(
             f"source of {what}",
             got=f"bandwidth {optics.bandwidth_um:g} µm, sine {optics.source_sine:g}, distance "
             f"{optics.source_distance_um:g} µm",
-            wanted="a distant point source of one colour (0, 0, 0)",
+            wanted="a distant, monochromatic point source (0, 0, 0)",
         )

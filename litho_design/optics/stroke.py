@@ -50,8 +50,9 @@ def measure_stroke(
         level_height_um: nominal step, µm.
 
     Returns:
-        The stroke, its efficiency as a blaze in the first and zero order, and the number of levels (or the
-        step height) with which the print would reach one wave.
+        The stroke, and the efficiency of a blaze with this stroke in the first and zero order. The record
+        also has the number of levels and the height per level, either of which would make the print reach one
+        wave.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]

@@ -15,14 +15,14 @@ _SLICES_PER_WAVELENGTH = 20
 def wave_through_relief(
     field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
 ) -> Tensor:
-    """Return the wave behind a relief from the wave at its foot, propagated back to the foot as for a thin
-    element.
+    """Return the wave behind a relief, given the wave at the foot of the relief.
 
-    In every slice, the angular spectrum propagates the wave twice, in the resist and in air, and each pixel
-    keeps the wave of its medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). A pixel that the surface
-    cuts mixes both waves by their shares, so that gradients flow. One reflection at normal incidence is
-    included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air to
-    the foot, the plane of a thin element. The field is periodic beyond the borders.
+    In every slice, the angular spectrum propagates the wave once through resist and once through air, and
+    each pixel keeps the wave of its own medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). If the
+    surface crosses a pixel within the slice, the two waves are mixed in proportion to the shares of resist
+    and air, so that gradients flow. One reflection at normal incidence is included: a share (n - 1)^2 / (n +
+    1)^2 of the light is lost. The result is propagated back through air to the foot, where a thin element
+    would be. The field is periodic beyond the borders.
 
     Args:
         field: complex (..., ny, nx) at the foot of the relief, inside the resist.

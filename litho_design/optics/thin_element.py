@@ -53,7 +53,7 @@ class Optics(Record):
     )
     bandwidth_um: float = setting(
         0.0,
-        "Standard deviation of the wavelengths of the source; 0 for one colour",
+        "Standard deviation of the wavelengths of the source; 0 for monochromatic light",
         unit="µm",
         ge=0,
     )
@@ -71,8 +71,8 @@ class Optics(Record):
     )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum", "far-field"] = setting(
         "auto",
-        "Propagator: the valid one of the next two (auto), the Rayleigh-Sommerfeld sum, the angular "
-        "spectrum, or the far field in the focal plane of a lens",
+        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, whichever of these two is valid "
+        "(auto), or the far field in the focal plane of a lens",
         option="--propagation",
     )
     element: ElementKind = setting(
@@ -107,9 +107,10 @@ def element_field(
     """Return the wave just behind a phase element that a plane wave of unit power illuminates.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
-    If the optics have a Gaussian beam or a near point source, the wave is multiplied by these. It is scaled
-    so that sum |u|^2 dy dx = 1. Intensities summed over any window, times the pixel area, are therefore
-    shares of the incident power. For a thick element in air, ``wave_through_relief`` replaces the phase.
+    If the optics have a Gaussian beam or a near point source, the wave also has the amplitude of the beam or
+    the phase of the source. The wave is scaled so that sum |u|^2 dy dx = 1. Intensities summed over any
+    window, times the pixel area, are therefore shares of the incident power. For a thick element in air,
+    ``wave_through_relief`` replaces the phase.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -146,8 +147,8 @@ def element_field(
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the wave behind a thick element in air that ``field`` (..., ny, nx) illuminates, with darkness
-    around the element.
+    """Return the wave behind a thick element in air, illuminated by ``field`` (..., ny, nx); the surroundings
+    are dark.
     """
     import torch
 

@@ -1,1 +1,1 @@
-"""Free parameters, starts, search, polish, and losses over a process window or several models."""
+"""Search for a layout: parameters, starting layouts, polish, and losses over a process window or models."""

@@ -25,8 +25,8 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """State in one line the estimate for the iterations left after ``done``, for scores and for the
-        report.
+        """Return one line with the estimated time and memory for the iterations left after ``done``, the
+        scores and the report.
         """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
@@ -65,7 +65,7 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Return the highest memory use so far, of the device for CUDA and otherwise of the process."""
+    """Return the peak memory use so far: that of the device for CUDA, otherwise that of the process."""
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

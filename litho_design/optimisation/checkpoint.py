@@ -80,8 +80,9 @@ def load_checkpoint(
 
 
 def checkpoint_path(folder: Path, part: str = "") -> Path:
-    """Return the file in which a search in ``folder`` stores its state; ``part`` names its part of a shared
-    search.
+    """Return the path of the file in which a search in ``folder`` stores its state.
+
+    If several processes share the search, ``part`` names the part of one process.
     """
     return folder / f"checkpoint{part}.pt"
 
@@ -114,7 +115,7 @@ def remove_checkpoint(folder: Path, part: str = "") -> None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """Load a checkpoint to the CPU first, so that a full GPU does not look like a damaged file."""
+    """Load a checkpoint into CPU memory, so that a lack of GPU memory is not mistaken for a damaged file."""
     stored = path.read_bytes()
     try:
         content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")

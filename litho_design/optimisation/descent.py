@@ -25,8 +25,8 @@ def descended(
 
     Args:
         free: the numbers to change, in place.
-        loss: function that returns the loss at the current numbers, and a result that later steps do not
-            change.
+        loss: function that returns the loss at the current numbers, and a result. Later steps must not change
+            this result.
         project: called after every step, to bring the numbers back into their range.
     """
     optimiser = torch.optim.Adam(free, lr=rate)

@@ -1,5 +1,5 @@
-"""Free parameters and the layout that they describe: cells or rings, by Gumbel-Softmax or by rounded
-heights.
+"""The free parameters of a layout of cells or rings: Gumbel-Softmax distributions, or heights that are
+rounded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ _START_SPREAD_LEVELS = 1.0
 class CellMap(nn.Module):
     """Spread one value per free cell over the pixels of the layout, and average pixels back to cells.
 
-    With ``rows``, the map covers only these rows of pixels; ``own`` selects their cells from all cells.
+    With ``rows``, the map covers only these rows of pixels; ``own`` selects the cells of these rows from
+    those of the whole layout.
     """
 
     ring: Tensor

@@ -41,8 +41,8 @@ def gerchberg_saxton(
     P^H (a exp(j arg P u) - P u)). The norm of P is at most one, so this step majorises the squared amplitude
     error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al.
     2007, doi:10.1364/OE.15.001913) raises the target amplitude where light is missing. This form improves
-    uniformity but loses the guarantee that the error never rises. The start phases are pi, the middle of the
-    range of levels that make a full wave, plus or minus up to one radian.
+    uniformity but loses the guarantee that the error never rises. The initial phases are random within one
+    radian of pi, which is the middle of the range if the levels span a full wave.
 
     Args:
         propagator: RSPropagator or ASMPropagator on square grids with the pixel pitch of the element.
@@ -105,11 +105,12 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels nearest to the ``phase`` of a lens plus the constant phase that loses the least
-    light.
+    """Return the levels nearest to the ``phase`` of a lens, after adding the constant phase that loses the
+    least light.
 
-    If the stroke is below one wave, the levels leave a gap in the phase circle, which a constant phase moves.
-    The mean of exp(j error) over the cells is the amplitude at the focus.
+    If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
+    phase decides which cells fall into this gap. The mean of exp(j error) over the cells is the amplitude at
+    the focus.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

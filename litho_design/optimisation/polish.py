@@ -20,15 +20,15 @@ def polish_levels(
 ) -> tuple[Tensor, list[float]]:
     """Improve an integer layout by one-level moves of cells; the loss never rises.
 
-    The gradient at the integer layout ranks the moves, and a share of them, the best ones, is applied at
-    once. This share is halved whenever the true loss of the changed layout does not fall.
+    The gradient at the integer layout ranks the moves. In each round, a share of the cells makes the best
+    moves at once. This share is halved whenever the true loss of the changed layout does not fall.
 
     Args:
         levels: int64 (*cells).
         rounds: number of evaluations with gradient.
 
     Returns:
-        Levels, int64 (*cells), and the loss after each accepted round, starting value first.
+        Levels, int64 (*cells), and the loss at the start and after each accepted round.
     """
     best, share = levels.clone(), _FIRST_SHARE
     gain, move, loss = _rank_moves(best, cells, objective, level_count)

@@ -33,10 +33,10 @@ class ProcessWindow(Record):
     """The spread of prints and optics, and how a search uses it.
 
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
-    blur. With ``samples`` above 0, a search minimises the mean loss of the worst ``tail`` share of that many
-    draws; every iteration uses the same draws. The defaults are guesses; replace them with the spreads of
-    your printer. The fields of one measured data set vary by 13 % in gain, including the scale of the
-    microscope.
+    blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
+    iteration. It minimises the mean loss of the worst draws; their share of all draws is ``tail``. The
+    defaults are guesses; replace them with the spreads of your printer. In one measured data set, the gain
+    varies by 13 % between fields; this value includes the changing scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -62,7 +62,7 @@ class ProcessWindow(Record):
         ge=0,
     )
     tail: float = setting(
-        0.25, "Share of draws, the worst ones, whose mean loss is minimised", option="--risk-tail", gt=0, le=1
+        0.25, "Share of the worst draws, whose mean loss is minimised", option="--risk-tail", gt=0, le=1
     )
     seed: int = setting(0, "Seed of the draws")
     yield_draws: int = setting(100, "Number of random prints for the yield", option="--yield-draws", ge=2)
@@ -90,8 +90,8 @@ class Draw:
         """Apply this draw to a printed map (size, size), or to rings (n,) from the centre; return the height,
         µm.
 
-        A uniform offset changes no image, only the scores of heights. Rings are blurred only along the
-        radius, which is exact for rings far from the centre or much wider than the blur.
+        A uniform offset changes the scores of heights, but no image. Rings are blurred only along the radius,
+        which is exact for rings far from the centre or much wider than the blur.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -124,7 +124,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads with draws that cannot be propagated, during the search or for the yield.
+    """Refuse spreads if any draw, of the search or of the yield, cannot be propagated.
 
     Raises:
         InputError: a draw is below the sampling limit of the propagator between ``source`` and ``target``, or
@@ -158,7 +158,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 class Yield(Record):
     """The share of random prints that pass, its 95 % confidence interval (Wilson), and the figures that
-    decide.
+    decide whether a print passes.
     """
 
     draws: int
@@ -173,8 +173,9 @@ def measure_yield(
     modelled: Mapping[str, float],
     errors: Collection[str] = (),
 ) -> Yield:
-    """Measure the share of drawn prints that pass because their figures stay close to those of the print as
-    modelled.
+    """Measure the share of drawn prints that pass.
+
+    A print passes if its figures are close enough to those of the print as modelled.
 
     Args:
         errors: figures that are better when lower.
@@ -199,16 +200,16 @@ def measure_yield(
 
 
 def risk(losses: Tensor, tail: float) -> Tensor:
-    """Return the mean of the worst losses, which are a share ``tail`` of all."""
+    """Return the mean of the worst losses; ``tail`` is their share of all losses."""
     worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the standard deviation of prints among models, µm, as an rms over the area; it is
-    differentiable.
+    """Return the standard deviation, µm, between the prints of several models, as the rms over the area.
 
-    A constant height is only a constant phase, so the mean of every print is subtracted first.
+    The result is differentiable. A constant height is only a constant phase, so the mean of every print is
+    subtracted first.
 
     Args:
         heights_um: prints of one layout by k models, (k, ...).
@@ -222,7 +223,7 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """Return ``window`` with the spread and correlation of gain and offset that measured prints have.
+    """Return ``window`` with the spreads and the correlation of gain and offset of measured prints.
 
     Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound on the
     spread between prints, because it also contains the changing scale of the microscope and the residual of
@@ -259,8 +260,9 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
 
 def blurred(height: Tensor, sigma_px: float) -> Tensor:
-    """Blur a map or rings with a Gaussian; a map is mirrored at its borders, and rings are mirrored at the
-    centre and constant outside.
+    """Blur a map or rings with a Gaussian.
+
+    A map is mirrored at its borders. Rings are mirrored at the centre, and the last ring is repeated outside.
     """
     import torch
     import torch.nn.functional as F

@@ -13,7 +13,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Ranks:
-    """The number of this process among all processes, and their sums and exchanges, which carry gradients."""
+    """The rank of this process, and sums and exchanges among all processes, through which gradients flow."""
 
     rank: int = 0
     count: int = 1
@@ -49,8 +49,8 @@ class Ranks:
         return range(count * place // self.count, count * (place + 1) // self.count)
 
     def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from each, concatenated into a flat
-        tensor.
+        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from it, for all r; return all
+        received entries as a flat tensor.
 
         Args:
             parts: one tensor per process, real or complex, of one dtype.

@@ -43,7 +43,8 @@ def search_layout(
         objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
         folder: folder of ``checkpoint.pt``; None to run without a checkpoint.
         fingerprint: text that identifies the task; a checkpoint of another task is refused.
-        part: name of this process's part of a shared search, which becomes part of the checkpoint's name.
+        part: name of this process's part of the search, if several processes share it; the name of the
+            checkpoint contains this text.
 
     Returns:
         The state, which contains the kept argmax levels (``best_levels``, per cell) and the history. The
@@ -130,7 +131,7 @@ def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) ->
 
 
 def lower_rate(schedule: StepLR | ReduceLROnPlateau, loss: float) -> None:
-    """Pass the loss of a finished iteration's sample to the scheduler."""
+    """Tell the scheduler that an iteration has finished; ``loss`` is the loss of the sampled layout."""
     if isinstance(schedule, ReduceLROnPlateau):
         schedule.step(loss)
     else:

@@ -46,12 +46,14 @@ class SearchSettings(Record):
     )
     rate_schedule: Literal["constant", "step", "plateau"] = setting(
         "constant",
-        "Learning rate over the iterations: constant; multiplied by rate_factor every rate_iterations "
-        "(step); or multiplied by it after more than rate_iterations in which the loss fell by less than "
-        f"{PROGRESS:g} (plateau)",
+        "Schedule of the learning rate: constant; step, which multiplies the rate by rate_factor every "
+        "rate_iterations; or plateau, which does so after more than rate_iterations in which the loss fell "
+        f"by less than {PROGRESS:g}",
     )
     rate_factor: float = setting(0.5, "Factor of the learning rate at each reduction", gt=0, lt=1)
-    rate_iterations: int = setting(25, "Iterations between two reductions, or without a lower loss", ge=1)
+    rate_iterations: int = setting(
+        25, "Iterations between two reductions (step), or without progress before one (plateau)", ge=1
+    )
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
@@ -85,8 +87,9 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """With further models, the loss of a search is the worst loss over all models + weight * disagreement in
-    waves.
+    """The penalty on the disagreement of several models.
+
+    The loss of a search is the worst loss over all models plus ``weight`` times their disagreement in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
@@ -100,7 +103,9 @@ class EnsemblePenalty(Record):
 
 
 class Fabrication(Record):
-    """A penalty on a layout, added to the loss of its light: inside_weight * ``outside``."""
+    """A penalty on layouts unlike the training layouts: ``inside_weight`` times ``outside`` is added to the
+    loss.
+    """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
 
@@ -117,7 +122,7 @@ class DesignSettings(Record):
 
     variant: Variant = setting(
         "default",
-        "Preset: this project's (default), as stated in the paper, or as in the authors' code",
+        "Preset: our own settings (default), those in the paper, or those of the authors' code",
         option="--variant",
     )
     layout: LayoutSettings = setting(LayoutSettings(), "Layout")
@@ -132,7 +137,7 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
     """Return settings for your own task, with changes by path, such as ``{"layout.size_px": 256}``.
 
     Raises:
-        InputError: a change names an unknown setting, or a value that the setting does not accept.
+        InputError: a change names an unknown setting, or gives a setting a value that it does not accept.
     """
     return changed(DesignSettings(), dict(changes or {}))
 

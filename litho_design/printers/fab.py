@@ -81,7 +81,7 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
     """Load the fab of a truth file.
 
     Raises:
-        InputError: there is no truth file, the pitch or level height of the layout is not the fab's, or the
+        InputError: there is no truth file, the layout differs from the fab in pitch or level height, or the
             layout has more levels than the fab prints.
     """
     fab = FabSimulator(Truth.read(source))

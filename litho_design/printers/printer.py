@@ -50,8 +50,8 @@ class PrinterRecord(Record):
 class Printer(nn.Module):
     """A frozen lithography model, or nominal heights, applied to one element.
 
-    The element stands alone on the substrate, but models continue their input beyond its edge. The layout is
-    therefore surrounded by a guard ring of level 0 before printing, and the print is cropped.
+    The element stands alone on the substrate, but a model assumes that a layout continues beyond its edge.
+    The layout is therefore surrounded by a guard ring of level 0 before printing, and the print is cropped.
 
     Args:
         simulator: a frozen model called as ``simulator(layout_um, pitch_um=...)``, or None for a
@@ -187,7 +187,7 @@ class Printer(nn.Module):
         return nullcontext() if at_precision is None else at_precision(precision)
 
     def record(self) -> PrinterRecord:
-        """Return name, hashes and guard ring of the printer, for results."""
+        """Return the name, the hashes and the guard ring of the printer, for results."""
         return PrinterRecord(
             name=self.name,
             sha256=self.weights_sha256(),
@@ -239,11 +239,11 @@ class Printer(nn.Module):
 
 
 def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
-    """Return the widths, in pixels, of the guard ring, of the halo of a patch, and of the halo of two rows of
-    pixels.
+    """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
+    strip.
 
-    A model that runs on tiles needs a whole tile around a patch. Two rows of pixels lie where two rows of
-    tiles are blended, and the mean of two tiles has a smaller error than one tile.
+    A model that runs on tiles needs a whole tile around a patch. The two rows of a strip lie where two rows
+    of tiles are blended, and the mean of two tiles has a smaller error there than a single tile.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

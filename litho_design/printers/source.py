@@ -30,8 +30,9 @@ def load_printer(
     """Load the printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal
     heights.
 
-    The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is the printer's name in
-    results, by default the model's own. A loaded printer is returned unchanged.
+    The folder ``truth`` of a virtual fab is loaded as a printer that can judge layouts but not take part in a
+    search. ``name`` is the printer's name in results, by default the model's own. A loaded printer is
+    returned unchanged.
 
     Raises:
         InputError: there is no frozen model, its pitch differs, it was not calibrated for the levels, or this
@@ -92,10 +93,9 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Return the zoo's judges that were trained on the same prints as the first ``known`` model, except known
-    models.
+    """Return the judges of the zoo that were trained on the same prints as the first of the ``known`` models.
 
-    A model that was not calibrated for the layout is left out.
+    Models that are already known, and models that were not calibrated for the layout, are left out.
     """
     from litho_models import zoo
 

@@ -73,12 +73,14 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """Return, in levels, by how much a layout exceeds twice the tails of a model's training layouts.
+    """Return, in levels, by how much the tails of a layout's histograms exceed twice those of training
+    layouts.
 
     For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
-    neighbours with steps of k or more. The result is the sum of their excesses over twice the share in the
-    training layouts. If the card has no histogram, the result is 0. A sum of tails, unlike a sum of shares,
-    also pulls back a pixel that is several levels outside.
+    neighbours with steps of k or more. A share may be up to twice the corresponding share of the training
+    layouts, and the result is the sum of all excesses. If the card has no histogram, the result is 0. Because
+    these shares are cumulative, the penalty also pulls back a pixel that lies several levels outside the
+    training layouts.
     """
     total = level.new_zeros(())
     trained, trained_steps = (
@@ -112,9 +114,10 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
     """Return the expected rms error of a model, µm, on the print of a relief with this standard deviation,
     µm.
 
-    The error combines the error on the prints in the model's card, scaled up for a relief that is higher than
-    these prints, with the scatter of the prints' gains. Errors are assumed to be normal, so the mean absolute
-    error is sqrt(2 / pi) of the rms error. If the card has no prints, the result is 0.
+    The result combines the error on the prints in the model's card and the scatter of the gains of these
+    prints. If the relief is higher than these prints, the error on them is scaled up. Errors are assumed to
+    be normal, so the mean absolute error is sqrt(2 / pi) of the rms error. If the card has no prints, the
+    result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:

@@ -29,7 +29,7 @@ class ReliefSettings(DesignSettings):
     )
     off_blur_um: float = setting(
         1.0,
-        "Standard deviation of the blur of a first print's measured deviation, if there is a first print",
+        "Standard deviation of the Gaussian that blurs the measured deviation of a first print, if any",
         unit="µm",
         ge=0,
     )
@@ -39,6 +39,6 @@ def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:
     """Return the settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
 
     Raises:
-        InputError: a change names an unknown setting, or a value that the setting does not accept.
+        InputError: a change names an unknown setting, or gives a setting a value that it does not accept.
     """
     return changed(ReliefSettings(), dict(changes or {}))

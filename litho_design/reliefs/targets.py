@@ -21,9 +21,9 @@ def load_relief(
     """Load a target height map, float32 (size, size), µm, and its record.
 
     Args:
-        source: a drawing ``height_um`` high: lens (a spherical cap), blaze (four periods of a sawtooth along
-            x) or staircase (six steps along x); a grey picture, whose brightest value stands for
-            ``height_um``; or heights in µm: a float TIFF, or an array.
+        source: a drawing, a greyscale image, or heights in µm (a float TIFF or an array). The drawings are
+            ``height_um`` high: lens (a spherical cap), blaze (four periods of a sawtooth along x) and
+            staircase (six steps along x). The brightest value of an image stands for ``height_um``.
 
     Raises:
         InputError: the source is neither a drawing nor a readable file, or the heights have another shape or
@@ -48,8 +48,9 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return a print's deviation from its expectation (size, size), float32, µm, blurred and without its
-    mean.
+    """Return the deviation of a print from the expected print, blurred and without its mean.
+
+    The deviation is a float32 array (size, size), µm.
 
     The roughness of a second print differs from that of the first, so the blur removes the roughness.
     """
@@ -90,6 +91,6 @@ def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
         raise InputError(
             "relief",
             got="heights that are all equal or not numbers",
-            wanted="finite heights in µm that differ",
+            wanted="finite heights in µm that are not all equal",
         )
     return found

@@ -55,10 +55,11 @@ class _Bare(nn.Module):
 
 @register_task
 class ReliefTask(Task):
-    """The task of printing a height map (size, size), µm, as ``load_relief`` returns it with its record.
+    """The task of printing a height map (size, size), µm; ``load_relief`` returns the map and its record.
 
-    The input ``off_um`` is the deviation of a first print from its expectation, without its mean. The search
-    expects the same deviation in the next print. Figures describe only the print, as others will measure it.
+    The input ``off_um`` is the deviation of a first print from the expected print, without its mean. The
+    search expects the same deviation in the next print. Figures compare the predicted print with the target
+    itself, as a measurement would.
 
     Raises:
         InputError: the start is for tasks with light, or the spreads exceed the range of any propagator.
@@ -134,8 +135,9 @@ class ReliefTask(Task):
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the start with the lowest expected loss: levels whose uniform prints have the target
-        heights, or the best affine levels.
+        """Return the starting levels with the lowest expected loss.
+
+        The candidates are levels whose uniform fields print the target heights, and the best affine levels.
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
@@ -162,8 +164,8 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels (size, size) of gain * height + zero, with the gain and zero of the lowest loss
-        over the printers.
+        """Return the levels (size, size) of gain * height + zero; gain and zero minimise the loss over the
+        printers.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
@@ -179,7 +181,7 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Return the whole levels (size, size) of gain * (height above the lowest point) + zero, limited to
+        """Return the integer levels (size, size) of gain * (height above the lowest point) + zero, limited to
         the printable levels.
         """
         layout = self.settings.layout
@@ -224,7 +226,8 @@ class ReliefTask(Task):
         """Return real levels (*cells) that print a relief's heights, if level k is ``level_heights_um[k]``
         high.
 
-        ``zero`` places the relief between the lowest (0) and the highest level (1).
+        ``zero`` moves the relief within the range of the levels: at 0, the relief begins at the lowest level;
+        at 1, it ends at the highest.
         """
         heights, target = np.asarray(level_heights_um), relief_um.cpu().numpy()
         room_um = (heights[-1] - heights[0]) - np.ptp(target)

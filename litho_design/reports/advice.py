@@ -71,11 +71,12 @@ def distribution_warning(design: Design) -> str:
     if not gauge.flagged:
         return ""
     text = (
-        f"the layout is far from the model's training layouts: {100 * gauge.level_distance:.0f} % of the "
-        "pixels would have to change level to match them, so the prediction is an extrapolation"
+        f"the layout is far from the model's training layouts: to match them, "
+        f"{100 * gauge.level_distance:.0f} % of the pixels would need another level, so the "
+        "prediction is an extrapolation"
     )
     text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
-    return f"{text}. Use --inside-weight to keep a search closer to them"
+    return f"{text}. Use --inside-weight to keep a search closer to the training layouts"
 
 
 def width_sentence(design: Design) -> str:
@@ -88,21 +89,21 @@ def width_sentence(design: Design) -> str:
         return ""
     by_model = dict(zip(width.level_heights_um, width.values().tolist(), strict=True))
     text = spread_sentence(width.figure, by_model, width.less, width.gain)
-    text += f" The search used {width.searched_with} of them."
+    text += f" The search used {width.searched_with} of these models."
     (low, high), (_, unit) = width.between, _parted(width.figure)
     if high > max(by_model.values()):
-        text += f" Including the models' own errors, expect {low:.3g} to {high:.3g}{unit}."
+        text += f" With the models' own errors, the expected range is {low:.3g} to {high:.3g}{unit}."
     if width.gain is not None and width.disagreement > width.gain:
         level, low_um, high_um = width.open_level
         text += (
-            f" The models differ most in the height of level {level} ({low_um:.3f} to {high_um:.3f} µm); a "
-            "print with wide fields of this level would decide between them (litho-models next-print)."
+            f" The models differ most in the height of level {level} ({low_um:.3f} to {high_um:.3f} µm). To "
+            "decide between the models, print wide fields of this level (see litho-models next-print)."
         )
     return text
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """Return a sentence with the figure that the first model predicts, its median over models, and its worst
+    """Return a sentence about one figure: the value of the first model, the median over models, and the worst
     value.
 
     The sentence also states whether the models differ too much.
@@ -145,8 +146,8 @@ def thickness_warning(design: Design) -> str:
         return ""
     return (
         f"computed as a thick element (wave propagation method, including one reflection), the same print "
-        f"has an efficiency of {100 * thick:.1f} % instead of the {100 * thin:.1f} % in these scores; its "
-        "detail is too fine for its height, so the scores are too good"
+        f"has an efficiency of {100 * thick:.1f} % instead of the {100 * thin:.1f} % in these scores; the "
+        "detail is too fine for this height, so these scores are too optimistic"
     )
 
 
@@ -154,10 +155,10 @@ def stroke_advice(design: Design) -> str:
     """State the stroke of the printed levels and the height of a full wave."""
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
-        f"The highest level prints {stroke.stroke_waves:.2f} waves above the lowest (gain "
-        f"{stroke.print_gain:.2f}). A blazed grating of these levels would send "
-        f"{100 * stroke.blaze_order_1:.1f} % into the first order and {100 * stroke.blaze_order_0:.1f} % "
-        "straight through."
+        f"The print of the highest level lies {stroke.stroke_waves:.2f} waves above that of the lowest (gain "
+        f"{stroke.print_gain:.2f}). A blazed grating with these levels would send "
+        f"{100 * stroke.blaze_order_1:.1f} % of the light into the first order and "
+        f"{100 * stroke.blaze_order_0:.1f} % straight through."
     )
     if gauge is not None and gauge.training_extreme_level_share < _SEEN_SHARE:
         text += (

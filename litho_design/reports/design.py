@@ -96,8 +96,9 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.figure(progress_figure(history, design), "Loss of the sampled layout and of the printable layout.")
     page.paragraph(
         f"Loss of the printable layout: {design.start_loss:.4f} at the start, {design.argmax_loss:.4f} after "
-        f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish; the last sample had "
-        f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.2g})."
+        f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish. The last "
+        f"sampled layout had a loss of {design.sample_loss:.4f} (soft-to-hard gap "
+        f"{design.argmax_loss - design.sample_loss:+.2g})."
     )
     _add_yield(page, design, task, torch.from_numpy(height_um).to(task.printer.device))
     page.heading("Printed height of the levels", folded=True)
@@ -105,8 +106,9 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.paragraph(stroke_advice(design))
     if tiling := design.tiling:
         page.paragraph(
-            f"The prints predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with halos "
-            f"differ by {tiling.rms_nm:.2g} nm rms and by at most {tiling.max_nm:.2g} nm."
+            f"The print was predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with "
+            f"halos. The two predictions differ by {tiling.rms_nm:.2g} nm rms and by at most "
+            f"{tiling.max_nm:.2g} nm."
         )
     if design.out_of_distribution is not None:
         distance = design.out_of_distribution.model_dump(exclude={"flagged"})
@@ -155,14 +157,14 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
     ceiling, settings = baselines.get("continuous phase", {}).get("loss"), task.settings
     if ceiling is not None and not settings.fabrication.inside_weight and not settings.window.samples:
         page.paragraph(
-            f"The loss of the printed layout is {design.polished_loss:.4f}, which is "
-            f"{100 * (design.polished_loss / ceiling - 1):+.1f} % relative to the {ceiling:.4f} that a "
-            "continuous phase reaches on the same cells."
+            f"The loss of the printed layout is {design.polished_loss:.4f}. A continuous phase on the same "
+            f"cells reaches {ceiling:.4f}; the loss of the printed layout differs from this value by "
+            f"{100 * (design.polished_loss / ceiling - 1):+.1f} %."
         )
     if reference := design.reference_efficiency:
         page.paragraph(
             f"A continuous phase optimised for power alone puts {100 * reference:.1f} % of the light on the "
-            f"signal; the print reaches {design.predicted['eff_signal'] / reference:.2f} of this value."
+            f"signal; the print reaches {design.predicted['eff_signal'] / reference:.2f} times this share."
         )
 
 
@@ -172,20 +174,21 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
     draws = task.window_scores(print_um, window.yield_draws)
     passed = measure_yield(draws, design.predicted, errors)
     page.heading("Process window", folded=True)
-    designed = "in the loss" if window.samples else "not in the loss"
+    included = "included" if window.samples else "did not include"
     page.paragraph(
         f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
-        f"the axis. The search did not use these prints; the process window was {designed}. Its standard "
-        f"deviations are: {'; '.join(spreads(window))}."
+        f"the axis. The search did not use these prints; its loss {included} the process window. The "
+        f"standard deviations of the process window are: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
-    grown = f", and each error is at most {100 / PASS_SHARE:.0f} % of the modelled one"
+    grown = f", and no error may exceed {100 / PASS_SHARE:.0f} % of it"
     page.paragraph(
-        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % confidence interval). In a "
-        f"print that passes, each figure in dB is at most {PASS_DROP_DB:g} dB below that of the print as "
-        f"modelled, every other figure is at least {100 * PASS_SHARE:g} % of the modelled one"
+        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % confidence interval). To "
+        f"pass, a print must have figures in dB that are at most {PASS_DROP_DB:g} dB below those of the "
+        f"print as modelled. Every other figure must reach at least {100 * PASS_SHARE:g} % of the modelled "
+        f"value"
         f"{grown * bool(set(errors) & set(passed.figures))}. "
-        f"These figures count: {', '.join(map(named, passed.figures))}."
+        f"The following figures are compared: {', '.join(map(named, passed.figures))}."
     )
     chosen = [name for name in task.headline if name in passed.figures][:2] or passed.figures[:2]
     figures = {name: (design.predicted[name], named(name)) for name in chosen}

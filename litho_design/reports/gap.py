@@ -26,17 +26,18 @@ _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
 def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequence[Panel]]) -> Path:
-    """Write ``report.html`` and one CSV per table; ``pictures`` shows the first seed, with one row per
-    arm.
+    """Write ``report.html`` and one CSV per table.
+
+    ``pictures`` contains one row of images per arm, all for the first seed.
     """
     lens = result.task.startswith("lens-")
     what = result.task.replace("lens-", "lens, ").replace("-", " ")
     what = f"hologram of “{result.target}”" if result.task == "hoe" else what
     page = Page(
         "The design-to-manufacturing gap",
-        f"{capitalised(what)}, designed with {_listed(result.arms)}; {result.settings.search.iterations} "
-        f"iterations each, seed{'s' * (len(result.seeds) > 1)} {_listed(result.seeds)}. Layouts are scored "
-        "as they would be printed.",
+        f"{capitalised(what)}, designed with {_listed(result.arms)} "
+        f"({result.settings.search.iterations} iterations per design; seed{'s' * (len(result.seeds) > 1)} "
+        f"{_listed(result.seeds)}). Layouts are scored as they would be printed.",
         run=result,
         facts={"seeds": ", ".join(map(str, result.seeds))}
         | {f"{name}, SHA-256": one.sha256 for name, one in result.judges.items() if one.sha256},
@@ -47,8 +48,9 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
     page.verdict(_verdict(result, shown[0]))
     page.figure(
         panels_figure(pictures),
-        f"Seed {result.seeds[0]}. Each title says what the layout was designed with and what printed it. "
-        + ("Each image is the square root of PSF over peak." if lens else "Images are at matched scale."),
+        f"Seed {result.seeds[0]}. Each title names the arm that designed the layout and the judge "
+        "that printed it. "
+        + ("Each image shows sqrt(PSF / peak)." if lens else "Images are at matched scale."),
     )
     page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
@@ -97,8 +99,9 @@ def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Return sentences that name the best arm under each judge that is not an arm, or under all judges if
-    there is none.
+    """Return sentences that name the best arm under each judge.
+
+    Judges that are also arms are skipped, unless there are no others.
     """
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = 1 if figure in registered_task(result.task).errors else -1
@@ -108,7 +111,7 @@ def _verdict(result: GapResult, figure: str) -> str:
         found = {arm: one.judged_mean for arm, one in _means(result, figure, judge).items()}
         best, *others = sorted(found, key=lambda arm: sign * found[arm])
         text = (
-            f"Printed by {called(judge)}, layouts designed with {called(best)} are best: "
+            f"If {called(judge)} prints the layouts, those designed with {called(best)} are best: "
             f"{found[best]:.4g}{unit}"
         )
         if others:

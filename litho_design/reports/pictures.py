@@ -23,9 +23,7 @@ _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map (m, m), ``side_um`` wide, with a colour map of matplotlib; a map with a unit gets a colour
-    bar.
-    """
+    """A map (m, m), ``side_um`` wide, and its matplotlib colour map. A map with a unit gets a colour bar."""
 
     title: str
     values: np.ndarray
@@ -76,7 +74,7 @@ def decibels(psf: np.ndarray) -> np.ndarray:
 
 
 def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Figure:
-    """Draw the print along the central row, the PSF and the MTF, each beside that of a perfect lens."""
+    """Draw the central row of the print, the PSF and the MTF, and the same curves of a perfect lens."""
     import torch
 
     from litho_design.lenses.score import mtf
@@ -112,7 +110,7 @@ def yield_figure(
 
     Args:
         draws: figures of each print.
-        figures: for each figure by name, its value for the print as modelled, and a label.
+        figures: for each figure to draw, the value for the print as modelled, and a label.
         falling: figures that are better when lower.
     """
     figure = new_figure(8, 3)

@@ -27,14 +27,14 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     page.verdict(_verdict(result))
     page.figure(
         panels_figure([[Panel(*shown, judgement.side_um) for shown in judgement.pictures.items()]]),
-        "The target image, and the image behind each print at matched scale; for a lens, the square root of "
-        "the PSF.",
+        "The target image, and the image behind each print, scaled to match the target. For a lens, the "
+        "images show the square root of the PSF.",
     )
     if judgement.photos:
         page.figure(
             panels_figure([[Panel(*shown, judgement.frame_um) for shown in judgement.photos.items()]]),
-            "The object, the photograph through the printed lens, and its deconvolutions, each at the scale "
-            "with the smallest error. The scores refer to this one object only.",
+            "The object, its photograph through the printed lens, and the deconvolved photographs, each "
+            "scaled for the smallest error. The scores refer to this one object only.",
         )
     for score in result.scores:
         for remark in score.remarks():
@@ -49,14 +49,14 @@ def write_score_report(folder: Path, result: ScoreResult, judgement: Judgement) 
     labels = meanings(registered_task(result.task).score_type) | meanings(LensPhotoScore)
     page.table(
         score_table(columns | (result.baselines or {}), labels),
-        "Figures by judge, ± one standard deviation, and their baselines",
+        "Figures by judge (± one standard deviation) and figures of the baselines",
         "scores.csv",
         digits=3,
     )
     heights = [
         {
             "printed by": score.judge.name,
-            "mean difference to the designed print, nm": 1000 * score.mean_height_difference_um,
+            "mean difference from the designed print, nm": 1000 * score.mean_height_difference_um,
             "rms difference, nm": 1000 * score.rms_height_difference_um,
         }
         for score in result.scores
@@ -87,7 +87,8 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """Return a sentence with the figure that the design expects and those of the models that judge it.
+    """Return a sentence that compares the figure expected by the design with the values of the judging
+    models.
 
     The sentence is empty if fewer than two models judge.
     """
@@ -100,7 +101,7 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """Return as text the difference from the expectation, in the figure that compares holograms."""
+    """Return a text with the difference of the SI-PSNR from the expected value; empty without SI-PSNR."""
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

@@ -30,7 +30,7 @@ _CUTOFFS_PER_UM = (0.25, 0.5)
 # The stair has few, wide steps, because it covers three fifths of a side and the printer rounds the edges.
 _TREADS = 10
 _WITNESSES = {
-    "substrate": "bare substrate without a print, which shows zero, tilt and bow of the microscope",
+    "substrate": "bare substrate without a print, which shows the zero, tilt and bow of the microscope",
     "flat": "one level everywhere, which shows the noise floor",
     "steps": "a stair in a random frame, which shows height against level",
 }
@@ -59,8 +59,8 @@ def new_sheet(
         model: model through which one version of the hologram is designed; the other is designed without a
             model.
         format: format of the printer's files, as for ``export``.
-        target: target of the hologram; ``settings``: settings of both designs, by default of a small
-            hologram. All fields have its size, pitch and levels.
+        target: target of the hologram; ``settings``: settings of both designs, by default those of a small
+            hologram. All fields have the size, pitch and levels of the hologram.
         layouts: number of random layouts from which the printer model is learned; ``seed``: their seed.
         device, announce: as for ``design_hologram``.
 
@@ -93,7 +93,7 @@ def new_sheet(
         write_card(
             folder,
             name="printed-sheet",
-            title="One sheet, printed and scanned to learn a printer from",
+            title="Prints and scans of one sheet, for learning a printer model",
             scan_size_um=(geometry.size_um, geometry.size_um),
             pitch_um=geometry.pitch_um,
             level_height_um=geometry.level_height_um,

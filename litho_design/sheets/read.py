@@ -79,15 +79,15 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
 
 
 def sheet_text(result: ReadSheet) -> str:
-    """Return the result in two sentences."""
+    """Return the result in words."""
     gain = {kind: db["with"] - db["without"] for kind, db in _by_kind(result).items()}
     better = "better" if gain["measured"] >= 0 else "worse"
     return (
-        f"Designed through {result.model}, the printed hologram is {abs(gain['measured']):.1f} dB {better} "
-        f"({result.measured_db['with']:.1f} instead of {result.measured_db['without']:.1f} dB; the expected "
-        f"gain was {gain['expected']:+.1f} dB). "
-        f"The mean absolute error of {result.model} on these prints is {result.model_nm:.1f} nm; that of the "
-        f"model fitted to them is {result.corrected_nm:.1f} nm on held-out scans."
+        f"The print of the hologram designed through {result.model} is {abs(gain['measured']):.1f} dB "
+        f"{better} than that of the other hologram ({result.measured_db['with']:.1f} instead of "
+        f"{result.measured_db['without']:.1f} dB; the expected gain was {gain['expected']:+.1f} dB). "
+        f"The mean absolute error of {result.model} on these prints is {result.model_nm:.1f} nm. A model "
+        f"fitted to these prints has an error of {result.corrected_nm:.1f} nm on held-out scans."
     )
 
 

@@ -24,8 +24,9 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """The sheet for a lab; ``expected_db`` is the SI-PSNR of each hologram's image that ``model``
-    predicts.
+    """The sheet for a lab.
+
+    ``expected_db`` is the SI-PSNR that the model predicts for the image of each hologram.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet/1"
@@ -44,7 +45,7 @@ class ReadSheet(RunFacts, Result):
 
     Attributes:
         model_nm: mean absolute error, on the new prints, of the model used for the design.
-        own_nm: mean absolute error of a model fitted to the new prints, by cross-validation in the loop;
+        own_nm: cross-validated mean absolute error of a model that the loop fitted to the new prints;
             ``corrected_nm``: the error of this model with the effects that the loop found.
         found: effects that the loop added; ``verdict``: verdict of the loop.
         measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: the predicted SI-PSNR.

@@ -19,7 +19,7 @@ class ElementBench(nn.Module):
     """Propagate the light of a source through a printed element onto a window of the same size in the image
     plane.
 
-    ``propagator`` belongs to the wave from the middle of the source.
+    ``propagator`` is the propagator for the middle wavelength of the source.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):

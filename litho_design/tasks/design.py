@@ -1,4 +1,4 @@
-"""A finished design as a folder: the record in design.json, with levels, predicted print and image."""
+"""The folder of a finished design: the record design.json, the levels, the predicted print and the image."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Design(Findings, Result):
 
     @property
     def in_rings(self) -> bool:
-        """Return whether the design has levels and heights along a radius instead of a plane."""
+        """Return whether the levels and heights of the design are given along a radius, not on a plane."""
         return RINGS_FILE in self.files
 
     @property
@@ -107,7 +107,9 @@ class Design(Findings, Result):
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
-    """Save arrays by file name, and levels as a 16-bit grey PNG too; return the SHA-256 of all files."""
+    """Save arrays by file name, and also the levels as a 16-bit greyscale PNG; return the SHA-256 of all
+    files.
+    """
     hashes = {}
     for name, array in arrays.items():
         with atomic_file(folder / name) as temporary, open(temporary, "wb") as stream:
@@ -125,8 +127,9 @@ def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
 
 
 def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:
-    """Read one array of a design folder and check it against the hash in the record; ``on_disk`` only maps
-    the file.
+    """Read one array of a design folder, and check its file against the hash in the record.
+
+    With ``on_disk``, the file is memory-mapped instead of read completely.
 
     Raises:
         InputError: there is no such file, or the file changed after the design.

@@ -88,8 +88,8 @@ def _make(
     if task.in_one_piece:
         level, width = best_layout(task, level)
     if width is not None and width.returned != SEARCHED:
-        what = f"the available models print the layout “{width.returned}” better than the searched one"
-        task.notes.append(f"{what}, so it was chosen")
+        what = f"the available models print the layout “{width.returned}” better than the layout found by"
+        task.notes.append(f"{what} the search, so it was chosen")
         with torch.no_grad():
             loss = float(task.objective(level[None, None].float())[0])
     height = task.printed_um(level)

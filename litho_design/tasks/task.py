@@ -53,11 +53,12 @@ class Task:
         starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
         headline: figures that reports and commands show first; all figures if empty.
         errors: figures that are better when lower; ``loss_unit``: see ``Width``.
-        in_one_piece: whether the search ends with single-level changes, and the run writes a report.
+        in_one_piece: whether the element is designed as a whole. If so, single-level changes follow the
+            search, and the run writes a report.
         ranks: the processes that share the task.
         score_type: record of the scores, whose field descriptions explain the figures in reports.
         settings, printer, printers, inputs: as given; ``notes``: notes for the record.
-        bench: optics of the settings, which turn a height map into what is seen.
+        bench: module that turns a height map into ``seen``, the input of ``loss`` and ``figures``.
 
     Args:
         settings: geometry, optics, search, process window.
@@ -111,14 +112,15 @@ class Task:
     # Methods that your own task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """Return the optics of every image: colours (``optics.at_wavelength``), planes, angles of
-        incidence.
+        """Return the optics of every image; they may differ in colour (``optics.at_wavelength``), plane or
+        angle.
         """
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
-        """Return the loss of what is seen, which is by default the shares of the incident power (views, size,
-        size).
+        """Return the loss of the light behind the print.
+
+        By default, ``seen`` contains the shares of the incident power (views, size, size).
 
         Returns:
             A scalar, or a scalar and its named parts.
@@ -126,7 +128,7 @@ class Task:
         raise NotImplementedError
 
     def figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Return the scores of what is seen, by name."""
+        """Return the scores of ``seen`` (see ``loss``), by name."""
         raise NotImplementedError
 
     # Methods that holograms and lenses override.
@@ -136,7 +138,7 @@ class Task:
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return the optics that turn a height map (size, size), µm, into what is seen."""
+        """Return the module that turns heights (size, size), µm, into ``seen``, the input of ``loss``."""
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
@@ -148,7 +150,7 @@ class Task:
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return uncorrected layouts (size, size) by name, by default the start for nominal heights."""
+        """Return uncorrected layouts (size, size) by name; by default, only the start for nominal heights."""
         if set(self.starts) == {"random"}:
             return {}
         layout = self.settings.layout
@@ -157,7 +159,7 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses of several models (models,) into one, by default the largest."""
+        """Combine the losses of several models (models,) into one loss, by default their maximum."""
         return losses.max()
 
     def check_printer(self, printer: Printer) -> None:
@@ -182,15 +184,17 @@ class Task:
         return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score a print (size, size), µm; ``expected_um`` is the print that the design expected, by default
-        the same.
+        """Score a print (size, size), µm.
+
+        ``expected_um`` is the print that the design expected; by default, it is the scored print.
         """
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score a print as a thick element; return None if the settings already say thick, or the task has no
-        light.
+        """Score a print as a thick element.
+
+        Return None if the settings already specify a thick element, or if the task has no light.
         """
         if self.settings.optics.element == "thick":
             return None
@@ -229,8 +233,9 @@ class Task:
         return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Return the efficiency of an ideal element found from a print (size, size), µm; None if it is
-        undefined.
+        """Return the efficiency of an ideal element; None if it is undefined.
+
+        The search for the ideal element starts from a print (size, size), µm.
         """
         return None
 
@@ -256,8 +261,10 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Return the draws of the process window in the loss, each with its bench; without draws, only the
-        print as modelled.
+        """Return the draws of the process window that enter the loss, each with its bench.
+
+        If there are no such draws, the only entry is None, which stands for the print as modelled, with its
+        bench.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
@@ -280,8 +287,9 @@ class Task:
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With several models, the loss is ``over_models`` plus the models' disagreement; with samples of the
-        process window, it is the risk over the samples. The penalty on rare levels and steps is added.
+        For each sample of the process window, ``over_models`` combines the losses of the models; ``risk``
+        then combines the samples. Penalties on the disagreement of the models and on rare levels and steps
+        are added.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
@@ -306,7 +314,7 @@ class Task:
 
     @torch.no_grad()
     def printed_um(self, level: Tensor, printer: Printer | None = None) -> Tensor:
-        """Print whole levels (size, size), by default with the first printer; return the height, µm."""
+        """Print integer levels (size, size), by default with the first printer; return the height, µm."""
         return self.printed(level[None, None].float(), printer or self.printer)
 
     @torch.no_grad()
@@ -330,8 +338,9 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of what is seen behind this model's print, and its named parts; by default
-        ``loss``.
+        """Return the loss of ``seen``, the light behind the print of ``printer``, and its named parts.
+
+        By default, the result is that of ``loss``.
         """
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})

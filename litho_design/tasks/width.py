@@ -1,4 +1,4 @@
-"""The width of a design: the figures that every available model gives its layout and uncorrected layouts."""
+"""The width of a design: figures of its layout and of uncorrected layouts according to all models."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Width(Record):
 
     Attributes:
         searched_with: how many of the models the search used.
-        figures: figures by candidate and model, including ``loss``; candidates are the searched layout and
-            the uncorrected ones.
+        figures: figures by candidate and model, including ``loss``; candidates are the layout found by the
+            search and the uncorrected ones.
         returned: the candidate with the smallest loss over all models (``Task.over_models``).
         figure: the first figure of the task; ``less``: whether it is better when lower.
         loss_unit: factor that converts the loss to the unit of the figure, if the loss is an error that

@@ -67,8 +67,8 @@ def compare(
     designs resume. The arms' printers also judge, so the matrix of arms and judges is complete.
 
     Args:
-        settings: settings of a hologram or a lens, which decide what is designed, or of ``task``; ``seeds``
-            override the seed of the search.
+        settings: settings of a hologram or of a lens, whose type decides what is designed, or settings of
+            ``task``. ``seeds`` replace the seed of the search.
         arms: printers to design with, as a mapping of models by name, or as a list of NAME=MODEL, MODEL,
             ``none`` and loaded printers.
         out: folder of the comparison.

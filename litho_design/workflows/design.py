@@ -43,8 +43,8 @@ class How(TypedDict, total=False):
     Attributes:
         judges: models (MODEL or NAME=MODEL) that print the finished layout to show the width of the design;
             by default, the zoo's models that were trained on the same prints.
-        robust: search also through the judges that have gradients; the loss is then that over all models
-            (``Task.over_models``), plus a penalty on the models' disagreement.
+        robust: let the search also use the judges that have gradients. The loss is then combined over all
+            models (``Task.over_models``), and a penalty on the models' disagreement is added.
         device: device of the models.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting (the default).
@@ -73,9 +73,9 @@ def design_hologram(
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        band_px: largest number of rows of a band, to design in bands an element too large for the memory of
-            one process. Processes started by torchrun share the bands; with ``cuda``, each uses its own GPU.
-            The model must have a finite reach, and no judges print the layout.
+        band_px: design an element that is too large for the memory of one process, in bands of at most this
+            many rows. Processes started by torchrun share the bands; with ``cuda``, each process uses its own
+            GPU. The model must have a finite reach, and there are no judges.
         how: judges, robust, device, extrapolate, announce (see ``How``).
 
     Returns:
@@ -120,9 +120,8 @@ def design_lens(
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
-        tile_px: length of the tiles, if the rings of a lens that focuses light are designed along a radius.
-            The plane is then not computed, so the lens may be 10 mm wide or more. The model must have a
-            finite reach.
+        tile_px: design the rings of a lens that focuses light along a radius, in tiles of this length. The
+            plane is not computed, so the lens may be 10 mm wide or more. The model must have a finite reach.
         how: see ``How``.
 
     Returns:
@@ -159,12 +158,12 @@ def correct(
     """Find the layout whose print comes closest to a target height map.
 
     Args:
-        relief: ``lens``, ``blaze`` or ``staircase``, a grey picture, a float TIFF of heights in µm, or an
+        relief: ``lens``, ``blaze`` or ``staircase``, a greyscale image, a float TIFF of heights in µm, or an
             array (size_px, size_px) of heights in µm (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction whose print was measured; ``scan``: that measurement. The next
-            print is expected to deviate from its expectation in the same way.
+            print is expected to deviate from its prediction in the same way.
         how: see ``How``; robust by default.
 
     Returns:
@@ -190,7 +189,8 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """Return the deviation of a first element's measured print as an input for the second element.
+    """Return how the measured print of a first element deviates from its prediction, as an input of the
+    second.
 
     Return no inputs if there is no first element.
     """

@@ -1,4 +1,4 @@
-"""A first result: one small hologram, designed without and with a printer model, which prints both
+"""A first result: a small hologram is designed without and with a printer model, and this model prints both
 designs.
 """
 

@@ -37,15 +37,17 @@ def score(
     Args:
         design: the folder of a design, or a design from ``load_design``.
         out: folder of the score.
-        judges: printers, or NAME=MODEL, MODEL or ``none``; MODEL may be ``truth`` of a virtual fab. Judges
-            with the weights of the design's own model are marked as not independent. Without a judge, scan or
-            photograph, the zoo's models that were trained on the same prints judge.
+        judges: loaded printers, or texts of the form NAME=MODEL, MODEL or ``none``; MODEL may be the folder
+            ``truth`` of a virtual fab. Judges with the weights of the design's own model are marked as not
+            independent. If there is no judge, scan or photograph, the judges are the zoo's models that were
+            trained on the same prints.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens; with
             ``scan``, it is also deconvolved with the PSF of the measured print.
-        element: ``thick`` judges every print by the wave propagation method; ignored for a loaded design.
-        band_px: largest number of rows of a band, if a large hologram is printed and scored band by band.
-        device: where prints and waves are computed; ignored for a loaded design.
+        element: with ``thick``, the light behind every print is computed by the wave propagation method;
+            ignored if ``design`` is already loaded.
+        band_px: print and score a large hologram in bands of at most this many rows.
+        device: where prints and waves are computed; ignored if ``design`` is already loaded.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
     Raises:
@@ -60,7 +62,7 @@ def score(
             raise InputError("score of a large element", got=given, wanted="only models as judges")
         if record.in_rings and band_px is not None:
             raise InputError(
-                "score of a lens in rings", got="bands", wanted="no bands, because rings need no plane"
+                "score of a lens in rings", got="bands", wanted="no bands, because rings have no plane"
             )
         judges = judges or ()
     loaded = (

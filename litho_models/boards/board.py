@@ -37,7 +37,7 @@ def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str
     """Draw the trials of a board.
 
     Raises:
-        InputError: settings that cannot be drawn, or fields that cannot be printed.
+        InputError: no trials can be drawn with these settings, or the fields cannot be printed.
     """
     # This call refuses impossible fields now, before a trial fails on them.
     Plan(n_scans, (size_px, size_px))
@@ -64,7 +64,7 @@ def new_board(
         n_scans: scans in each store; ``size_px``: side of a layout.
 
     Raises:
-        InputError: settings that cannot be drawn, or a folder with another board.
+        InputError: no trials can be drawn with these settings, or ``out`` holds another board.
     """
     drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
     # Trials in measured prints are left out, because they need a store of measured prints.
@@ -108,7 +108,7 @@ def judge_board(
         report: function that receives the progress messages of the default loop.
 
     Raises:
-        InputError: no board, or a folder with the trials of another board or loop.
+        InputError: ``board`` holds no board, or ``out`` holds the trials of another board or loop.
     """
     source = Path(board)
     draws = Draws.read(source)
@@ -136,8 +136,8 @@ def command_loop(command: str) -> Loop:
     FOLDER/answer.json.
 
     Raises:
-        InputError: a command that cannot be run. The returned loop raises it if the exit code is not 0 or the
-            answer is missing.
+        InputError: the command cannot be run. The returned loop also raises this error, if the exit code is
+            not 0 or the answer is missing.
     """
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
@@ -176,13 +176,15 @@ def store_of(board: Path, draw: Draw) -> Path:
 
 
 def cpu_s() -> float:
-    """Return the processor seconds of this process and its finished children."""
+    """Return the CPU time, in seconds, of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def trial_line(trial: Trial) -> str:
-    """Describe a trial in one line: the outcome of each cause, false names, the error, why it failed."""
+    """Describe a trial in one line: the outcome of each cause, false names, the error, and the reason for a
+    failure.
+    """
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false name: {name}" for name in trial.false_names]
     ratio = trial.errors and trial.errors.ratio

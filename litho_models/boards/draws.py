@@ -1,5 +1,6 @@
-"""Draw the causes to plant from all causes that the virtual fab can simulate, with one seed and before any
-run.
+"""Draw the causes to plant from all causes that the virtual fab can simulate.
+
+One seed determines all draws, which are made before any run.
 
 There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. This module
 does not read the loop's catalogue of effects.
@@ -113,8 +114,10 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 
 
 def _draw_mixtures(rng: Rng) -> list[Draw]:
-    """Draw the trials of mixtures. About half of the causes have a form of the catalogue. No two causes of a
-    trial share a right name.
+    """Draw the trials of mixtures.
+
+    For about half of the causes, the catalogue contains the form. No two causes of a trial share a right
+    name.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -188,7 +191,7 @@ def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Deal from a deck until there are ``size`` causes; skip causes whose right names are refused or
+    """Deal causes from a deck until there are ``size``, skipping causes with a right name that is refused or
     taken.
     """
     names = list(started)

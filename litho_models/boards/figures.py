@@ -56,7 +56,10 @@ def share(hits: Iterable[bool]) -> str:
 
 
 def counted(trials: Iterable[Trial]) -> list[Outcome]:
-    """Return the outcomes of causes above 8 nm; if a trial failed before sizing, the drawn size counts."""
+    """Return the outcomes of causes larger than 8 nm.
+
+    If a trial failed before the sizes were measured, the drawn sizes count.
+    """
     found = []
     for trial in trials:
         sizes = {one.name: one.wanted_rms_nm for one in trial.draw.causes}
@@ -84,7 +87,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         ratio = np.median(bias[:, 1] / bias[:, 0])
         figures.append(
             Figure(
-                "error of the base's values without, with the findings; median of the ratios",
+                "error of the base's values without and with the findings; median ratio",
                 f"{100 * without:.1f} %, {100 * with_found:.1f} %; {ratio:.2f}",
                 "at most 1/3",
             )
@@ -92,7 +95,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
     minutes = [trial.dataset_cpu_s / 60 for trial in trials if trial.dataset_cpu_s is not None]
     if minutes:
         spent = f"{np.mean(minutes):.1f}, {max(minutes):.1f}"
-        figures.append(Figure("processor minutes per data set: mean, longest", spent))
+        figures.append(Figure("CPU minutes per data set: mean, longest", spent))
     return figures
 
 

@@ -42,7 +42,7 @@ def judged(
 
     Args:
         draw: the trial as drawn; ``planted``: result of `plant`.
-        answer: the loop's answer; ``used_s``: processor seconds that it took.
+        answer: the loop's answer; ``used_s``: CPU time of the loop, s.
         jobs: the printed fields; ``store``: the store that the loop got.
     """
     locked = set(store.locked_ids)
@@ -70,8 +70,9 @@ def judge(
     jobs: Sequence[Job],
     scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """Return one outcome per planted cause, in the order of the causes, or one outcome for the whole trial if
-    nothing was planted.
+    """Return one outcome per planted cause, in the order of the causes.
+
+    If nothing was planted, return one outcome for the whole trial.
 
     Each finding counts for at most one cause. Findings are assigned to larger causes first.
     """
@@ -129,7 +130,9 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Return whether the loop found a displacement along x in groups that separate the scans as planted."""
+    """Return whether the loop found a displacement along x in groups that do not mix strongly and weakly
+    displaced scans.
+    """
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
         labels: dict[str, set[bool]] = {}
@@ -158,10 +161,11 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Return the mean absolute error of the noise-free scans with all causes, k = 1, nm.
+    """Return the mean absolute error, nm, of the true models at k = 1.
 
-    The store's transform (and bend) of each scan maps it onto the layout. The error uses the same scans,
-    pixels and per-scan terms as the scores of the loop.
+    The predictions are noise-free scans with all causes. Each is mapped onto the layout with the transform
+    (and bend) that the store contains for this scan. The error uses the same scans, pixels and per-scan terms
+    as the scores of the loop.
     """
     by_id = {job.id: job for job in jobs}
     predictions = []

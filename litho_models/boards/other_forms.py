@@ -35,13 +35,13 @@ _MOST_SCANS = 256
 
 @dataclass(frozen=True)
 class Form:
-    """One form; ``draw`` draws its random values and returns its law.
+    """One form of a cause; the function ``draw`` draws the random values of the form and returns its law.
 
     Attributes:
         limit: largest strength, in ``unit``; the law of a form changes nothing at strength 0.
         meaning: the meaning of a strength of one unit, and the drawn values.
-        deck: boards that draw this form; ``base``: a part of a mixture's printer, which is not drawn as a
-            cause.
+        deck: boards that draw this form. A ``base`` form is not drawn as a cause, but belongs to the printer
+            of a mixture.
         names: right names in the catalogue; most forms have none.
     """
 
@@ -59,7 +59,7 @@ FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """Several forms with their strengths. At each stage, the fab applies them one after the other."""
+    """Several forms with their strengths. At each stage, the fab applies the forms one after the other."""
 
     def __init__(self, strengths: Mapping[str, float], seed: int):
         self._laws = [
@@ -91,7 +91,7 @@ def _number(name: str) -> int:
 def _form(
     name: str, stage: Stage, unit: str, limit: float, deck: Deck = "both", names: tuple[str, ...] = ()
 ) -> Callable[[Draw], Draw]:
-    """Register a drawing function as a form, with its docstring as meaning."""
+    """Register a drawing function as a form, whose meaning is the docstring of the function."""
 
     def enter(draw: Draw) -> Draw:
         meaning = " ".join((draw.__doc__ or "").split())
@@ -438,8 +438,9 @@ def _seam(rng: Rng) -> tuple[int, float]:
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> Array:
-    """Return a mask that is True on one side of a seam; ``side`` encodes the axis that the seam crosses and
-    the side.
+    """Return a mask that is True on one side of a seam.
+
+    ``side`` encodes both the axis across the seam (0, 1: y; 2, 3: x) and the side (odd: after the seam).
     """
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

@@ -1,8 +1,8 @@
 """Plant the causes of a trial at their strengths, and print its fields.
 
-The size of a cause is the rms of the change that the best refitted base cannot absorb. To find it, the
-Physics model, which can represent the fab without causes, is fitted to the noise-free scans with the cause.
-Datum, gain, tilt, bow and an affine registration error are free in each scan.
+The size of a cause is the rms of the change that remains after the base is refitted. To find the size, the
+Physics model, which can represent the fab without causes, is fitted to noise-free scans that contain the
+cause. Datum, gain, tilt, bow and an affine registration error are free in each scan.
 """
 
 from __future__ import annotations
@@ -87,11 +87,12 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength at which each cause, alone, has its drawn size on these fields. The form of the base
-    comes first.
+    """Find the strength at which each cause, planted alone, has its drawn size on these fields.
 
-    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded.
-    No other cause is drawn in its place. The size of an alias is the change of the scans before a refit,
+    The form of the base comes first in the result.
+
+    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded. No
+    other cause is drawn in its place. For an alias, the size is the change of the scans before a refit,
     because the refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
@@ -99,7 +100,10 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
-    """Print and scan all fields into raw files; return their card, which states only required facts."""
+    """Print and scan all fields, and write the raw files; return the path of their card.
+
+    The card states only the required facts.
+    """
     (folder / "scans").mkdir(parents=True)
     for job in jobs:
         scan = scan_job(fab_of(draw, planted, job), job)

@@ -26,12 +26,13 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A knob of the virtual fab or a form of its own, with the size that it should have (see
-    `Planted.rms_nm`).
+    """A cause as drawn: a knob of the virtual fab or another form, and the size that it should have.
+
+    The size is that of `Planted.rms_nm`.
 
     Attributes:
-        by: with ``batch``, scans after ``place`` in the printing order have ``weak`` times the strength. With
-            ``field``, this holds for scans whose id ends in none of the digits of ``place``.
+        by: the scans that have only ``weak`` times the strength: none (``all``), those after ``place`` in the
+            printing order (``batch``), or those whose id does not end in a digit of ``place`` (``field``).
     """
 
     name: str
@@ -77,10 +78,10 @@ class Planted(Record):
 
     Attributes:
         names: right names in the catalogue of effects.
-        strength: strength in ``unit``; ``at_limit``: whether this is the largest possible strength, which did
-            not reach the drawn size.
-        rms_nm: rms residual that this cause alone leaves after a refit of base, scan terms and registration,
-            without noise.
+        strength: strength in ``unit``; ``at_limit``: whether the drawn size was out of reach, so that the
+            strength is the largest possible one.
+        rms_nm: rms of the residual that this cause alone leaves in noise-free scans after a refit of the
+            base, the scan terms and the registration.
     """
 
     draw: CauseDraw
@@ -132,9 +133,9 @@ class Found(Record):
 
     Attributes:
         names: name of the finding in the catalogue, then the names of effects that look the same.
-        by: grouping of scans between which the strength differs; ``scan``: one strength per scan; ``all``:
-            one strength for all scans.
-        exponents: confidence intervals of its exponent, if it is a power law.
+        by: grouping of the scans, if the strength differs between groups; ``scan``: one strength per scan;
+            ``all``: one strength for all scans.
+        exponents: confidence intervals of the exponent, if the finding is a power law.
     """
 
     names: list[str]
@@ -178,7 +179,7 @@ class Trial(Result, extra="ignore"):
         false_names: sets of causes that the loop named but that contain no planted cause.
         bias: median relative error of the base's values, without and with the findings; None if the printer
             or the chosen base is not a Physics model.
-        dataset_cpu_s: processor seconds of build and loop.
+        dataset_cpu_s: CPU time of build and loop, s.
     """
 
     SCHEMA = "litho-models/blind-trial/2"
@@ -199,8 +200,8 @@ class Scoreboard(Result):
     """All trials of a board; ``pending`` trials were drawn but not run, and ``command`` reproduces the
     scoreboard.
 
-    ``loop`` is the name of the judged loop, and ``draws_sha256`` the hash of ``draws.json`` of a judged
-    board.
+    ``loop`` is the name of the judged loop, and ``draws_sha256`` is the hash of the judged board's
+    ``draws.json``.
     """
 
     SCHEMA = "litho-models/blind-trials/3"

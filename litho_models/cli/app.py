@@ -37,9 +37,9 @@ StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")
 Out = Annotated[Path, option("folder for the result; a folder with other contents is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
-    option("terms fitted to each scan for its datum-free error; by default offset, or none for films"),
+    option("terms fitted to each scan for its datum-free error; by default offset, but none for films"),
 ]
-_BACKGROUND_HELP = "training: add the smooth background that the training scans share to the predictions"
+_BACKGROUND_HELP = "training: add to the predictions the smooth background that the training scans share"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
@@ -129,7 +129,7 @@ def evaluate(
         ),
     ] = False,
 ) -> None:
-    """Score one frozen model on a store. If this is its training dataset, the locked scans are left out.
+    """Score one frozen model on a store, without the locked scans if the store is its training dataset.
 
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
@@ -179,7 +179,7 @@ def benchmark(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """Train every model without each fold, and score it on the scans of that fold; resumable.
+    """For each fold, train every model on the other folds and score it on this fold; resumable.
 
     Example: litho-models benchmark prints.zarr --models affine,physics,pbl --out benchmark
     """
@@ -209,7 +209,7 @@ def benchmark(
     typer.echo(table.round(2).to_string(index=False, na_rep="–"))
     scored = len(result.split.scored_ids)
     if scored < FEWEST_FOR_INTERVAL:
-        typer.echo(f"no intervals: {scored} scans are too few, {FEWEST_FOR_INTERVAL} are needed")
+        typer.echo(f"no intervals: there are {scored} scans, but at least {FEWEST_FOR_INTERVAL} are needed")
     typer.echo(benchmark_verdict(result))
     typer.echo(f"report {out / 'report.html'}")
 
@@ -250,7 +250,7 @@ def export(
     frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
-        f"{out} accepts layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; its heights differ "
+        f"{out} accepts layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm. Its heights differ "
         f"from those of the model by at most {NM_PER_UM * difference_um:.2g} nm"
     )
 
@@ -297,7 +297,7 @@ def compare(
 @app.command()
 def freeze(
     run: Annotated[
-        str, argument("folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
+        str, argument("output of `train` or `close-loop`, or a frozen model (a folder or zoo:NAME)")
     ],
     out: Out,
     attribute: Annotated[
@@ -325,7 +325,7 @@ def _attribution(given: Sequence[str]) -> Any:
         raise InputError(
             "--attribute",
             got=wrong[0],
-            wanted="EFFECT=microscope or EFFECT=printer each time, if it is given more than once",
+            wanted="EFFECT=microscope or EFFECT=printer in every use, if the option is used more than once",
         )
     return dict(text.split("=", 1) for text in given)
 

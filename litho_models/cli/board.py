@@ -26,8 +26,8 @@ def new(
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
     size_px: Annotated[int, option("side of a layout, pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Print and scan fields with hidden causes in the virtual fab. The loop gets the stores, the judge also
-    the causes.
+    """Print and scan fields with hidden causes in the virtual fab. The loop gets only the stores; the judge
+    also gets the causes.
 
     Example: litho-models board new --trials 8 --out board
     """

@@ -24,8 +24,8 @@ def close_loop(
     stores: Annotated[
         list[Path],
         argument(
-            "dataset store made by litho-data build; further stores contain later prints of the same "
-            "printer, which decide the questions that the first store leaves open"
+            "dataset store made by litho-data build; further stores may add later prints of the same "
+            "printer that decide the questions left open by the first store"
         ),
     ],
     out: Annotated[Path, option("folder for the result, report, tables and corrected model")],
@@ -43,8 +43,8 @@ def close_loop(
     nested: Annotated[
         Literal["folds", "prints"] | None,
         option(
-            "also repeat all choices with each fold or print left out, and judge them on that "
-            "fold or print; slow"
+            "also leave out each fold (or print) in turn, repeat all choices without it, and judge them "
+            "on it; slow"
         ),
     ] = None,
     inject: Annotated[
@@ -59,7 +59,7 @@ def close_loop(
     steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
     cache: Annotated[
         Path | None,
-        option("folder for the trained networks of each fold; by default beside --out"),
+        option("folder for the trained networks of each fold; by default a folder next to --out"),
     ] = None,
     seed: Annotated[int, option("seed of folds and bootstrap, not of the lock box", min=0)] = 0,
     workers: WorkersOption = 1,
@@ -117,7 +117,7 @@ def check(
         option("id of a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
     false_alarms: Annotated[
-        float, option("share of data sets from an unchanged printer that may raise an alarm")
+        float, option("accepted share of data sets that raise an alarm although the printer is unchanged")
     ] = 0.005,
     tolerance: Annotated[
         float | None,

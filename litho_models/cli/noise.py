@@ -30,15 +30,15 @@ def noise(
     residuals: Annotated[
         str | None,
         option(
-            "folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
-            "zoo:NAME), for σ(x) alone"
+            "output folder of `benchmark` (for the noise budget and σ(x)), or a frozen model: a folder or "
+            "zoo:NAME (for σ(x) only)"
         ),
     ] = None,
     model: Annotated[str | None, option("which model of the benchmark; by default the best")] = None,
     seed: Annotated[int, option("seed for the choice of pixels", min=0)] = 0,
 ) -> None:
-    """Estimate roughness, dose matrix, noise budget, and σ(x) with its calibration; lengths in µm, noise in
-    nm.
+    """Estimate the roughness, the dose matrix, the noise budget and a calibrated σ(x); lengths in µm, noise
+    in nm.
 
     Example: litho-models noise prints.zarr --residuals benchmark --out noise
     """
@@ -55,7 +55,7 @@ def noise(
     if store is not None:
         result = litho_models.analyse_noise(store, out, residuals=residuals, model=model, seed=seed)
     elif flat is None:
-        wanted = "a store, or --flat and its scan"
+        wanted = "a store, or --flat with the scan of a flat print"
         raise InputError("noise", got=given or "nothing to analyse", wanted=wanted)
     elif of_a_store:
         raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store with {of_a_store}")

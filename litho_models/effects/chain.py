@@ -24,8 +24,9 @@ class EffectChain(nn.Module):
     Args:
         base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
         effects: parameter values by the name of the effect; parameters that are not given are off.
-        frames: whether a height effect rotates with the print or with the scan, if that differs from the
-            default: effects of stage ``measurement`` rotate with the scan, all others with the print.
+        frames: for height effects that deviate from the default, whether they rotate with the print or with
+            the scan. By default, effects of stage ``measurement`` rotate with the scan, and all others rotate
+            with the print.
     """
 
     def __init__(
@@ -68,9 +69,9 @@ class EffectChain(nn.Module):
         """Apply the height effects to the base model's height.
 
         Args:
-            known: fields after each effect that were already computed for the same scan and base; new ones
-                are added.
-            key: what ``height_um`` depends on.
+            known: fields after each effect, as far as they were already computed for the same scan and base;
+                newly computed fields are added.
+            key: the effects and values on which ``height_um`` depends, as returned by ``before_base``.
         """
         return self._run_stage("height", height_um, context, known, key)[0]
 

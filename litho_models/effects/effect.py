@@ -31,14 +31,14 @@ class Parameter:
     """One parameter of an effect.
 
     Args:
-        unit: ``1`` for dimensionless.
-        lower, upper: physical range; an estimate outside it contradicts the effect.
+        unit: ``1`` for a dimensionless parameter.
+        lower, upper: bounds of the physical range. An estimate outside this range contradicts the effect.
         typical: a usual value, used for screening and as the starting value of fits.
-        kind: at its ``null``, an ``amplitude`` switches the effect off. A ``shape`` (a length, a position)
-            has no meaning while all amplitudes are null. A ``choice`` is a shape with few possible values
-            (a direction) that is never fitted.
+        kind: an ``amplitude`` switches the effect off when it equals its ``null``. A ``shape`` (such as a
+            length or a position) has no meaning while all amplitudes are switched off. A ``choice`` is a
+            shape with few possible values (such as a direction) and is never fitted.
         null: value of an amplitude at which the effect changes nothing.
-        tried: values that screening tries; if empty, it tries ``typical``.
+        tried: values that screening tries; if there are none, screening tries ``typical``.
     """
 
     unit: str
@@ -51,7 +51,7 @@ class Parameter:
 
     @property
     def off(self) -> float:
-        """Return the value this parameter has while its effect is off."""
+        """Return the value that this parameter has while its effect is off."""
         return self.null if self.kind == "amplitude" else self.typical
 
     @property
@@ -72,14 +72,14 @@ class FieldContext:
         field_centre_um: (y, x) of this field's centre in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
         slow_axis: axis perpendicular to the written lines.
-        order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
+        order: position of this field in the writing order, scaled so that the dataset spans -0.5 to 0.5.
         scan_shape: (rows, columns) of the whole scan, if this field is only a part of a scan.
         origin_px: (row, column) of this field's first pixel in the whole scan.
-        quarter_turns: number of quarter turns (as by ``rot90``) by which the array was rotated under the
-            microscope.
+        quarter_turns: number of quarter turns by which the print was rotated under the microscope, counted as
+            in ``rot90``.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip.
-        pixel_size: pixel size relative to that of the other scans, by which lags in time are scaled.
+        pixel_size: pixel size relative to that of the other scans. Lags in time are scaled by this ratio.
         dose: dose relative to the recipe, already contained in ``layout_um``.
     """
 
@@ -101,7 +101,9 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return what ``make`` computes from the field alone; it is computed once and cached."""
+        """Return a quantity that depends only on the field; ``make`` computes it once, and the result is
+        cached.
+        """
         if name not in self._kept:
             self._kept[name] = make(self)
         return self._kept[name]
@@ -123,7 +125,9 @@ class FieldContext:
         )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
-        """Return each pixel's position from the centre of the write field: shapes (y, 1) and (1, x), µm."""
+        """Return the position of each pixel relative to the centre of the write field, µm: shapes (y, 1) and
+        (1, x).
+        """
         rows, columns = self._pixels()
         (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
         return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
@@ -133,7 +137,9 @@ class FieldContext:
         return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
-        """Return each pixel's position, from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
+        """Return the position of each pixel, which runs from -1 to 1 over the whole scan: shapes (y, 1) and
+        (1, x).
+        """
         rows, columns = self._pixels()
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
         return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
@@ -145,8 +151,8 @@ class FieldContext:
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
-        """Return half the write field, or half the longer side of this field if the card states no write
-        field.
+        """Return half the width of the write field. If the card states no write field, return half the longer
+        side of this field.
         """
         if self.field_radius_um is not None:
             return self.field_radius_um
@@ -171,22 +177,24 @@ class Effect:
 
     Args:
         name: the identifier used in code, JSON and on the command line.
-        title: short description that a process engineer understands.
-        stage, role: stage of the process, and whether the effect may enter the exported process model.
-        acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
-        parameters: name to ``Parameter``; at least one amplitude.
-        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm; ``of_single_scans``
-            for per-scan effects.
-        trials: parameter sets that screening compares with the null values. By default it tries one amplitude
-            at a time, at each of its ``tried`` values and for each combination of shapes.
+        title: short description for a process engineer.
+        stage: stage of the process.
+        role: whether the effect may become part of the exported process model.
+        acts_on: ``layout``, the input of the base model, or ``height``, its output; both are in µm.
+        parameters: mapping from name to ``Parameter``, with at least one amplitude.
+        apply: pure function (field, values, context) -> field; both fields have the shape (b, 1, y, x) and
+            are in µm. For per-scan effects, it is ``of_single_scans``.
+        trials: parameter sets that screening compares with the null values. By default, screening tries one
+            amplitude at a time, at each of its ``tried`` values and for each combination of shapes.
         source: source of the formula.
         separating: experiment that distinguishes this effect from similar effects.
         needs: what a test of the effect requires: a known order of the scans, or a microscope with a probe.
         reverses: parameters whose sign is opposite on retrace lines.
         of_tip: whether a new tip removes this effect.
-        of_films: whether this effect moves the edges of a film seen from above. Other effects change heights.
-        knowledge: for a cause, the physical cause is known; for a law, only a formula; for a description,
-            only a covariate.
+        of_films: true if this effect moves the edges of a film seen from above, and false if it changes
+            heights.
+        knowledge: what is known about the effect: the physical cause for a ``cause``, only a formula for a
+            ``law``, and only a covariate for a ``description``.
     """
 
     name: str
@@ -232,20 +240,21 @@ class Effect:
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the parameters at which the effect is off, with the given ones replaced.
+        """Return the values of all parameters; those that are not given have the values at which the effect
+        is off.
 
         Raises:
-            InputError: a name this effect does not have.
+            InputError: a name that is not a parameter of this effect.
         """
         for name in values:
             require_known(f"parameter of {self.name}", name, self.parameters)
         return {**self.off_values(), **values}
 
     def require_in_range(self, values: Mapping[str, float]) -> None:
-        """Refuse values that this effect cannot have.
+        """Check that all values are within their physical ranges.
 
         Raises:
-            InputError: a name this effect does not have, or a value outside its physical range.
+            InputError: a name that is not a parameter of this effect, or a value outside its physical range.
         """
         for name, value in self.with_values(values).items():
             limits = self.parameters[name]
@@ -262,12 +271,12 @@ class Effect:
         context: FieldContext,
         scanned: bool = False,
     ) -> Tensor:
-        """Apply the effect. Numbers become tensors on the array's device; parameters that are not given are
-        off.
+        """Apply the effect. Numbers are converted to tensors on the device of the array. Parameters that are
+        not given have the values at which the effect is off.
 
         Args:
-            scanned: apply it as an effect of the microscope: in the frame and direction of the scan, and
-                with the tip of the scan.
+            scanned: whether to apply the effect as one of the microscope, which depends on the orientation,
+                the direction and the tip of the scan.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
@@ -293,8 +302,8 @@ def entry(
     acts_on: ActsOn,
     **facts: Any,
 ) -> Callable[[Apply], Effect]:
-    """Make a decorator that turns a formula into an effect of the same name; ``facts`` are other fields of
-    ``Effect``.
+    """Make a decorator that turns a formula into an effect of the same name. ``facts`` sets the other fields
+    of ``Effect``.
     """
 
     def of_formula(apply: Apply) -> Effect:

@@ -31,8 +31,8 @@ _SLICED_REACH_UM = 0.8
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Make the spot elliptical: T = exp(-2 π² f' C f), where C changes the spot's second moments by the given
-    Cxx - Cyy and 2 Cxy.
+    """Make the spot elliptical: T = exp(-2 π² f' C f), where C is added to the second moments of the spot.
+    The parameters are Cxx - Cyy and 2 Cxy.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -50,11 +50,13 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
         "weight": Parameter("1", -0.3, 1.5, 0.1),
         "length_um": Parameter("µm", 0.6, 10.0, 2.0, "shape", tried=(1.0, 2.0, 4.0, 8.0)),
     },
-    source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
+    source="proximity sum of two Gaussians, as in electron-beam writing; weights may be negative",
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that leaks in from the neighbourhood within b: D = (M + η G_b * M) / (1 + η)."""
+    """Add the dose that leaks in from the neighbourhood: D = (M + η G_b * M) / (1 + η), where G_b is a
+    Gaussian of standard deviation b.
+    """
     weight, length = values["weight"], values["length_um"]
     blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -67,7 +69,7 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise the dose to a power: D = M_ref (M / M_ref)^p, where 1 % of M_ref is first added to M, so that the
+    """Raise the dose to a power: D = M_ref (M / M_ref)^p. Beforehand, 1 % of M_ref is added to M, so that the
     slope at M = 0 stays finite.
     """
     foot = 0.01
@@ -85,14 +87,15 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
         "steepness": Parameter("1", 4.0, 40.0, 12.0, "shape"),
     },
     acts_on="height",
-    source="slicing of the paper, 0.1 µm; threshold per slice",
-    separating="pillars and pits of one width and several heights, one slice and many",
+    source="slices of 0.1 µm, as in the paper, with a threshold applied to each slice",
+    separating="pillars and pits of one width and several heights, from one slice to many",
 )
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Cure slices of height t separately: (1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M.
+    """Cure slices of height t separately: G*M becomes (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The step is a logistic function about the threshold, scaled to map 0 to 0 and 1 to 1. A slice that is
-    narrower than the spot is lost, and a gap narrower than the spot is filled.
+    The difference is added to the height. The step is a logistic function about the threshold, scaled to map
+    0 to 0 and 1 to 1. A slice that is narrower than the spot is lost, and a gap narrower than the spot is
+    filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed

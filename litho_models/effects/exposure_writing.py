@@ -43,8 +43,8 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Change the height by focus and stage tilt over the field: H + 1[M > 0] (a x + b y + c r²), coordinates
-    in units of R.
+    """Change the height by focus and stage tilt over the field: H + 1[M > 0] (a x + b y + c r²), with
+    coordinates in units of R.
     """
     y, x = context.centred_um()
     radius = context.radius_um()
@@ -77,14 +77,14 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
         "length_um": Parameter("µm", 0.3, 3.0, 1.5, "shape"),
     },
     acts_on="height",
-    source="search of the interface before writing; clipping at the substrate",
+    source="the printer searches for the interface before writing; heights are clipped at the substrate",
     separating="leave bare substrate in every field",
 )
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Remove the part written below the substrate H_s: max(H - z, H_s) where H > H_s.
+    """Remove the part that was written below the surface H_s of the substrate: max(H - z, H_s) where H > H_s.
 
-    The lost part shrinks as the print does: z = z0 (1 - k (1 - u)), where u is the mean relative nominal
-    height nearby.
+    The lost part, of height z, shrinks like the print: z = z0 (1 - k (1 - u)), where u is the mean nominal
+    height nearby as a fraction of the full height.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -102,7 +102,9 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the beam lag: filter with a one-sided exponential of length l = v τ, without its mean delay."""
+    """Let the beam lag: filter the layout with a one-sided exponential of length l = v τ, whose mean delay is
+    removed.
+    """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
@@ -122,8 +124,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (or lengthen it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula gives the correct area that an edge loses. It does not give the shape of the edge, which
-    depends on the spot, because the spot is wider than δ.
+    The formula is correct for the area that an edge loses, but not for the shape of the edge. The shape is
+    determined by the spot, which is wider than δ.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -136,10 +138,11 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
     separating="scan each print at 0 and 90 degrees; scan a calibration grating",
 )
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), x from the centre of a field of half width r.
+    """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), with x from the centre of a field of half width
+    r.
 
-    Over a write field of half width R, the displacement is c x (1 - x / 2R) without the part that
-    registration removes.
+    Over a write field of half width R, the displacement is c x (1 - x / 2R). The part of it that registration
+    removes is left out.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -187,14 +190,15 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
     },
     role="nuisance",
     acts_on="height",
-    source="ripples of the paper's noise figure, at 0.1 µm pitch",
+    source="ripples in the noise figure of the paper, at a pitch of 0.1 µm",
     separating="rescan at 25 nm per pixel",
 )
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add ripples at the hatching pitch p, seen as their alias: H + 1[M > 0] (a cos 2π f y + b sin 2π f y).
+    """Add ripples at the hatching pitch p, which appear at their alias frequency f: H + 1[M > 0] (a cos 2π f
+    y + b sin 2π f y).
 
-    Sampled with pixels dx, the ripples appear at f = |1/p - 1/dx|. The write field fixes the phase of the
-    ripples, which is the same in every print.
+    For pixels of size dx, this frequency is f = |1/p - 1/dx|. The write field fixes the phase of the ripples,
+    which is the same in every print.
     """
     y, x = context.centred_um()
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)

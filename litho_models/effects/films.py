@@ -1,6 +1,6 @@
 """Effects and laws of films: they move the edges of a written, developed or etched film, seen from above.
 
-Lengths are in pixels of the layout, which resolve the beam or lens of the machine.
+Lengths are in pixels of the layout. These pixels are fine enough for the resolution of the beam or lens.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ _of_films = partial(entry, role="process", of_films=True)
     separating="write one feature alone and inside dense surroundings of three sizes",
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that the substrate scatters back into the film within b: D = (M + η G_b * M) / (1 + η)."""
+    """Add the dose that the substrate scatters back into the film: D = (M + η G_b * M) / (1 + η), where G_b
+    is a Gaussian of standard deviation b.
+    """
     weight, length = values["weight"], values["length_px"]
     blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
     return layout + weight / (1 + weight) * (blurred - layout)
@@ -47,7 +49,7 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     {"variance_px2": Parameter("px²", 0.0, 150.0, 8.0, tried=(8.0, 45.0))},
     stage="resist",
     acts_on="height",
-    source="acid or reactants that diffuse in a resist of high contrast, then a threshold at one half",
+    source="acid or reactants diffuse in a resist of high contrast, which has a threshold at one half",
     separating="write necks and islands of five widths, at two baking times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -69,7 +71,7 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     stage="development",
     acts_on="height",
     source="lateral etching at a constant rate, the same at every dose and in every surrounding",
-    separating="write one layout at five doses: a bias is the same at each",
+    separating="write one layout at five doses; a bias does not depend on the dose",
 )
 def etch_bias(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Move edges outwards by the bias."""
@@ -94,7 +96,7 @@ edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards in dense places and inwards in sparse ones, by the shift times 2 M̄ - 1."""
+    """Move edges outwards by the shift times 2 M̄ - 1, so that edges in sparse places move inwards."""
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
     return _moved(height, values["bias_px"] * (2 * nearby[0, 0] - 1), context)
@@ -104,7 +106,9 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
-    """Move edges along their normals: each pixel gets the film's value at this distance inwards."""
+    """Move edges along their normals: each pixel takes the value that the film has ``outwards_px`` further
+    inwards.
+    """
     normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
     along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
     steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)

@@ -26,7 +26,8 @@ def add_filtered(
 
     Args:
         field: (b, 1, y, x).
-        transfer_minus_one: (fy, fx) in cycles/µm, shapes (y, 1) and (1, x/2 + 1) -> T(f) - 1.
+        transfer_minus_one: function that returns T - 1 at the frequencies fy (y, 1) and fx (1, x/2 + 1), in
+            cycles/µm.
         pitch_um: sampling, µm.
         reach_um: half the support of the kernel. The field is continued by this length beyond its edges, as
             in the base models.
@@ -54,7 +55,9 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
 
 
 def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
-    """Return the mean relative nominal height within that length of each pixel (1, 1, y, x)."""
+    """Return the mean nominal height around each pixel, (1, 1, y, x), as a fraction of the full height. The
+    mean has Gaussian weights with the standard deviation ``length_um``.
+    """
     relative = context.layout_um / context.full_height_um
     return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
 

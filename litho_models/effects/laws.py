@@ -40,10 +40,9 @@ _SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y
 
 @dataclass(frozen=True)
 class Surface:
-    """Compute the quantities that the formulas contain, from a field h (b, 1, y, x), µm, its context, and the
-    law's parameters.
+    """Compute the quantities in the formula of a law from a field, its context and the parameters of the law.
 
-    ``h`` is the height or, for a law of the exposure, the dose expressed as nominal height.
+    ``h`` (b, 1, y, x), µm, is the height or, for a law of the exposure, the dose expressed as nominal height.
     """
 
     h: Tensor
@@ -70,7 +69,9 @@ class Surface:
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return x, y, r² or the closeness to the scan's edge, e^(-distance / length), of each pixel."""
+        """Return x, y, r² or ``rim`` at each pixel; ``rim`` is e^(-distance / length) for the distance to the
+        edge of the scan.
+        """
         y, x = self.context.scan_position()
         if word == "rim":
             sides_um = (self.context.pitch_um * (size - 1) / 2 for size in self.context.whole_shape())
@@ -79,15 +80,17 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step along an axis of the scan: 0 before the law's position, 1 beyond this position, and
-        linear within one pixel.
+        """Return a step along an axis of the scan: 0 before the position of the law and 1 beyond it, with a
+        linear rise over one pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
     def mean(self, of: Tensor | None = None) -> Tensor:
-        """Return the Gaussian-weighted mean of a map (by default the height) within the law's length."""
+        """Return the Gaussian-weighted mean of a map (by default the height); the length of the law is the
+        standard deviation.
+        """
         field, reach = self.h if of is None else of, self.values["length_um"]
         return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
@@ -196,7 +199,7 @@ def _displaced(name: str, formula: str, axis: str, way: str) -> Facts:
 
 
 def _beside(name: str, *sides: str) -> Facts:
-    formula = f"mean of D {' and '.join(sides)} over the length - D"
+    formula = f"(mean of D {' and '.join(sides)} over the length) - D"
     return name, formula, "µm", lambda s: s.trailing(*sides) - s.h
 
 
@@ -221,8 +224,8 @@ def _law(
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
-    """Make a wave: in the dose it describes slices, in the height standing waves of light. The wave is zero
-    where the field is zero.
+    """Make a wave law. A wave in the dose describes slices, and a wave in the height describes standing waves
+    of light. The wave is zero where the field is zero.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -233,7 +236,7 @@ def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
     frequency = Parameter("1/µm", lowest, highest, 5.0, "shape", tried=tried)
     parameters = {"sine_um": amplitude, "cosine_um": amplitude, "frequency_per_um": frequency}
     return _nameless(
-        f"{_FIELD[on]}-wave", "a wave in its own value, sin(2π f h + phase)", parameters, apply, on
+        f"{_FIELD[on]}-wave", f"a wave in the {_FIELD[on]} itself, sin(2π f h + phase)", parameters, apply, on
     )
 
 
@@ -248,9 +251,9 @@ def _nameless(
         acts_on=on,
         parameters=parameters,
         apply=apply,
-        source="found in the residual; h and the dose D in µm, h̄ the Gaussian mean of h over a length; "
-        "x and y from -1 to 1 over the scan, r² = x² + y², rim = e^(-distance to the edge / length), the "
-        "order t from -0.5 to 0.5; slopes and sides are along axes rotated by turn_deg",
+        source="found in the residual. h and the dose D are in µm; h̄ is the Gaussian mean of h over a "
+        "length. x and y run from -1 to 1 over the scan; r² = x² + y², and rim = e^(-distance to the edge / "
+        "length). The order t runs from -0.5 to 0.5. Slopes and sides are along axes rotated by turn_deg",
         separating=_TURNED,
         knowledge="law",
     )
@@ -282,8 +285,8 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add a weighted sum of the height differences to displaced positions; the field is continued beyond its
-    edge.
+    """Add a weighted sum of the differences between the heights at displaced positions and the height of the
+    pixel. The field is continued beyond its edge.
     """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)

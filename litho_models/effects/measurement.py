@@ -35,8 +35,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """Let the probe lag along the fast axis: z += (H - z) / (1 + l / dx), without the mean delay.
 
     The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
-    If ``rising`` is 1, the probe is a linear filter. Below 1, the probe parachutes off falling edges. The
-    delay is a constant time, so smaller pixels make the length shorter.
+    If ``rising`` is 1, the probe acts as a linear filter. If it is below 1, the probe parachutes off falling
+    edges. The delay is a constant time, so smaller pixels make the length shorter.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -63,7 +63,7 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     """Let the scanner run fast in the middle of a line: H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the
     scan.
 
-    The displacement is c x (1 - x / L) without its mean, because registration removes a mean shift.
+    The displacement is c x (1 - x / L) minus its mean, because registration removes a mean shift.
     """
     y, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -73,7 +73,7 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 @of_microscope(
     "blur of the finished scan",
     {"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025, tried=(0.0025, 0.04))},
-    source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
+    source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes have slower filters",
     separating="register with two interpolation kernels; scan with half the pixel size",
 )
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -108,7 +108,8 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """Dilate the surface by a paraboloid tip: max over u of H(x - u) - u² / 2R; to first order H + R |grad
     H|² / 2.
 
-    A tip may be sharper along or across the scan lines; ``along`` and ``across`` are shares of R.
+    A tip may be sharper along or across the scan lines: its radii in these directions are ``along`` × R and
+    ``across`` × R.
     """
     radius = values["radius_um"]
     # The formula divides by the radius, so the change is scaled linearly to zero for very sharp tips.
@@ -123,8 +124,8 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     """Dilate rows (..., x) by a parabola; the surface is linear between half pixels.
 
-    The tip touches a linear piece of slope s at the distance R s from the tip's axis or, if this point is not
-    on the piece, at the piece's nearest end.
+    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point is not
+    on the piece, the tip touches the end of the piece that is nearest to this point.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)

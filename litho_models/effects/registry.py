@@ -26,7 +26,7 @@ EFFECTS = (
         acts_on="height",
         parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
         apply=of_single_scans,
-        source="arXiv:2309.17343, line-like noise along the hatching; random, so no model predicts it",
+        source="arXiv:2309.17343: line-like noise along the hatching, too random for any model to predict",
         separating="scan the same field at 0 and 90 degrees",
     ),
     _of_microscope(
@@ -77,7 +77,7 @@ EFFECTS = (
         "slow-drift",
         "creep after the scan starts",
         parameters={name: Parameter("µm", -1.0, 1.0, 0.03) for name in CREEP_DECAYS},
-        source="exponential creep of the scanner; its slow part lies in the bow",
+        source="exponential creep of the scanner; the bow contains the slow part of the creep",
         separating="scan the same field twice in a row, downwards and upwards",
     ),
 )
@@ -85,9 +85,9 @@ EFFECTS = (
 
 # Effects of the catalogue that are not visible in a residual map on the layout's grid.
 UNTESTABLE = {
-    "min-to-zero-datum": "it is an order statistic of each scan; datum-offset covers its effect",
+    "min-to-zero-datum": "it shifts each scan by the lowest height of the scan; datum-offset covers it",
     "quantisation": "the raw files are not in the store",
-    "scars-and-spikes": "it is a mask, not a term; the loop looks for it among the outliers",
+    "scars-and-spikes": "they are masked, not modelled; the loop looks for them among the outliers",
 }
 
 # Per-scan effects are not included here, because they are never part of a model.
@@ -135,12 +135,12 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     """Add an effect to the catalogue as a candidate of the loop, and return it.
 
     Args:
-        effect: the effect; a per-scan effect (``apply`` is ``of_single_scans``) also needs a scan term, see
-            ``litho_models.scan_terms.register_scan_term``.
+        effect: the new effect. A per-scan effect (one whose ``apply`` is ``of_single_scans``) also needs a
+            scan term; see ``litho_models.scan_terms.register_scan_term``.
         after: the effect after which the new effect acts; by default the last effect of its stage.
 
     Raises:
-        InputError: a name that is taken, or no effect called ``after``.
+        InputError: the name is already taken, or there is no effect named ``after``.
     """
     if effect.name in {**CATALOGUE, **_NAMELESS}:
         raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
@@ -154,7 +154,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
 
 
 def get_effect(name: str) -> Effect:
-    """Return the effect of that name.
+    """Return the effect with this name.
 
     Raises:
         InputError: no such effect.
@@ -182,7 +182,8 @@ def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
     """Return the effects that screening tests. Their parameters are common to all scans.
 
     Args:
-        tip_radius_um: radius of the tip or its upper bound, if the store states one; it is tried in addition.
+        tip_radius_um: radius of the tip, or an upper bound for it, if the store states one. Screening also
+            tries this radius.
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:

@@ -25,7 +25,9 @@ _OF_NARROW = {
     separating="step edges of two heights, scanned with two pixel sizes and a new tip",
 )
 def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Blur H by an isotropic Gaussian of variance s², as reactants that diffuse after the exposure do."""
+    """Blur H by an isotropic Gaussian of variance s², which describes reactants that diffuse after the
+    exposure.
+    """
     return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
 
@@ -89,8 +91,8 @@ def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) ->
     separating="print the same height inside low and high surroundings; a power sweep",
 )
 def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean relative
-    nominal height nearby.
+    """Shrink the print more where its surroundings are thin: H (1 - k (1 - u)), where u is the mean nominal
+    height nearby as a fraction of the full height.
     """
     return height * (1 - values["fraction"] * (1 - dose_nearby(context, values["length_um"])))
 
@@ -98,11 +100,11 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 @of_development(
     "tops shrinking towards the centre of the field",
     {"fraction": Parameter("1", 0.0, 0.1, 0.005)},
-    source="print bound to the substrate at its base, free at its top",
+    source="the print is bound to the substrate at its base but free at its top",
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink tops inwards more than bases: H(r + s H(r) / full r), r from the centre of the field.
+    """Shrink tops inwards more than bases: H(r + s H(r) / full r), with r from the centre of the field.
 
     Shrinkage at the mean height is a change of magnification, which registration removes. A scan therefore
     shows at x the point at r = x / (1 + s mean / full).
@@ -192,7 +194,7 @@ def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
         for turn in (0.0, 45.0)
         for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
     ),
-    source="empirical: loss by a power of the slope, with an ellipse of coefficients in a rotated frame",
+    source="empirical: the loss is a power of the slope, with an ellipse of coefficients in rotated axes",
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:

@@ -55,8 +55,8 @@ def benchmark(
     workers: int = 1,
     dask: str | None = None,
 ) -> Benchmark:
-    """Cross-validate ``models``: fold by fold, train each model on the other folds and score it on this one.
-    Write ``benchmark.json``, a report and CSV tables.
+    """Cross-validate ``models``: for each fold, train each model on all other folds and score it on this
+    fold. Write ``benchmark.json``, a report and CSV tables.
 
     Args:
         store: dataset store.
@@ -81,9 +81,9 @@ def benchmark(
             instead.
 
     Raises:
-        InputError: no model, an unknown or repeated model, a store that cannot be read or is too small for
-            the split or the lock box, too many first folds, a noise analysis of other data, a damaged cache,
-            or an ``out`` that holds a benchmark with more models or scans than this one.
+        InputError: models are missing, unknown or repeated; the store cannot be read, or is too small for the
+            split or the lock box; there are too many first folds; the noise analysis is of other data; the
+            cache is damaged; or ``out`` holds a benchmark with more models or scans than this one.
     """
     require_models(models)
     dataset = open_store(store)

@@ -58,8 +58,8 @@ def evaluate(
         open_lock_box: also score the locked scans of the prints that the model was trained on.
 
     Raises:
-        InputError: a model or store that cannot be read, geometries that differ, or a noise analysis of
-            other data.
+        InputError: the model or the store cannot be read, their geometries differ, or the noise analysis is
+            of other data.
     """
     dataset = open_store(store)
     film = dataset.instrument == "sem"

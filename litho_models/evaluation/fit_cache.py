@@ -32,10 +32,10 @@ from litho_models.splits.folds import Fold
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training scans and on held-out scans.
 
-    Each error is the mean over scans of the datum-free error of policy ``offset``, without a background.
-    Differences between the three errors therefore show over-fitting. ``inner_validation_nm`` is None without
-    validation scans. ``measurement`` is the measurement model learned with the fit, if it was removed from
-    the training scans.
+    Each error is the datum-free error of the policy ``offset``, averaged over scans and computed without a
+    background. Differences between the three errors therefore show over-fitting. ``inner_validation_nm`` is
+    None without validation scans. ``measurement`` is the measurement model learned with the fit, if it was
+    removed from the training scans.
     """
 
     background: Background
@@ -99,8 +99,8 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the predicted scan: the printed height (ny, nx), µm, with the measurement model or background
-    that the training scans share.
+    """Return the predicted scan: the printed height (ny, nx), µm, combined with the measurement model or the
+    background learned from the training scans.
     """
     found = record.diagnostics
     if background == "none":

@@ -34,7 +34,7 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
         (0.17, "each scan's own terms fitted", 1.0, "leading"),
     ]
     if scores[0].seen_by == "sem":
-        bars, floor_nm = [(0.0, "distance of predicted from measured edges", 1.0, "leading")], None
+        bars, floor_nm = [(0.0, "distance between predicted and measured edges", 1.0, "leading")], None
     for shift, label, strength, error in bars:
         means = np.array([getattr(s, f"{error}_nm") for s in scores])
         axes.barh(position + shift, means, 0.32, color=colours, alpha=strength)

@@ -23,9 +23,10 @@ _OF_FIT = (
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
-    "leave-one-print-out": "all scans of one print are held out together; scans of the lock box never are",
-    "paper": "a random quarter of the quadrants is held out. Quadrants of one scan are in both training and "
-    "test set, so errors are too small: use this split only for comparison with the paper",
+    "leave-one-print-out": "all scans of one print are held out together; scans of the lock box are in no "
+    "fold",
+    "paper": "a random quarter of the quadrants is held out. The training set and the test set both contain "
+    "quadrants of the same scans, so errors are too small: use this split only for comparison with the paper",
 }
 
 
@@ -89,8 +90,9 @@ def write_benchmark_report(
     page.heading("Training", folded=True)
     page.table(
         result.fits,
-        "Training time of every fit, and its errors on training, inner-validation and held-out scans, whose "
-        "differences show over-fitting. No background is used; the zero height of each scan is fitted.",
+        "Training time of every fit, and errors of the fitted model on training, inner-validation and "
+        "held-out scans. Differences between these errors show over-fitting. No background is used, and the "
+        "zero height of each scan is fitted.",
         "fits.csv",
         digits=3,
         columns=_OF_FIT,

@@ -73,7 +73,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     the first is better.
 
     Raises:
-        InputError: files that cannot be read; results with different data, folds, scans or nuisances; or only
+        InputError: a file cannot be read; the results have different data, folds, scans or nuisances; or only
             one of the models was trained on scored scans.
     """
     import pandas as pd
@@ -99,9 +99,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Return the facts that must agree between this result and one compared with it, and its scores by
-    model.
-    """
+    """Return the facts that must be the same in two compared results, and this result's scores by model."""
     file = Path(path)
     if file.is_dir():
         names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]

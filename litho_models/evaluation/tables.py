@@ -26,8 +26,8 @@ def headline_table(
     """Return one row per model, with both errors and their confidence intervals, the excess over the noise
     floor, the RMS error and the bias.
 
-    The last row is the noise floor, computed in each column with the same scan terms as the errors. For films
-    the table lists errors of edges and features instead.
+    The last row is the noise floor. In each column, it is computed with the same scan terms as the errors.
+    For films the table lists errors of edges and features instead.
     """
     import pandas as pd
 
@@ -75,8 +75,8 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """Return one row per model and background and one column per policy. The policy with line offsets has a
-    second column, the number of terms.
+    """Return one row per model and background and one column per policy. For the policy with line offsets, a
+    second column states the number of terms.
 
     The last row is the noise floor under each policy.
     """

@@ -75,7 +75,8 @@ class CheckpointFolder:
     """A folder that always contains the last complete checkpoint; ``key`` names the run to which it belongs.
 
     Raises:
-        InputError: the folder holds a checkpoint of another model, configuration or data, or a damaged one.
+        InputError: the checkpoint in the folder is damaged, or belongs to another model, configuration or
+            dataset.
     """
 
     def __init__(self, path: str | Path, key: str):

@@ -47,7 +47,10 @@ class TrainingConfig(Record):
     )
     batch: int = Field(4, ge=1, le=_MOST, description="crops per step")
     crop_px: int = Field(
-        128, ge=8, le=_MOST, description="scored side of a crop, px; a model on tiles uses its tile size"
+        128,
+        ge=8,
+        le=_MOST,
+        description="side of the scored part of a crop, px; models on tiles use their tile size",
     )
     crops: Literal["random", "quadrants"] = "random"
     optimiser: Literal["adamw", "adam"] = "adamw"
@@ -64,9 +67,10 @@ class TrainingConfig(Record):
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
         """Return the settings of a named recipe for a model; ``settings`` override individual fields.
 
-        ``paper``: Adam, batch 4, L1, 4,000 epochs of 72 quadrants, the paper's learning rates, no per-scan
-        terms. ``fast``: AdamW with a one-cycle schedule, random crops, per-scan terms fitted jointly, and
-        ``FAST_STEPS``, or ``FAST_CHAIN`` for the default PBL.
+        The recipe ``paper`` minimises the L1 loss with Adam, in batches of 4, over 4,000 epochs of 72
+        quadrants. It uses the learning rates of the paper and no per-scan terms. The recipe ``fast`` uses
+        AdamW with a one-cycle schedule, random crops and jointly fitted per-scan terms. Its number of steps
+        is in ``FAST_STEPS``; ``FAST_CHAIN`` contains the settings of the default PBL.
 
         Raises:
             InputError: unknown recipe.

@@ -63,8 +63,8 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
     """Group the windows of a step; the groups go through the network one after the other.
 
-    On a CPU a group has at most ``_PASS_PX`` pixels, or one window. This limits the memory and takes no extra
-    time. On other devices all windows form one group.
+    On a CPU, a group has at most ``_PASS_PX`` pixels, unless one window is larger. This limits the memory and
+    takes no extra time. On other devices all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":

@@ -36,7 +36,7 @@ class FitFacts(Record):
     """The scans on which a model was trained and validated, its number of parameters, and the time of the
     fit.
 
-    ``at_bounds`` lists the fitted values that lie on a bound of their range, each with that bound.
+    ``at_bounds`` maps each fitted value that lies on a bound of its range to this bound.
     """
 
     parameters: int
@@ -122,8 +122,8 @@ def fit_in_cache(
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Return the heights that a small model fitted to the scans predicts. They give the first estimate of the
-    scan terms for a network.
+    """Fit a small model to the scans, and return the heights that it predicts. The first scan terms of a
+    network are estimated from these heights.
     """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":

@@ -1,9 +1,10 @@
 """Fit small models by least squares: a damped Gauss-Newton method that also solves for the terms of each
 scan.
 
-The loss is a sum of squares, or of absolute values, minimised as squares with the weights 1/sqrt(r² + δ²). A
-``Problem`` provides the residuals and derivatives of a model (one of the zoo, or the loop's model with
-effects), and the ``room``: the smallest and largest allowed step of each parameter.
+The loss is a sum of squares or a sum of absolute values. Absolute values are minimised as squares with the
+weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals and derivatives of a model: a model of the zoo,
+or the model of the loop with its effects. It also provides the ``room``: the smallest and largest step
+allowed for each parameter.
 """
 
 from __future__ import annotations
@@ -62,15 +63,17 @@ class Rules:
 
     Attributes:
         loss: the quantity that is minimised.
-        term_weight: with ``squares``, the weight of the part of a residual that scan terms can explain. It is
-            large enough to determine the common part of the terms (the datum) and small enough that no scan
-            biases the parameters.
+        term_weight: with ``squares``, the weight of the part of a residual that scan terms can explain. This
+            weight is large enough to determine the common part of the terms, which is the datum. It is small
+            enough that no single scan biases the parameters.
         pinned: with ``absolute``, the number of leading scan terms whose mean over the scans is held at zero.
-        steps: largest number of steps; ``relative_gain``: a smaller gain of one step ends the fit.
-        tries: attempts at one step, each with ten times the damping of the previous one; ``lowest_damping``:
-            lower limit on the damping.
+        steps: largest number of steps.
+        relative_gain: the fit ends after a step that gains less than this fraction of the loss.
+        tries: largest number of attempts at one step. Each attempt has ten times the damping of the previous
+            one.
+        lowest_damping: lower limit on the damping.
         kept_above: derivatives are reused while the gain of a step is at least this fraction of the predicted
-            gain; with None they are never reused.
+            gain. With None, they are never reused.
     """
 
     loss: Loss
@@ -142,8 +145,8 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations, with rows for the parameters, then for the terms of each scan, and last for the
-    conditions that pin leading terms.
+    """Normal equations. The first rows are those of the parameters, the next are those of the scan terms, and
+    the last are the conditions that pin leading terms.
 
     With ``squares``, the terms of the scans are eliminated, and only rows for the parameters remain.
     """
@@ -179,7 +182,9 @@ class NormalEquations:
         return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
 
     def solve(self, damping: float, room: Room | None) -> tuple[Array, Array]:
-        """Return the changes of the parameters within their room, and of the terms (scans, k)."""
+        """Return the step of the parameters, which stays within their room, and the changes of the terms
+        (scans, k).
+        """
         count = self.count
         if room is not None:
             step = solve_damped(*self._parameters_only(), damping, room)
@@ -210,8 +215,8 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Return by how much the normal equations, (p, p) and (p,), predict that a step (p,) reduces the sum of
-    squares.
+    """Return the reduction of the sum of squares that the normal equations, (p, p) and (p,), predict for a
+    step (p,).
     """
     return float(2 * right @ step - step @ matrix @ step)
 
@@ -256,7 +261,7 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
     Args:
         normal, right: A (p, p), positive semi-definite, and b (p,).
         damping: relative to the diagonal.
-        room: lowest and highest allowed x, (p,) each; no limits by default.
+        room: lowest and highest allowed x, two arrays (p,); by default, there are no limits.
     """
     diagonal = np.diag(normal).copy()
     floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
@@ -293,7 +298,7 @@ def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
 
 
 def gram_inside(columns: Array, basis: Array) -> Array:
-    """Return the inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
+    """Return the inner products (m, m) of the columns after projection onto an orthonormal basis (n, k)."""
     inside = basis.T @ columns
     return inside.T @ inside
 

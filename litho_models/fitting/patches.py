@@ -1,4 +1,4 @@
-"""Draw patches from a store for your own training loop, as a PyTorch ``Dataset`` without the locked scans."""
+"""Draw patches for your own training loop from the unlocked scans of a store, as a PyTorch ``Dataset``."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,7 +41,7 @@ class PatchDataset(Dataset[Patch]):
         size_px: side s of a patch; ``margin_px``: width m of the margin.
         per_scan: number of patches from each scan.
         ids: scans to draw from; by default all that are not locked.
-        seed: decides the positions of the patches.
+        seed: seed of the random positions of the patches.
 
     Raises:
         InputError: unknown or locked ids, or a patch that is larger than a scan.
@@ -61,7 +61,9 @@ class PatchDataset(Dataset[Patch]):
         self._layouts_um = [scan.layout_um for scan in self._scans]
         smallest = min(min(scan.shape) for scan in self._scans)
         if not 1 <= size_px <= smallest:
-            raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, a scan's side")
+            raise InputError(
+                "size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the shortest side of a scan"
+            )
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
             raise InputError(

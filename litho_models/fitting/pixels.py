@@ -28,8 +28,8 @@ EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """The fitted pixels of one scan: features (n, all), measured height minus the height of the chain (n,)
-    µm, and the scan's own terms (m, n).
+    """The fitted pixels of one scan: the features of all networks (n, k), the measured height minus the
+    height that the chain predicts (n,), µm, and the maps of the scan terms (m, n).
     """
 
     features: Tensor
@@ -94,8 +94,8 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """Return the heights that the networks should add at all pixels, (all n,) µm, after the scan terms are
-    removed.
+    """Return the heights that the networks should add at the fitted pixels, one vector for all scans, µm. The
+    scan terms are removed from these heights.
     """
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]

@@ -9,8 +9,8 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Join the processes of torchrun with gloo on CPUs, or with NCCL on GPUs, where each process uses a
-    separate GPU.
+    """Join the processes of torchrun. They use gloo on CPUs and NCCL on GPUs; on GPUs, each process has its
+    own GPU.
 
     Returns:
         The number of this process, counted from 0, and the number of processes.

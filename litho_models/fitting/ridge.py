@@ -32,7 +32,7 @@ _TERM_WEIGHT = 1e-3
 
 
 def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
-    """Fit the weights of ``model`` in place to the mean absolute error.
+    """Fit the weights of ``model`` in place, minimising the mean absolute error.
 
     Args:
         model: the model; ``scans``: training scans.

@@ -118,7 +118,7 @@ def train(
                 "lock_box_sha256": ids_sha256(locked),
                 "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
             },
-            limitations=["Not evaluated in training: an evaluation of this model gives its error."],
+            limitations=["Training does not evaluate the model; an evaluation gives its error."],
         )
         record.write(folder)
     return record

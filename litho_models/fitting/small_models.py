@@ -28,7 +28,8 @@ RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=1
 
 
 def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Policy) -> list[float]:
-    """Fit ``model`` in place to the mean absolute error, on every second row and column of a window per scan.
+    """Fit ``model`` in place, minimising the mean absolute error on every second row and column of one window
+    per scan.
 
     Line offsets of ``full+rows`` are left out, because they average out over a scan and hardly affect a small
     model.
@@ -76,7 +77,7 @@ class ModelProblem:
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
-    """Return the smallest and largest step (p,) that ranges and ``STEP_LIMIT`` allow for the trainable
+    """Return the smallest and largest step (p,) allowed by ``STEP_LIMIT`` and by the ranges of the trainable
     numbers of a model.
     """
     ranges = model.ranges if isinstance(model, Simulator) else {}

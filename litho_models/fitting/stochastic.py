@@ -93,7 +93,7 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Guard the steps up to ``last``: raise InputError if weights of the model became infinite or NaN."""
+    """Raise an InputError if weights of the model became infinite or NaN in the steps up to ``last``."""
     try:
         yield
         error = None
@@ -163,8 +163,8 @@ def _losses(
     """Return the loss of some windows and, for the record, a tensor (2,) with their weighted absolute error,
     µm, and their weight.
 
-    A random crop includes its surroundings or is one tile of the model. A quadrant is treated as a separate
-    image.
+    A random crop is predicted with its surroundings or, if the model runs on tiles, as one tile. A quadrant
+    is treated as a separate image.
     """
     tile = model.tile if config.crops == "random" else None
     # The receptive radius changes during training if the width of a blur is learned.
@@ -204,8 +204,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Return by how many pixels tiles may reach beyond a scan: at least as many as in prediction, and enough
-    that one tile fits.
+    """Return the number of pixels by which tiles may extend beyond a scan. It is at least as large as in
+    prediction, and large enough for one tile to fit.
     """
     if model.tile is None or config.crops != "random":
         return 0
@@ -214,8 +214,8 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Return the learning rate of one step. It is constant, or it rises along a cosine for a tenth of the
-    steps and then falls along another.
+    """Return the learning rate of one step. It is constant, or it rises along a cosine during the first tenth
+    of the steps and then falls along a cosine.
     """
     if config.schedule == "constant":
         return config.learning_rate

@@ -52,11 +52,11 @@ class ModelCard(RunFacts, Result):
     """Everything needed to load, use and judge a frozen model.
 
     ``background`` is the mean contribution of the microscope to the training scans. This background is used
-    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` lists the
-    fitted values that lie on a bound of their range, each with that bound. ``baseline`` contains the gain and
-    error (``ScanFigures``) of the scans from which the model was made; ``litho-models check`` compares new
-    prints with them. ``attributed`` says to which side each effect of undetermined role was attributed when
-    the model was frozen.
+    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each
+    fitted value that lies on a bound of its range to this bound. ``baseline`` contains the gain and error
+    (``ScanFigures``) of the scans from which the model was made; ``litho-models check`` compares new prints
+    with these values. ``attributed`` maps each effect of undetermined role to the side, printer or
+    microscope, to which it was attributed when the model was frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)

@@ -37,12 +37,12 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
     ``metadata_props`` of ONNX).
 
     Args:
-        out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
+        out: output file: ``.pt2``, for ``torch.export.load``, or ``.onnx``, which needs the extra ``onnx``.
         size_px: side of the layout.
 
     Raises:
-        InputError: a different suffix; ``onnx`` is not installed; the format lacks an operation of the model;
-            or the program would predict other heights.
+        InputError: the suffix is different; ``onnx`` is not installed; the format lacks an operation of the
+            model; or the program does not predict the same heights as the model.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:
@@ -72,8 +72,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 class _Numbers(TorchDispatchMode):
     """The Python numbers that a model reads from tensors, recorded in one run and replayed in another.
 
-    These numbers are the radii of kernels, which follow from the kernels' widths, and the ends of tables.
-    They depend only on the weights, so a program may contain them as constants.
+    These numbers are the radii of kernels, which follow from the widths of the kernels, and the end points of
+    tables. They depend only on the weights, so a program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):

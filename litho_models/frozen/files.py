@@ -97,8 +97,8 @@ def load_frozen(
         extrapolate: accept heights beyond the calibrated range.
 
     Raises:
-        InputError: no such folder or zoo model, or a card or weights that are damaged, of another format, or
-            do not belong together.
+        InputError: the folder or zoo model does not exist; the card or the weights are damaged or of another
+            format; or the card and the weights do not belong together.
     """
     path = zoo.model_folder(source)
     card = ModelCard.read(path)
@@ -121,8 +121,8 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
         repository: ``owner/name``; created if it does not exist, as a private repository if ``private``.
 
     Raises:
-        InputError: a source that ``load_frozen`` refuses, a repository that refuses the upload, or
-            huggingface_hub is not installed.
+        InputError: ``load_frozen`` refuses the source, the repository refuses the upload, or huggingface_hub
+            is not installed.
     """
     load_frozen(source)
     return hub.upload(zoo.model_folder(source), repository, private=private)
@@ -178,7 +178,7 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
         raise InputError(
             f"calibrated_range_um beside {weights}",
             got=f"{lowest:g} to {highest:g} µm",
-            wanted=f"a range within 0 to {config.full_height_um:g} µm, the range of its levels",
+            wanted=f"a range within that of its levels, 0 to {config.full_height_um:g} µm",
         )
     try:
         return known(config)
@@ -206,6 +206,7 @@ def _check_effects(card: ModelCard) -> None:
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",
                 wanted="an effect of the printer",
-                hint="`litho-models freeze --attribute printer` attributes undetermined effects to it",
+                hint="`litho-models freeze --attribute printer` attributes undetermined effects to the "
+                "printer",
             )
         effect.require_in_range(values)

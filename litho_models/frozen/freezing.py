@@ -14,7 +14,8 @@ MODEL_FOLDER = "model"
 # Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
-    f"The stated errors include {SCAN_AXIS}, a part for measured maps that is left out of this model."
+    f"The stated errors are those of a model that also has {SCAN_AXIS}, a part for measured maps. This model "
+    "was frozen without it."
 )
 
 

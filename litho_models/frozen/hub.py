@@ -20,7 +20,8 @@ def fetched(address: str) -> Path:
         address: ``hf://owner/name``, or ``hf://owner/name@revision``.
 
     Raises:
-        InputError: no such address or repository, or huggingface_hub is not installed.
+        InputError: the address is not valid, the repository does not exist, or huggingface_hub is not
+            installed.
     """
     repository, _, revision = address.removeprefix(ADDRESS).partition("@")
     with _hub(repository) as hub:
@@ -32,7 +33,7 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
     address.
 
     Raises:
-        InputError: no such address, a repository that refuses the upload, or huggingface_hub is not
+        InputError: the address is not valid, the repository refuses the upload, or huggingface_hub is not
             installed.
     """
     repository = repository.removeprefix(ADDRESS)

@@ -18,12 +18,13 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     µm.
 
     Args:
-        layout: TIFF, PNG, BMP or NPY of integer levels or of their grey values, sampled at the model's pitch;
-            or any export of the design package, whose sidecar states pitch and level height.
+        layout: TIFF, PNG, BMP or NPY file of integer levels, or of grey values that represent levels, sampled
+            at the model's pitch. Any export of the design package is also accepted, because its sidecar
+            states the pitch and the level height.
         out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
 
     Raises:
-        InputError: a layout that cannot be read or has levels beyond the calibrated range, or an ``out`` with
+        InputError: the layout cannot be read or has levels beyond the calibrated range, or ``out`` has
             another suffix.
     """
     pitch_um = model.pitch_um

@@ -88,13 +88,15 @@ class FrozenSimulator(nn.Module):
         """Predict the print of a layout; return its height (b, 1, y, x), µm.
 
         Args:
-            layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
-                ``double()``.
-            pitch_um: sampling of the layout; ``level_height_um``: its level height. Each is checked if given.
+            layout_um: nominal height (b, 1, y, x), µm. Its dtype must be that of the weights: float32, or
+                float64 after ``double()``.
+            pitch_um: sampling of the layout; it is checked if given.
+            level_height_um: level height of the layout; it is checked if given.
 
         Raises:
-            InputError: a pitch or level height other than the model's, a layout that is not a tensor or has
-                the wrong shape or dtype, or heights beyond the calibrated range without ``extrapolate``.
+            InputError: the pitch or the level height differs from that of the model; the layout is not a
+                tensor, or has the wrong shape or dtype; or heights lie beyond the calibrated range and
+                ``extrapolate`` is not set.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -106,14 +108,14 @@ class FrozenSimulator(nn.Module):
         height, µm, with the same type and shape.
 
         Args:
-            layout_um: nominal height (..., y, x), µm, of any float type: a NumPy array, an xarray array
-                (whose coordinates y_um and x_um, if any, are checked), or a tensor, through which gradients
-                flow.
+            layout_um: nominal height (..., y, x), µm, of any float type: a NumPy array, an xarray array, or a
+                tensor. If an xarray array has the coordinates y_um and x_um, they are checked. Gradients flow
+                through a tensor.
             pitch_um: sampling of the layout; it is checked if given.
 
         Raises:
-            InputError: as for ``forward``, and also for integers, which would be levels, and for fewer than
-                two dimensions.
+            InputError: as for ``forward``; also if the layout contains integers, which would be levels, or
+                has fewer than two dimensions.
         """
         self.check_geometry(pitch_um)
         if isinstance(layout_um, Tensor):
@@ -141,7 +143,7 @@ class FrozenSimulator(nn.Module):
             )
         if layout_um.ndim < 2 or not layout_um.numel():
             shape = tuple(layout_um.shape)
-            raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), all larger than 0")
+            raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), with no empty dimension")
         dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
         fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
         # Fields are predicted one after the other, so that a stack needs no more memory than one field.
@@ -162,9 +164,9 @@ class FrozenSimulator(nn.Module):
         """Predict as ``forward`` does, but crop ``border_px`` on each side; return (b, 1, y - 2 border, x - 2
         border) µm.
 
-        If the border is at least as wide as the receptive radius, or if the model runs on tiles, only the
-        pixels that the result needs are computed. In the first case, nothing is assumed about the layout
-        beyond its edge.
+        If the border is at least as wide as the receptive radius, only the pixels that the result needs are
+        computed, and nothing is assumed about the layout beyond its edge. If the model runs on tiles, only
+        the needed pixels are computed as well.
 
         Raises:
             InputError: as for ``forward``, or a border that leaves no pixels.
@@ -198,7 +200,9 @@ class FrozenSimulator(nn.Module):
             )
         if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
             raise InputError(
-                "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), all larger than 0"
+                "layout",
+                got=f"shape {tuple(layout_um.shape)}",
+                wanted="(batch, 1, y, x), with no empty dimension",
             )
         # A model without weights accepts a layout of any floating-point type.
         own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
@@ -234,7 +238,8 @@ class FrozenSimulator(nn.Module):
                 f"layout for model {self.name}",
                 got=f"heights from {lowest:g} to {highest:g} µm",
                 wanted=f"{self._lowest_um:g} to {self._highest_um:g} µm, the calibrated range",
-                hint="load the model with extrapolate=True to accept less certain heights",
+                hint="load the model with extrapolate=True to accept these heights; predictions are then "
+                "less certain",
             )
 
 

@@ -42,8 +42,8 @@ def gaussian_blur(
 
     Args:
         field: floating-point tensor (..., y, x).
-        sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. Tensors
-            carry gradients.
+        sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. If it is a tensor,
+            gradients flow to it.
         pitch_um: sampling of the field, µm.
         edge: ``replicate`` repeats the outermost pixels, and ``zero`` assumes zeros outside; the size stays
             the same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).

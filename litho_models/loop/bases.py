@@ -32,11 +32,12 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
 ) -> dict[str, nn.Module]:
-    """Return the models that may be corrected, by name. A network is trained anew without each fold.
+    """Return the models that may be corrected, by name. For each fold, a network is trained again without the
+    scans of this fold.
 
     Args:
-        base: name of a model, a frozen model (its folder, ``zoo:NAME``), or ``auto``, which lets small
-            models compete.
+        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which returns several
+            small models, from which the loop chooses one.
         study: the scans with their folds, the seed and the workers.
         steps: number of optimiser steps of a network; None uses the number in its recipe.
         cache: folder that keeps trained networks.

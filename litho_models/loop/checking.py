@@ -1,4 +1,4 @@
-"""Check whether a cause is named correctly, with everything else in the model.
+"""Check whether a cause is named correctly, in a model that contains all other effects.
 
 If the name is right, the residual no longer depends on the change that the cause makes. If the named effect
 only resembles the true cause, the residual contains variants of this change: scaled with height or position,
@@ -34,10 +34,11 @@ class Check:
     """Check the causes of one model against everything that could replace them.
 
     Attributes:
-        state: the model; ``others``: its causes and laws; ``laws``, ``tables``: all candidates that could
-            replace a cause.
+        state: the model.
+        others: causes and laws in the model.
+        laws, tables: all candidates that could replace a cause.
         left_nm2: part of the model's squared residual that features of layout and position can explain.
-        secants: changes that the laws would make in the scans.
+        secants: changes that the laws would make to the predicted scans.
     """
 
     state: State
@@ -58,7 +59,7 @@ class Check:
         return self.state.study
 
     def of(self, cause: Cause) -> Cause:
-        """Judge one cause together with everything else in the model."""
+        """Judge one cause in the model that contains all other effects."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
@@ -68,7 +69,7 @@ class Check:
         if unneeded:
             reason = f"not needed when the other effects are in the model: {unneeded}"
         elif larger:
-            reason = f"it may only correct an error in the formula of {larger}"
+            reason = f"it may merely correct an error in the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
             reason = f"with {', '.join(self.laws_in)} in the model, its gain falls to less than half"
         elif outgrown := self.state.twin.outgrows(cause.name):
@@ -78,16 +79,21 @@ class Check:
         # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
         # that is small relative to the unexplained error therefore proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
-            added = f"variants of the change that it makes would add {100 * share:.0f} % to its gain"
+            added = (
+                "variants of its change (scaled, blurred or displaced) would add "
+                f"{100 * share:.0f} % to its gain"
+            )
             reason = f"it only resembles the true cause: {added}"
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Return the name of a much larger law, or of a much larger cause whose variants replace this cause.
+        """Return the name of a law or cause that gains much more and may explain this cause; empty if there
+        is none.
 
-        If a cause gains less than a tenth of a larger one, it may only correct the larger one's formula.
-        Every law is approximate, so a larger law is always returned. A larger cause is returned if its
-        variants gain at least half as much as this cause. Return an empty name if there is neither.
+        If this cause gains less than a tenth of what another effect gains, it may merely correct the formula
+        of that effect. If the other effect is a law, it is always returned, because every law is approximate.
+        If the other effect is a cause, it is returned if its variants gain at least half as much as this
+        cause.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -118,8 +124,8 @@ class Check:
     def beside_table(self, cause: Cause) -> Cause:
         """Refuse the name of a cause if a table explains more, even if it passed all other checks.
 
-        The name is refused if a table in place of the cause gains more than twice as much, and the cause
-        gains nothing in addition to the table.
+        The name is refused if two conditions hold: a table that replaces the cause gains more than twice as
+        much, and adding the cause to the table gains nothing.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -144,10 +150,12 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Return how much variants of a cause's change reduce the squared error on held-out scans, nm².
+    """Return how much the squared error on held-out scans, nm², falls if variants of the change that a cause
+    makes are added to the model.
 
     Args:
-        without, state: model without and with the cause.
+        without: model without the cause.
+        state: model with the cause.
     """
     grams, study = [], state.study
     before, after = (one.maps_um(study.windows) for one in (without, state))

@@ -1,7 +1,7 @@
 """Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search for causes is run with each base model, and the base models are compared with their causes
-included.
+The search for causes is run with each base model. The base models are then compared, each with the causes
+that were found for it.
 
 ``close`` is an estimator: it makes all choices and fits on the given scans, and its result can predict any
 other scan. To judge its choices on held-out scans, call ``close`` without these scans.
@@ -40,13 +40,15 @@ class Closed:
     """The choices and fits that the loop makes on some of the scans.
 
     Attributes:
-        base_name: name of the chosen base; ``rivals``: results of the same search with the other bases.
-        plain: the base fitted to the original scans; ``base``: the base fitted to the scans from which the
-            measurement errors shared by groups of scans have been subtracted.
-        named: result of the search among causes; ``lawful``: result of the search for short laws in addition
-            to the causes.
-        described: tables over a covariate, which describe the remaining error; they act last in the model.
-        rests: by stage, the part of the residual that features of layout and position still explain.
+        base_name: name of the chosen base.
+        rivals: results of the same search with the other bases.
+        plain: the base fitted to the original scans.
+        base: the base fitted to the scans without the measurement errors that the scans of a group share.
+        named: result of the search for causes.
+        lawful: result of the search for short laws in addition to the causes.
+        described: tables over a covariate that describe the remaining error. These tables act last in the
+            model.
+        rests: for each stage, the part of the residual that features of layout and position still explain.
         untestable: effects that could not be tested, with reasons.
     """
 
@@ -100,7 +102,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
     Args:
         study: development scans.
-        bases: base models by name. Those with few parameters are refitted.
+        bases: base models by name. Base models with few parameters are refitted.
     """
     plain, began_s = {}, time.monotonic()
     for name, base in bases.items():
@@ -164,8 +166,8 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose the simplest base model among those with nearly the smallest error.
 
-    The simplest base has the fewest causes that were not found with all other bases. If several bases are
-    equal in this, the one with the fewest parameters is chosen.
+    The simplest base is the one with the fewest causes that the search does not also find with every other
+    base. If several bases have equally few such causes, the one with the fewest parameters is chosen.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -180,13 +182,14 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Search for laws, then for tables, in addition to the causes. Then check each cause together with all
-    of them.
+    """Search for laws and then for tables, both in addition to the causes. Then check each cause in the model
+    that contains the laws and tables.
 
     A cause that fails its check is removed, and the search for laws is repeated without it.
 
     Args:
-        start: the base; ``named``: its causes, from which refused causes are removed.
+        start: the base.
+        named: causes found with this base; causes that are refused are removed from it.
     """
     study = start.study
     # Tables describe heights, not films.

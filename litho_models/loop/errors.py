@@ -38,8 +38,8 @@ def error_rows(
     """Return the errors of predicted maps (y, x), µm, under each reported policy; films get no offset.
 
     Args:
-        numbers: number of fitted parameters of printer and measurement;
-            ``terms``: ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``.
+        numbers: numbers of fitted parameters of the printer and of the measurement model.
+        terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``.
     """
     rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
@@ -114,13 +114,17 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """Predict scans (y, x), with print and measurement learned without the scan's fold."""
+        """Predict each scan (y, x), µm, by a printer and a measurement model fitted without the fold of the
+        scan.
+        """
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """Return how much the error (k = 1) grows without each cause or law, after the model is refitted.
+        """Return by how much the error (k = 1), nm, grows when a cause or law is removed and the model is
+        refitted.
 
-        The measurement model is then fitted again, with these parameters of the printer held fixed.
+        After this refit, the measurement model is fitted again, with the parameters of the printer held
+        fixed.
         """
 
         def error_nm(state: State) -> float:
@@ -160,13 +164,13 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Predict each scan by a fit to the scans outside its part.
+        """Predict each scan by a fit to the scans of all other parts.
 
         Also return the largest number of parameters of these fits.
 
         Args:
-            starts: by part, the model from which the fit without this part starts; ``part_of``: part of each
-                scan.
+            starts: for each part, the starting model of the fit that leaves this part out.
+            part_of: part to which each scan belongs.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -200,7 +204,7 @@ def errors_of_others(
 ) -> list[ErrorRow]:
     """Return the errors of models on scans that were not used to choose them.
 
-    ``found`` contains pairs of models and the scans that these models did not use.
+    Each pair in ``found`` contains the models of one loop and the scans that this loop did not use.
     """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))

@@ -1,4 +1,5 @@
-"""Fit a model of the printer to all scans, then refit it without each fold to predict that fold.
+"""Fit a model of the printer to all scans. Then, for each fold, refit the model to the scans of all other
+folds and predict the scans of this fold.
 
 Per-scan terms are projected out, so that they do not bias the parameters of the printer.
 """
@@ -47,9 +48,11 @@ class Study:
     """Scans with their folds, and the settings by which findings are judged.
 
     Attributes:
-        scans: prepared scans; ``fold_of``: (scans,) number of the fold of each scan.
+        scans: prepared scans.
+        fold_of: (scans,) number of the fold of each scan.
         seed: seed of folds, calibration blocks and permutations.
-        workers: pool for independent fits; ``report``: gets progress messages.
+        workers: pool for independent fits.
+        report: function that receives progress messages.
     """
 
     scans: Sequence[PreparedScan]
@@ -94,7 +97,9 @@ class Study:
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Return the tip radius, or its upper bound, of the first scan that has one; otherwise None."""
+        """Return the tip radius, or an upper bound for it, from the first scan that states one; None if no
+        scan does.
+        """
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
@@ -117,9 +122,11 @@ class State:
     """A model fitted to the scans of a study.
 
     Attributes:
-        twin: the model fitted to all scans; ``per_fold``: the models fitted without each fold.
+        twin: the model fitted to all scans.
+        per_fold: for each fold, the model fitted without the scans of this fold.
         linear: residual, derivatives and free terms of each window at ``twin``.
-        held_out_um: residual (n,) of each window, predicted without its fold.
+        held_out_um: residual (n,) of each window, for the model that was fitted without the fold of the
+            window.
         freed_um: ``held_out_um`` after the free terms of each scan are projected out.
     """
 
@@ -152,7 +159,9 @@ class State:
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predict the print (y, x) of each scan, or of its window, by the model fitted without its fold."""
+        """Predict the print (y, x) of each scan, or of its window, by the model fitted without the fold of
+        the scan.
+        """
         folds = zip(self.study.fold_of, scans, strict=True)
         return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
@@ -191,8 +200,8 @@ class TwinProblem:
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest allowed steps. They keep effects in range and change base parameters only a
-        little.
+        """Return the smallest and largest allowed steps. These steps keep the effects within their ranges and
+        change the base parameters by small amounts.
         """
         return self._twin.at(vector).room()
 

@@ -1,8 +1,8 @@
 """Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-First, the change must have the right sign: in every scan that contains the effect, the inner product of the
-change with the residual before it is positive. A sign-flip test checks this. Second, the change at its common
-strength must lower the error: the confidence interval of the gain must lie above zero.
+First, the change must have the right sign. In a scan that contains the effect, the change has a positive
+inner product with the residual before the change. A sign-flip test checks this. Second, the change at its
+common strength must lower the error: the confidence interval of the gain must lie above zero.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def judge(
     """Judge a change by the squared error (scans,) before and after, nm².
 
     Args:
-        evidence_nm2: (scans,) mean product of the change and the residual before it; by default the gains.
+        evidence_nm2: (scans,) mean product of the change and the residual before the change; by default the
+            gains.
     """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)
@@ -96,13 +97,13 @@ def judge_states(before: State, after: State) -> Judgement:
 
 
 def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
-    """Return the mean product of a change with the residual before it, ignoring unmeasured pixels."""
+    """Return the mean product of a change and the residual before the change, ignoring unmeasured pixels."""
     return NM_PER_UM**2 * float(np.nanmean(before_um * (before_um - after_um)))
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Return whether a rival is worse than the best change in nearly every scan, by at least a quarter of
-    the best gain.
+    """Return whether a rival is clearly worse than the best change: it must be worse in nearly every scan,
+    and its gain must be smaller by at least a quarter of the best gain.
     """
     lost = judge(other_nm2, best_nm2, study)
     return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

@@ -37,7 +37,8 @@ class Rest:
 
     Attributes:
         gains_nm2: (scans,) squared error that the ridge removes from each held-out scan.
-        squares_nm2: (scans,) squared error without the ridge. Both exclude the free terms of the scans.
+        squares_nm2: (scans,) squared error without the ridge. The free terms of the scans are excluded from
+            both arrays.
     """
 
     gains_nm2: np.ndarray
@@ -59,8 +60,8 @@ class Rest:
 
     @property
     def most_nm(self) -> float:
-        """Return an upper bound on the rms error of the model's form: the root of the upper end of
-        ``ci95_nm2``.
+        """Return an upper bound on the rms error caused by the form of the model: the square root of the
+        upper end of ``ci95_nm2``.
         """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
@@ -144,7 +145,9 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Return the mean squared residual (scans,) of ridges fitted and regularised without each scan's fold."""
+    """Return the mean squared residual (scans,). The ridge for each scan is fitted and regularised without
+    the fold of the scan.
+    """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
     # Strength of regularisation, in scans.

@@ -69,7 +69,9 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
 
 
 def _rounding(steps_um: Sequence[float]) -> ScanFinding:
-    """Report the rounding of the raw files, which adds uniform noise of rms step / √12."""
+    """Report the rounding of the raw files. The rms of the uniform noise that it adds is the step divided by
+    √12.
+    """
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
     if not len(rounded):
@@ -126,14 +128,16 @@ def _short_lines(
     first, last = _LINE_LAGS_UM
     text = (
         f"on flat areas, residuals {first:g} to {last:g} µm apart share {along.mean():.1f} nm² of variance "
-        f"along the scan lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness "
-        f"of at least {rms_nm:.1f} nm rms, from the print or from the microscope"
+        f"along the scan lines and {across.mean():.1f} nm² across them (p = {p:.4f}); the line-shaped "
+        f"roughness is at least {rms_nm:.1f} nm rms and comes from the print or from the microscope"
     )
     return ScanFinding.of("line-roughness", text, seen=p <= CONFIRM_P and rms_nm >= _SMALLEST_RMS_NM, p=p)
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
-    """Return the mean product, nm², of residuals ``_LINE_LAGS_UM`` apart, along and across the scan lines."""
+    """Return the mean product, nm², of residuals at distances within ``_LINE_LAGS_UM``, first along and then
+    across the scan lines.
+    """
     slope = np.hypot(*np.gradient(prediction))
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)

@@ -53,11 +53,13 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Fit the measurement model, then the printer, then the measurement's strengths again, to the same scans.
+    """Fit the measurement model, then the printer, and then the strengths of the measurement model again, all
+    to the same scans.
 
     Args:
-        twin: start of the printer's fit; ``scans``: original scans.
-        refit: fit the printer again once the measurement is known.
+        twin: starting model for the fit of the printer.
+        scans: original scans.
+        refit: whether to fit the printer again once the measurement model is known.
     """
     stored = [scan.stored for scan in scans]
     maps = [twin.height(scan) for scan in scans]

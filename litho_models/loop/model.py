@@ -69,7 +69,8 @@ class Twin:
         base: the model of the printer; its parameters are refitted if they are few.
         numbers: fitted parameters of the base.
         effects: the effects by name, in the order in which they were added.
-        frames: frame with which an effect rotates, if this is not the default; see ``EffectChain``.
+        frames: for each effect that does not use its default frame, the frame with which it rotates; see
+            ``EffectChain``.
     """
 
     base: nn.Module
@@ -146,7 +147,9 @@ class Twin:
         return self.only(())
 
     def ungrouped(self) -> Twin:
-        """Replace strengths by group by their mean, and sort parameters in the order in which effects act."""
+        """Replace the strengths of groups by their mean, and sort parameters in the order in which effects
+        act.
+        """
         effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
         return replace(self, effects=effects)
 
@@ -171,9 +174,9 @@ class Twin:
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Keep strengths by group only for the groups of these scans.
+        """Keep the strengths of the groups to which these scans belong.
 
-        Every other group gets the mean of their strengths.
+        Every other group gets the mean of the strengths that are kept.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -216,7 +219,8 @@ class Twin:
 
         Args:
             extra: a further effect to try.
-            known: fields of this scan that twins of the same base computed before; new ones are added.
+            known: fields of this scan that twins with the same base have already computed. New fields are
+                added.
         """
         chain, known = self.chain(scan, extra), {} if known is None else known
         exposed_um, key = chain.before_base(scan.context.layout_um, scan.context, known)
@@ -227,7 +231,9 @@ class Twin:
         return chain.after_base(known[key], scan.context, known, key)[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Return the steps (p,) of difference quotients; a step is negative only near an upper limit."""
+        """Return the step of each parameter, (p,), for difference quotients. It is negative only near an
+        upper limit.
+        """
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
         effects = np.where(self.vector[self.own :] + size <= upper, size, -size)
@@ -266,8 +272,8 @@ class Twin:
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def exhausts(self, name: str) -> list[str]:
-        """Return the amplitudes of an effect that reach a limit of their range, other than the null, in some
-        group.
+        """Return the amplitudes of an effect that lie on a limit of their range in some group. The null does
+        not count as a limit.
         """
         return self._at_limits(name, lambda one, at: one.kind == "amplitude" and at != one.null)
 

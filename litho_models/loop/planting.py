@@ -43,8 +43,9 @@ def plant(
     """Plant an effect in copies of the scans, run a new loop on the copies, and return what it finds.
 
     Args:
-        effect, amount: from ``parse_planted``; ``closed``: result of the loop on the original scans.
-        close_again: runs the same loop on other scans.
+        effect, amount: results of ``parse_planted``.
+        closed: result of the loop on the original scans.
+        close_again: function that runs the same loop on other scans.
     """
     amplitude = effect.amplitudes[0]
     values = {effect.name: {**effect.off_values(), amplitude: amount}}

@@ -28,7 +28,8 @@ class PreparedScan:
     Attributes:
         stored: the scan in the store.
         context: the position and exposed layout of the scan, which the effects use.
-        sample: flat indices of the pixels for fits and screening, thinned and away from the edge.
+        sample: flat indices of the pixels that fits and screening use: a thinned selection away from the
+            edge.
         height: measured height at ``sample``, float64 µm.
         line: index of the scan line under each pixel (y, x).
         quadrant: part of a large scan that fits and screening use; see ``window``.
@@ -64,7 +65,7 @@ class PreparedScan:
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
     def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
-        """Return the orthonormal basis (n, k) of the scan's free terms at a prediction (y, x), µm."""
+        """Return an orthonormal basis (n, k) of the scan's free terms for a predicted height (y, x), µm."""
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
 
@@ -83,7 +84,9 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans, and interpolate their positions in the writing order of the fitted scans."""
+    """Prepare further scans. Their positions in the writing order are interpolated between those of known
+    scans.
+    """
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
     def placed(scan: PreparedScan) -> PreparedScan:

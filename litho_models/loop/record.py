@@ -37,13 +37,17 @@ class ErrorRow(Record):
     """Error of one model on held-out scans.
 
     Attributes:
-        model: the base, the base with causes, or ``all``, the corrected model.
-        measurement: what was added to the predicted print: nothing, the smooth background of the training
-            scans (the published protocol), or the whole measurement model.
+        model: ``base`` for the base model, ``causes`` for the base model with the causes that were found, or
+            ``all`` for the corrected model.
+        measurement: what was added to the predicted print. ``print alone`` adds nothing, ``published`` adds
+            the smooth background of the training scans (the published protocol), and ``shared`` adds the
+            whole measurement model.
         policy: the ``k`` terms fitted to each scan, on pixels that are not scored.
-        held_out: folds of scans, or whole prints; nested if all choices were also made without them.
-        printer_numbers: number of fitted parameters of the model; ``measurement_numbers``: number of fitted
-            parameters of the measurement model, the largest of all folds.
+        held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
+            all choices were also made without the held-out scans.
+        printer_numbers: number of fitted parameters of the model.
+        measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
+            number is largest.
         edge_by_scan_nm: mean distance of the edges, for films.
     """
 
@@ -62,7 +66,9 @@ class ErrorRow(Record):
 
     @property
     def leading_by_scan_nm(self) -> dict[str, float]:
-        """Return the leading error by scan: the error of edges for films, of heights otherwise."""
+        """Return the leading error by scan, which is the error of the edges for films and the error of the
+        heights for all other prints.
+        """
         return self.edge_by_scan_nm or self.by_scan_nm
 
     @property
@@ -72,7 +78,11 @@ class ErrorRow(Record):
 
     @property
     def is_headline(self) -> bool:
-        """Return whether this is the headline error: k = 1 (films: 0), shared measurement, folds of scans."""
+        """Return whether this is the headline error.
+
+        The headline error is computed with k = 1 (for films with k = 0), with the shared measurement model
+        and on held-out folds of scans.
+        """
         usual = usual_policy(bool(self.edge_by_scan_nm))
         return (self.policy, self.measurement, self.held_out) == (usual, "shared", "scans")
 
@@ -92,15 +102,16 @@ class FoundEffect(Record):
     """An effect, law or table that was added to the model.
 
     Attributes:
-        by: the grouping in which its strength differs; ``all`` for one strength.
+        by: the grouping by which the strength differs, or ``all`` if all scans have the same strength.
         strengths: fitted values of each parameter.
         gain_nm2: decrease of the squared error of held-out scans when the effect is added to everything else
-            in the model. The error is that of the fitted pixels, after seven terms and an affine
-            registration error of each scan are removed.
+            in the model. The error is computed on the fitted pixels, after seven terms and an affine
+            registration error have been removed from each scan.
         left_out_nm: increase of the mean absolute error if the effect is left out (k = 1).
-        family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping, by
-            permuted labels.
-        reshaped_share: gain that variants of its change would add, as a share of its own gain.
+        family_p: p value of the effect in the screening of all candidates.
+        group_p: p value of the grouping, from permuted labels.
+        reshaped_share: further gain if variants of the effect's change were added to the model, divided by
+            the gain of the effect itself.
         survives_on: other bases with which the search also found the effect.
     """
 
@@ -136,10 +147,12 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """A term or mark that differs from scan to scan and is not part of any model.
+    """A per-scan term, or a mark found in single scans, that is not part of any model.
 
     Attributes:
-        seen: whether it was found; ``evidence``: a sentence; ``p``: p value of its test.
+        seen: whether the term or mark was found.
+        evidence: the evidence, in words.
+        p: p value of the test.
         spread: standard deviation of each parameter over scans.
         confusable_with: effects that look the same in these scans.
     """
@@ -165,8 +178,9 @@ class ScanFinding(Record):
 class Planted(Record):
     """An effect planted in copies of the scans, and what the loop found in these copies.
 
-    ``rms_nm`` is the rms of the change that it makes, without the scans' free terms. ``named`` is the
-    reported set of effects that contains it; it is empty if there is none. ``found`` is the fitted amount.
+    ``rms_nm`` is the rms of the change that the planted effect makes, after the free terms of each scan are
+    removed. ``named`` is the reported set of effects that contains the planted effect; it is empty if no set
+    contains it. ``found`` is the fitted amount.
     """
 
     name: str
@@ -178,8 +192,8 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """The part of the squared error (nm²) of held-out scans that features of layout and position still
-    explain; ``matters`` says whether this part exceeds chance.
+    """How much of the squared error on held-out scans (nm²) can still be explained by features of the layout
+    and of the position. ``matters`` says whether this part is larger than expected by chance.
     """
 
     stage: str
@@ -205,7 +219,11 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """An open question after new prints: the answers declared beforehand, and those that remain."""
+    """The state of an open question after new prints.
+
+    ``declared`` lists the answers that were declared before the prints, and ``left`` lists the answers that
+    remain.
+    """
 
     question: str
     kind: str
@@ -221,10 +239,14 @@ class Decision(Record):
 class CloseLoop(Result):
     """The record of a loop.
 
-    ``errors``: see ``ErrorRow``. ``gain``: the error of the base minus that of the corrected model, at k = 1
-    with the shared measurement, over scans and over prints. ``chosen``: how often nested selections chose
-    each effect. ``confounded``: pairs of parameters that these scans cannot determine separately, with their
-    correlation. ``decisions``: open questions of this store that the prints of further stores decide.
+    Attributes:
+        errors: see ``ErrorRow``.
+        gain_nm: the error of the base model minus the error of the corrected model, at k = 1 and with the
+            shared measurement model. ``over_scans`` and ``over_prints`` contain its confidence intervals.
+        chosen: how often the nested selections chose each effect.
+        confounded: pairs of parameters that these scans cannot determine separately, with the correlation of
+            each pair.
+        decisions: open questions of this store to which the prints of further stores were applied.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -262,7 +284,10 @@ class CloseLoop(Result):
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """Return one row of the errors, by default for the usual terms; None if it was not computed."""
+        """Return the row of the errors with these properties, or None if this error was not computed.
+
+        The default policy is the usual one.
+        """
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out
         rows = (r for r in self.errors if (r.model, r.policy, r.measurement, r.held_out) == wanted)

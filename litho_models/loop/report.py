@@ -54,8 +54,8 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     _residuals(page, maps)
     page.table(
         result.explained,
-        "Squared error on held-out scans that a ridge regression on features of layout and "
-        "position still explains.",
+        "The part of the squared error on held-out scans that can still be explained by a ridge regression "
+        "on features of the layout and of the position.",
         "explained.csv",
     )
     page.heading("All errors")
@@ -69,7 +69,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     page.heading("Terms that differ from scan to scan", folded=True)
     page.table(
         [one.model_dump() | {"spread": said("spread", one)} for one in result.single_scans],
-        "These terms are part of no model. Spread: standard deviation over scans.",
+        "No model contains these terms. The spread is the standard deviation over scans.",
         "single_scans.csv",
     )
     if result.planted:
@@ -77,7 +77,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.table(result.planted, "Whether the loop names each planted effect.", "planted.csv", digits=3)
     if result.confounded:
         page.paragraph(
-            "These scans cannot determine separately: "
+            "The parameters in each of these pairs cannot be determined separately from these scans: "
             f"{'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
         )
     page.heading("Every other candidate", folded=True)

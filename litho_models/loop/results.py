@@ -1,4 +1,6 @@
-"""Make the record of a loop: errors, strengths with confidence intervals, and why effects were rejected."""
+"""Make the record of a loop, with errors, strengths, confidence intervals, and the reasons why effects were
+rejected.
+"""
 
 from __future__ import annotations
 
@@ -46,9 +48,11 @@ def record(
     """Make the record of one run.
 
     Args:
-        closed: result of ``close``; ``errors``: rows of ``error_rows``; ``single_scans``: findings in single
-            scans.
-        left_out_nm: by effect, see ``FoundEffect``; ``given``: further fields of the record.
+        closed: result of ``close``.
+        errors: rows of ``error_rows``.
+        single_scans: findings in single scans.
+        left_out_nm: the value of ``FoundEffect.left_out_nm`` for each effect.
+        given: further fields of the record.
     """
     study, final = closed.study, closed.final.twin
     effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
@@ -172,7 +176,8 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
     """Return the cluster-robust covariance (p, p) of fitted parameters.
 
     Args:
-        linear: derivatives of each window at the optimum; ``units``: print or scan of each window.
+        linear: derivatives of each window at the optimum.
+        units: print or scan of each window.
     """
     parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
@@ -201,7 +206,10 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
-    """Explain why each other effect was not added; per-scan effects (``seen``) are listed elsewhere."""
+    """Explain for every other effect why it was not added.
+
+    Per-scan effects (``seen``) are listed elsewhere.
+    """
     sets = {other: one.name for one in added for other in one.confusable_with}
     films, first, last = closed.study.of_films, closed.named.first, closed.named.last
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}

@@ -1,4 +1,4 @@
-"""Run the loop on a store, and write record, report, tables and the corrected model."""
+"""Run the loop on a store, and write the record, the report, the tables and the corrected model."""
 
 from __future__ import annotations
 
@@ -55,24 +55,30 @@ def close_loop(
     decided_by: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
-    """Close the loop on a dataset store and write the result to ``out``, which appears only when complete.
+    """Close the loop on a dataset store and write the result to ``out``.
+
+    The folder ``out`` appears only when the result is complete.
 
     Args:
         store: a store made by ``litho-data build``.
         base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which lets small
             models compete.
         base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
-        folds: number of folds; each scan is predicted by fits without its fold.
-        nested: also repeat all choices without each fold, or each print, and judge them on what was left out.
-        inject: effects as ``NAME=AMOUNT``, each planted in copies of the scans to see whether it is found.
-        open_lock_box: also score the locked scans.
-        steps: optimiser steps of a network, by default those of its recipe. A network is trained once per
-            fold, without its scans.
-        cache: folder that keeps trained networks, by default beside ``out``.
+        folds: number of folds; each scan is predicted by fits that have not used its fold.
+        nested: ``folds`` or ``prints`` to repeat all choices without each fold, or without each print, and to
+            judge the choices on the fold or print that was left out.
+        inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to see
+            whether the loop finds it.
+        open_lock_box: whether to score the locked scans, too.
+        steps: number of optimiser steps of a network; by default the number in its recipe. For each fold, a
+            network is trained without the scans of this fold.
+        cache: folder in which trained networks are kept; by default a folder beside ``out``.
         seed: seed of folds, calibration blocks and permutations.
-        workers: local processes; ``dask``: address of a Dask scheduler instead.
-        further: called before anything is written; ``decided_by``: hashes of the further stores that it uses.
-        report: gets progress messages.
+        workers: number of local processes.
+        dask: address of a Dask scheduler to use instead of local processes.
+        further: function that is called before anything is written.
+        decided_by: hashes of the further stores that the function ``further`` uses.
+        report: function that receives the progress messages.
 
     Raises:
         InputError: there is no store, the base is unknown, too few scans are usable, or ``nested`` is set
@@ -163,7 +169,8 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Repeat all choices without each fold, or print, and judge them on this fold or print.
+    """Repeat all choices without each fold (or print), and judge them on the fold (or print) that was left
+    out.
 
     Also count how often each effect was chosen.
     """

@@ -1,8 +1,8 @@
 """Predict the held-out gain of every candidate from its derivative at the current model.
 
-A candidate is a set of columns: secants of an effect at some of its parameters, or maps along a covariate.
-The strength of a candidate is common to all scans or differs by group. The computation needs only inner
-products from each scan.
+A candidate is a set of columns. The columns are either secants of an effect at some of its parameters, or
+maps along a covariate. The strength of a candidate is common to all scans or differs by group. The
+computation needs only inner products from each scan.
 """
 
 from __future__ import annotations
@@ -32,18 +32,23 @@ PERMUTATIONS = 199
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A trial with a grouping of its strength, and its predicted gain on held-out scans.
+    """A trial, the grouping of its strength, and the gain that is predicted for held-out scans.
 
     Attributes:
-        trial: the tried parameters; ``by``: the grouping of the strength.
-        gains_nm2: (scans,) decrease of the squared error, with strengths fitted without the scan's fold.
-        multiples: fitted multiples of the trial's amplitudes by label, from all scans.
+        trial: the parameters that were tried.
+        by: the grouping by which the strength differs.
+        gains_nm2: decrease of the squared error of each scan, (scans,). The strengths are fitted without the
+            fold of this scan.
+        multiples: for each label, the factors by which the amplitudes of the trial are multiplied; they are
+            fitted to all scans.
         allowed: whether the strengths have a physical sign.
-        retained: share of the information that remains after scan terms and the model's own parameters are
-            projected out; ``beside_base``: the share after only the scan terms are projected out.
-        family_p: share of sign flips of the scans in which any candidate gains at least as much.
-        group_p: if a grouping was tested, share of permutations of the scans in which any grouping gains at
-            least as much.
+        retained: share of the information that remains after both the scan terms and the model's own
+            parameters are projected out.
+        beside_base: share of the information that remains if the scan terms alone are projected out.
+        family_p: share of the sign flips of the scans in which at least one candidate gains as much as this
+            one.
+        group_p: share of the permutations of the scans in which at least one grouping gains as much as this
+            one; None if no grouping was tested.
     """
 
     trial: Trial
@@ -78,7 +83,8 @@ class Screening:
     """The secants of all trials, and their inner products with the residual of a fitted model.
 
     Args:
-        state: the current model; ``effects``: candidates that it does not contain.
+        state: the current model.
+        effects: candidates that the model does not contain.
         secants: secants at a similar model; by default they are taken at the current model.
         beside_own: whether the model's own parameters are projected out of the candidates.
     """
@@ -164,7 +170,9 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def _change(self, one: Screened) -> np.ndarray:
-        """Return the factors (scans, columns) with which the columns add up to the change of a candidate."""
+        """Return the change of a candidate as factors (scans, columns). The change is the sum of the columns
+        multiplied by these factors.
+        """
         found = np.zeros(self.freed.shape[:2])
         found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         return found
@@ -190,11 +198,11 @@ class Screening:
         columns: Sequence[int],
         taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return held-out gains (scans,), nm², of some columns with strengths by label; also return the
-        strengths fitted to all scans.
+        """Return the held-out gains (scans,), nm², of some columns whose strengths differ by label. Also
+        return the strengths that are fitted to all scans.
 
         Args:
-            taken: returns a factor for the fitted strengths.
+            taken: function that returns the factor by which the fitted strengths are multiplied.
         """
         own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
         scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]

@@ -1,5 +1,5 @@
-"""Search for causes: add effects while they reduce the error on held-out scans, and test every added effect
-again at the end.
+"""Search for causes. Effects are added as long as they reduce the error on held-out scans, and every added
+effect is tested again at the end.
 
 All candidates are screened at once, with common strengths and with strengths by group. The most promising
 candidates are fitted in full before one is chosen, because a derivative at zero strength gives only a rough
@@ -31,14 +31,17 @@ class Cause:
     """An effect in the model.
 
     Attributes:
-        name, by: the effect, and the grouping of its strength.
+        name: name of the effect.
+        by: the grouping by which its strength differs.
         alike: other effects that look the same in these scans.
-        judgement: judgement of its gain on held-out scans, in addition to the rest of the model.
-        family_p: p value of its screening among all candidates; ``group_p``: p value of its grouping.
-        values: starting values of its parameters by label, for the fit of a table.
-        reshaped_share: gain that variants of its change would add, as a share of its own gain.
-        reason: why its name was refused; empty if it was not.
-        corrects: whether it was refused because it may only correct another formula.
+        judgement: judgement of the gain on held-out scans when the effect is added to the rest of the model.
+        family_p: p value of the effect in the screening of all candidates.
+        group_p: p value of the grouping.
+        values: starting values of the parameters by label, for the fit of a table.
+        reshaped_share: further gain if variants of the effect's change were added to the model, divided by
+            the gain of the effect itself.
+        reason: why the name of the effect was refused; empty if the name was not refused.
+        corrects: whether the name was refused because the effect may merely correct another formula.
     """
 
     name: str
@@ -55,9 +58,9 @@ class Cause:
 
 @dataclass
 class Found:
-    """The result of a search: the model, its causes, and what is known about all other candidates.
+    """The result of a search: the model, its causes, and what is known about the other candidates.
 
-    ``failed``: causes whose name was refused.
+    ``failed`` lists the causes whose names were refused.
     """
 
     state: State
@@ -82,9 +85,11 @@ def search(
     """Add at most ``most`` effects to a fitted model.
 
     Args:
-        start: the current model; ``candidates``: effects that may be added.
-        secants: secants of the candidates at a similar model; by default at the model itself.
-        seed: result of the same search with another base, whose causes are tried first.
+        start: the current model.
+        candidates: effects that may be added.
+        secants: secants of the candidates at a similar model; by default they are computed at the current
+            model.
+        seed: result of the same search with another base. The causes in this result are tried first.
     """
     found = _seeded(start, seed) if seed and seed.causes else Found(start)
     while len(found.causes) < most and _add_one(found, candidates, secants):
@@ -191,8 +196,8 @@ def _regroup(found: Found, name: str) -> None:
 
 
 def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """Return up to three rivals of the best candidate that make a similar change and promise at least a third
-    of its gain.
+    """Return up to three rivals of the best candidate. A rival makes a similar change, and its predicted gain
+    is at least 30 % of the best gain.
     """
     near = (one for one in standing if one.gain_nm2 >= 0.3 * best.gain_nm2)
     return [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]
@@ -259,7 +264,9 @@ def _defend(found: Found) -> None:
 
 
 def _test_again(found: Found) -> None:
-    """Judge each cause in addition to all others, and remove it if it is not confirmed."""
+    """Judge the gain of each cause with all other causes in the model, and remove each cause that is not
+    confirmed.
+    """
     study = found.state.study
     for cause in list(found.causes):
         study.report(f"testing {cause.name} again")

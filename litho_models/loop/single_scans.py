@@ -38,8 +38,10 @@ class SingleScans:
     """Scans and their expected maps, with terms fitted on pixels that are not scored.
 
     Args:
-        study: seed and folds; ``scans``: original scans; ``maps_um``: expected maps (y, x)
-            of held-out scans, including the measurement.
+        study: the study, which provides the seed and the folds.
+        scans: the original scans.
+        maps_um: expected map (y, x) of each scan, predicted while the scan was held out. The map includes the
+            measurement model.
     """
 
     def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
@@ -78,8 +80,8 @@ class SingleScans:
         terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
         rmse_nm = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
-            f"with {terms[1]:.0f} instead of {terms[0]:.0f} terms per scan, the RMSE on pixels outside the "
-            f"fit goes from {rmse_nm[0]:.2f} to {rmse_nm[1]:.2f} nm"
+            f"if the number of terms per scan rises from {terms[0]:.0f} to {terms[1]:.0f}, the RMSE on "
+            f"pixels outside the fit changes from {rmse_nm[0]:.2f} to {rmse_nm[1]:.2f} nm"
         )
         return ScanFinding.of(
             name,
@@ -91,7 +93,10 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """Return the coefficients (scans, k) of ``own`` in a fit of all ``terms``; displacements in µm."""
+        """Return the coefficients (scans, k) of ``own`` in a fit of all ``terms``.
+
+        Displacements are in µm.
+        """
         found = []
         lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
         for scan, prediction in zip(self.scans, self.maps_um, strict=True):
@@ -173,7 +178,7 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """Describe a common period of the line means, such as that of mains hum, in words.
+        """Describe in words a period that the line means have in common, such as the period of mains hum.
 
         All frequencies are tested at once.
         """
@@ -189,12 +194,15 @@ class SingleScans:
             return ""
         return (
             f"; the line means repeat every {found.period_um:.3g} µm, and this period explains "
-            f"{100 * found.share:.0f} % of their squares (p = {found.p:.1g})"
+            f"{100 * found.share:.0f} % of the sum of their squares (p = {found.p:.1g})"
         )
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:
-        """Return each scan's residual (y, x) without datum and bow; 0 where not measured."""
+        """Return the residual (y, x) of each scan without datum and bow.
+
+        Pixels without a measurement are 0.
+        """
         return [
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)

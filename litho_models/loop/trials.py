@@ -32,21 +32,24 @@ class Trial:
 
     @cached_property
     def _facts(self) -> np.ndarray:
-        """Return the null, lowest and highest value of each amplitude, and its usual distance from the
-        null.
+        """Return the null value, the lowest value and the highest value of each amplitude, and the usual
+        distance of the amplitude from the null value.
         """
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """Return the distance of each amplitude (…, amplitudes) from its null, at multiples (…, sets)."""
+        """Return the distance of each amplitude from its null value, (…, amplitudes), after the parameter
+        sets are scaled by ``multiples`` (…, sets).
+        """
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
-        """Return whether every amplitude, at multiples (…, sets), lies on the allowed side of its null.
+        """Return whether every amplitude lies on the allowed side of its null value after the parameter sets
+        are scaled by ``multiples`` (…, sets).
 
-        Wrong signs of amplitudes that are small relative to the largest amplitude of any group count as noise
-        and are ignored.
+        An amplitude with the wrong sign counts as noise and is ignored if it is small relative to the largest
+        amplitude of any group.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -64,7 +67,9 @@ class Trial:
         return float(np.min(room[beyond] / steps[beyond], initial=1.0))
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
-        """Return the starting values of a fit, no farther from the null than the largest trial."""
+        """Return the starting values of a fit. No value is farther from the null value than in the largest
+        trial.
+        """
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
         steps = np.clip(self.steps(multiples * self.reach(multiples)), -largest, largest)
@@ -74,7 +79,7 @@ class Trial:
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """Return the distance of each amplitude from its null in each set, (sets, amplitudes)."""
+    """Return the distance of each amplitude from its null value in each parameter set, (sets, amplitudes)."""
     nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
@@ -84,8 +89,8 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
     Columns are numbered from ``first``.
 
-    The same amplitudes at the same shape may be tried at two sizes, because a large effect may not simply
-    make a multiple of the change that a small one makes.
+    The same amplitudes may be tried with the same shape at two sizes, because the change that a large effect
+    makes need not be a multiple of the change that a small effect makes.
     """
     found: list[Trial] = []
     for effect in effects:

@@ -78,11 +78,13 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """Return the parameters that no fit changes: those that are fixed by default and those in ``fix``,
-    without those in ``free``.
+    """Return the parameters that no fit changes.
+
+    These are the parameters that are fixed by default and the parameters in ``fix``, except the parameters in
+    ``free``.
 
     Raises:
-        InputError: an unknown model, or a parameter to free that is not fixed.
+        InputError: the model is unknown, or ``free`` names a parameter that is not fixed by default.
     """
     usual = model_class(name).Config.model_fields["fixed"].default
     for one in free:

@@ -1,4 +1,5 @@
-"""Load the weights of the paper's authors into our models of variant ``authors``, by translating their names.
+"""Load the weights of the paper's authors into our models of variant ``authors``. The names of the weights
+are translated.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -36,7 +37,8 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         fields: config fields of the model (geometry).
 
     Raises:
-        InputError: weights of an unknown class, or weights that are missing, unknown or of another shape.
+        InputError: the weights belong to an unknown class, or some weights are missing, unknown or of the
+            wrong shape.
     """
     if not isinstance(weights, Mapping):
         hint = "read the authors' file with torch.load"

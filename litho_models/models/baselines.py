@@ -52,8 +52,8 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), where T is linear between fitted heights at evenly spaced inputs: one for each level,
-    at most 33.
+    """H = T(G_σ * M), where T interpolates linearly between fitted heights. The heights belong to evenly
+    spaced inputs; there is one input for each level, but there are at most 33.
     """
 
     name = "blur-table"
@@ -120,7 +120,9 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Blur a layout by one width (or by a pair, along y and x), and crop ``reach_px`` at each edge."""
+    """Blur a layout and crop ``reach_px`` at each edge. ``sigma_um`` is the width of the blur, or a pair of
+    widths along y and x.
+    """
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
     rows, columns = (
@@ -139,8 +141,8 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """H = w · φ(M), where φ contains Gaussian blurs, second to fourth powers of one blur, its squared slopes,
-    and 1.
+    """H = w · φ(M), where φ contains Gaussian blurs, the second to fourth powers of one blur, the squared
+    slopes of this blur, and 1.
 
     Slopes along y and x have separate weights, because the two axes of a print may differ.
     """

@@ -1,5 +1,5 @@
-"""Networks whose inputs are fixed features of a field: the surroundings of a layout pixel, or the height
-along x.
+"""Networks whose inputs are fixed features of a field. The features describe either the surroundings of a
+layout pixel, or the height along x.
 
 The features have no parameters, so these networks are fitted to single pixels
 (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
@@ -33,9 +33,11 @@ class FeatureNetworkConfig(BaseModel):
 
     hidden: tuple[int, ...] = Field((48, 32), min_length=1, max_length=8, description="hidden units")
     blurs_um: Widths = Field((0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5), description="σ")
-    slope_blurs_um: Widths = Field((0.15, 0.3, 0.6), min_length=1, description="σ of the blurs with slopes")
+    slope_blurs_um: Widths = Field(
+        (0.15, 0.3, 0.6), min_length=1, description="σ of the blurs whose slopes are used"
+    )
     shifts_um: Widths = Field((0.2, 0.5, 1.0), min_length=1, description="displacements")
-    steep_um: Widths = Field((0.4, 1.0, 2.0), description="σ of the mean steepness around a pixel")
+    steep_um: Widths = Field((0.4, 1.0, 2.0), description="σ of the window for the mean steepness")
 
 
 class ScanAxisConfig(FeatureNetworkConfig):
@@ -46,8 +48,8 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 
 class FeatureNetwork(OfField):
-    """A height, µm, computed from the features of each pixel: the sum of a linear part and a network, both
-    zero before training.
+    """A height, µm, computed from the features of each pixel. It is the sum of a linear part and a network.
+    Before training, both are zero.
     """
 
     # Whether the network may add a constant height.

@@ -38,8 +38,8 @@ class FeaturesConfig(SimulatorConfig):
 
 
 class OfField(nn.Module, ABC):
-    """Common methods of models with features: blurs, displacements, their reach, and the scaling of a
-    network's inputs.
+    """Methods that all models with features share: blurs, displacements, the reach of these operations, and
+    the scaling of the inputs of a network.
     """
 
     config: Any
@@ -53,7 +53,7 @@ class OfField(nn.Module, ABC):
         """Return the receptive radius of the features."""
 
     def _point(self) -> Tensor:
-        """Return a field of the smallest size, whose interior is one pixel."""
+        """Return a field of the smallest possible size. Its interior is a single pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -74,8 +74,8 @@ class OfField(nn.Module, ABC):
         self.register_buffer("scale", torch.ones(count))
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
-        """Set the centre and scale of the inputs from those ``seen`` in each scan (inputs, n): the mean over
-        scans and the standard deviation within scans.
+        """Set the centre and the scale of the inputs from the inputs ``seen`` in each scan, (inputs, n). The
+        centre is the mean over scans, and the scale is the standard deviation within scans.
         """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
@@ -86,10 +86,16 @@ class OfField(nn.Module, ABC):
 class Features(OfField, Simulator):
     """H = w · φ(M), with all heights relative to the highest level.
 
-    φ contains blurs with their cubes and the products of each pair; slopes along y and x at several blurs,
-    with their magnitudes, products and second derivatives; copies displaced to one side, and the magnitudes
-    of the height differences to them; blurs along one axis; and the steepness of the surroundings along each
-    axis. The magnitudes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes
+    φ contains:
+
+    - blurs, their cubes, and the product of each pair of blurs;
+    - slopes along y and x at several blurs, with their magnitudes, products and second derivatives;
+    - copies of the layout that are displaced to one side, and the magnitudes of the height differences
+      between the layout and these copies;
+    - blurs along one axis;
+    - the steepness of the surroundings along each axis.
+
+    The magnitudes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes
     differ. ``litho_models.fitting.ridge`` finds the weights in closed form.
     """
 
@@ -125,8 +131,9 @@ class Features(OfField, Simulator):
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the features φ(M) of the interior, (b, 1, y, x) each, in two lists: blurs, slopes and
-        displaced copies; and their products and 1.
+        """Return the features φ(M) of the interior in two lists of maps (b, 1, y, x). The first list contains
+        the simple features, such as blurs, slopes and displaced copies. The second list contains products of
+        these features, and 1.
         """
         config = self.config
         layout = layout_um / config.full_height_um

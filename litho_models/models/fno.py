@@ -1,10 +1,10 @@
 """FNO: the Fourier neural operator, the paper's learned simulator that contains no physics.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
-24; see arXiv:2309.17343, appendix "Fourier Neural Operator". Each layer adds a product in Fourier space,
-which covers the whole image, to a local convolution. The operator treats the image as periodic. Its modes are
-numbers of periods per image, so the result depends on the image size. The variant ``default`` therefore runs
-the operator on tiles of one size.
+24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of a local
+convolution and a product in Fourier space, which acts on the whole image. The operator treats the image as
+periodic. A mode is defined by its number of periods per image, so the result depends on the image size. The
+variant ``default`` therefore runs the operator on tiles of one size.
 """
 
 import math
@@ -31,11 +31,13 @@ class FnoConfig(SimulatorConfig):
     projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
     # The paper uses 1 x 1. Detail finer than the kept modes is then mapped only pixel by pixel.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
-    coordinates: bool = Field(False, description="y and x, from 0 to 1, as further inputs")
+    coordinates: bool = Field(False, description="use y and x, scaled to 0 ... 1, as further inputs")
     padding_fraction: float = Field(
-        0.0, ge=0, le=1, description="zeros at bottom and right, fraction of size"
+        0.0, ge=0, le=1, description="width of the zeros added at the bottom and right, relative to the size"
     )
-    padding_px: int = Field(0, ge=0, le=4096, description="zeros at bottom and right of an image of any size")
+    padding_px: int = Field(
+        0, ge=0, le=4096, description="width of the zeros added at the bottom and right of every image"
+    )
     tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
     overlap_px: int = Field(32, ge=0, description="overlap of blended tiles, at most half a tile")
     # Before training, the network returns the layout; it learns the difference. The paper's network starts
@@ -68,8 +70,9 @@ class Fno(Simulator):
     layer.
 
     P lifts each pixel to ``width`` channels, and Q maps them to a height through one hidden layer. With
-    ``starts_as_layout``, this height is added to M and is zero before training. If the config has a tile,
-    ``interior`` is the height of one tile, which is treated as periodic, and the field is blended from tiles.
+    ``starts_as_layout``, this height is added to M, and it is zero before training. If the config has a tile,
+    ``interior`` returns the height of one tile, which is treated as periodic. The height of the whole field
+    is then blended from tiles.
     """
 
     name = "fno"

@@ -265,7 +265,7 @@ PARTS = {
             "shrinkage",
             {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
             _shrink,
-            "less height where less is exposed nearby: arXiv:2309.17343, parameterized physics model",
+            "the height is lower where less is exposed nearby: arXiv:2309.17343, parameterized physics model",
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(
@@ -286,7 +286,7 @@ PARTS = {
 
 
 def register_part(part: Part) -> Part:
-    """Register a part, so that ``parts`` of printers in this process can name it.
+    """Register a part, so that printers in this process can name it in their ``parts``.
 
     Raises:
         InputError: a name that is taken.

@@ -1,8 +1,14 @@
 """PBL: physics-based learning, the paper's simulator, with networks for the unknown steps of the process.
 
-PBL chains an optical blur of fixed width, a pointwise network (exposure threshold), a diffusion blur of
-learned width, a pointwise network (shrinkage) and an areawise network (everything else); see
-arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model".
+PBL is a chain of five steps:
+
+- an optical blur of fixed width;
+- a pointwise network for the exposure threshold;
+- a diffusion blur of learned width;
+- a pointwise network for the shrinkage;
+- an areawise network for everything else.
+
+See arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model".
 """
 
 from __future__ import annotations
@@ -278,7 +284,8 @@ class Pbl(Simulator):
 
 
 class AreawiseNet(nn.Module):
-    """A stack of 3 x 3 convolutions, 1 -> channels -> 1, with a leaky ReLU after each but the last.
+    """A stack of 3 x 3 convolutions, 1 -> channels -> 1, with a leaky ReLU after every convolution except the
+    last.
 
     With ``transposable``, each kernel is averaged with its transpose, which treats x and y alike.
     """

@@ -75,10 +75,12 @@ class Physics(Simulator):
     """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
 
     In ``default``, H₀ is the nominal full height and g is a gain, without which a full level would always
-    print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. With a threshold below 0, before the
-    first level, the projection uses only the concave part of the tanh. S = κ + (1 - κ) · u, where u is the
-    diffused dose scaled to 0 ... 1, with a fixed range in ``default``, the range of the image in ``paper``,
-    and its maximum in ``authors``. In ``paper`` and ``authors``, the result therefore depends on the crop.
+    print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. A threshold below 0 lies before the
+    first level, so that the projection uses only the concave part of the tanh.
+
+    The shrinkage is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
+    ``default`` scales by a fixed range, ``paper`` scales by the range of the image, and ``authors`` scales by
+    the maximum of the image. In ``paper`` and ``authors``, the result therefore depends on the crop.
     """
 
     name = "physics"

@@ -13,7 +13,8 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 
 class PrinterConfig(SimulatorConfig):
-    """The parts in order, and fixed or initial values of their parameters, by ``part.parameter``.
+    """The parts in their order, and the fixed or initial values of their parameters, which are named
+    ``part.parameter``.
 
     Each parameter can also be set like a field, for example as ``spot.sigma_um``.
     """

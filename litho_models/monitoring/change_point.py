@@ -1,14 +1,15 @@
 """Test whether the mean of a monitored quantity has changed since the reference, at a stated rate of false
 alarms.
 
-Each new print is tried as the first print after a step that lasts until the last print. Student's t with
-pooled spread compares the values before the step, including the reference, with those after it. The t
-distribution holds for any number of reference prints, with unknown mean and spread. The test is the
-likelihood ratio for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
-Technology 35, 355). The rate of false alarms is divided among the comparisons, so it holds for the whole set,
-whatever the correlation between comparisons (Bonferroni). A step should be noticed within ``SOON`` prints, so
-comparisons with at least that many prints after the step get most of the rate. With three new prints, the
-rule is nearly the t test of their mean, which is the best possible test if the spread is unknown.
+The test assumes in turn that each new print is the first print after a step, and that the step lasts until
+the last print. Student's t with a pooled spread compares the values before the step, including the reference,
+with the values after it. The t distribution is valid for any number of reference prints, although their mean
+and spread are unknown. The test is the likelihood ratio for a step in the mean with unknown parameters
+(Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the
+comparisons, so it holds for the whole set, whatever the correlation between comparisons (Bonferroni). A step
+should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step get
+most of the rate. With three new prints, the rule is nearly the t test of their mean, which is the best
+possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -29,11 +30,13 @@ _LARGEST = 1e4
 
 
 class Series(NamedTuple):
-    """One value per print in printing order, and its variance up to a common factor.
+    """The value of each print in printing order, and the variance of each value up to a common factor.
 
     Attributes:
-        reference: values of the reference prints, (..., n); ``new``: values of the new prints, (..., m).
-        reference_variance: (n,); ``new_variance``: (m,).
+        reference: values of the reference prints, (..., n).
+        new: values of the new prints, (..., m).
+        reference_variance: relative variances of the reference prints, (n,).
+        new_variance: relative variances of the new prints, (m,).
     """
 
     reference: Array
@@ -46,8 +49,9 @@ class Step(NamedTuple):
     """A step in the mean.
 
     Attributes:
-        since: number of the first changed new print, from 0.
-        size: new mean minus old mean; ``ci95``: confidence interval of this difference.
+        since: index of the first new print after the step, counted from 0.
+        size: new mean minus old mean.
+        ci95: confidence interval of ``size``.
     """
 
     since: int
@@ -56,8 +60,8 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Return each comparison's share of the rate of false alarms, by its first changed print, (m,). The
-    shares add up to 1.
+    """Return the share of the rate of false alarms that each comparison gets, (m,). The comparisons are in
+    the order of their first changed print. The shares add up to 1.
     """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
@@ -65,7 +69,8 @@ def shares(new_prints: int) -> Array:
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """Return the step and its standard error for every possible first changed print, (m, ...) each.
+    """Return the step and its standard error for every possible first changed print. Both arrays have the
+    shape (m, ...).
 
     If nothing has changed, the ratio of step to standard error follows Student's t with n + m - 2 degrees of
     freedom.
@@ -108,8 +113,9 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
     one in which the step starts with the rise.
 
     Args:
-        step: the rise, in units of the (unknown) spread of a print whose variance here is 1.
-        reference_variance: (n,); ``new_variance``: (m,), of Gaussian values.
+        step: the rise, in units of the unknown spread. A print with this spread has a relative variance of 1.
+        reference_variance: relative variances of the reference prints, (n,). All values are Gaussian.
+        new_variance: relative variances of the new prints, (m,).
         rate: chance of a false alarm in the whole set.
     """
     limit, freedom, error = _comparison(reference_variance, new_variance, rate)

@@ -30,14 +30,15 @@ def check(
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
-        store: dataset store of the new prints; locked scans are left out if the model was made from these
-            prints.
+        store: dataset store of the new prints. Locked scans are left out if the model was made from the
+            prints of this store.
         out: result folder.
-        reference: store of unchanged prints; by default the prints in the model's card.
-        new: names of the prints of ``store`` that are new; the other prints are then the reference.
+        reference: store of unchanged prints; by default, the prints in the model's card are the reference.
+        new: names of the new prints, if ``store`` also contains the reference prints. All other prints of the
+            store are then the reference.
         false_alarms: chance that prints of an unchanged printer raise an alarm in any monitored quantity.
-        tolerance: largest relative drift of a monitored quantity (0.05 is 5 %); three times its spread by
-            default.
+        tolerance: largest allowed relative drift of a monitored quantity (0.05 is 5 %); by default three
+            times the spread of the quantity.
 
     Raises:
         InputError: a model or store that cannot be read or does not fit, or too few prints.

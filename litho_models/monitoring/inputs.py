@@ -65,7 +65,7 @@ def gather(
         raise InputError(
             f"scans of {dataset.path}",
             got="none to compare",
-            wanted="at least one with the dose of the reference",
+            wanted="at least one that has the same dose as the reference",
         )
     return found
 

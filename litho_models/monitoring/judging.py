@@ -27,7 +27,8 @@ class Trend(NamedTuple):
     """A straight line through the values of prints.
 
     Attributes:
-        per_print: change from print to print; ``ci95``: its 95 % confidence interval.
+        per_print: change from print to print.
+        ci95: 95 % confidence interval of ``per_print``.
         p: two-sided p value of the slope.
         prints_left: number of further prints for which the 95 % bound on the drift stays within the
             tolerance.
@@ -42,14 +43,14 @@ class Trend(NamedTuple):
 def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, tolerance: float) -> Trend:
     """Fit the trend over all prints, and estimate the number of prints until it reaches the tolerance.
 
-    The drift is the change since the middle of the reference, when the model was made: the trend times the
-    number of prints since then. The 95 % bound on the drift follows from the end of the trend's confidence
-    interval at which the change is faster. The forecast assumes a steady drift. Steps are detected by the
-    alarm.
+    The drift is the change since the model was made, which is taken to be at the middle of the reference. It
+    is the slope of the trend multiplied by the number of prints since then. Its 95 % bound is computed from
+    the steeper end of the slope's confidence interval. The forecast assumes a steady drift. Steps are
+    detected by the alarm.
 
     Args:
-        values: one value per print in printing order, (n,), at least three; ``variance``: their relative
-            variances, (n,).
+        values: one value per print in printing order, (n,). At least three values are needed.
+        variance: relative variances of the values, (n,).
         reference: bool (n,), True for prints of the reference.
         tolerance: largest drift, in the unit of ``values``.
     """
@@ -84,7 +85,8 @@ def judge(
 
     Args:
         reference, new: scans of the prints, in any order; there must be at least three reference prints.
-        rate: chance of a false alarm if nothing has changed, divided among the quantities by their weights.
+        rate: chance of a false alarm if nothing has changed. This rate is divided among the quantities by
+            their weights.
         tolerance: largest allowed relative drift; three times the spread by default.
         between: whether new prints were made between reference prints. If so, the trend follows the common
             printing order; otherwise all new prints come after the reference.

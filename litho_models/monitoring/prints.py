@@ -53,8 +53,8 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """The names, values and numbers of scans of prints in printing order, (n,) each. A value is the mean over
-    the scans of a print.
+    """The name, the value and the number of scans of each print, in printing order. The value of a print is
+    the mean over its scans.
     """
 
     names: list[str]
@@ -66,10 +66,11 @@ class Spread(NamedTuple):
     """The variation of unchanged prints.
 
     Attributes:
-        mean: mean over the prints; ``sd``: standard deviation between prints; ``sd_ci95``: its 95 %
-            confidence interval.
-        between, within: variance between prints, and between scans of a print; ``within`` is None if no print
-            has two scans.
+        mean: mean over the prints.
+        sd: standard deviation between prints.
+        sd_ci95: 95 % confidence interval of ``sd``.
+        between: variance between prints.
+        within: variance between the scans of a print; None if no print has two scans.
     """
 
     mean: float
@@ -79,8 +80,8 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Return the variance of each print's value, which depends on its number of scans, relative to the
-        variance of a typical print; (n,).
+        """Return the relative variance of the value of each print, (n,). The variance depends on the number
+        of scans of the print. It is 1 for a typical print.
         """
         if self.within is None:
             return np.ones(len(counts))
@@ -106,8 +107,8 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute the mean and spread over at least two prints, with variance components from a one-way analysis
     of variance.
 
-    The mean of one scan varies more than the mean of four. Prints with several scans show how much of the
-    variation comes from the scans. A negative variance between prints counts as 0.
+    A value from one scan varies more than a mean over four scans. Prints with several scans show how much of
+    the variation comes from the scans. A negative variance between prints counts as 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -150,10 +151,11 @@ class FigureCheck(Record):
 
     ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound on the p value of a
     change. An alarm is raised if ``p`` is at most ``alarm_at``, the quantity's share of the rate.
-    ``noticeable_step`` is the rise r that is noticed within three new prints (or all, if fewer) in 9 of 10
-    cases; a fall by r/(1 + r) is noticed equally often. ``noticeable_step`` is None if the rise exceeds a
-    factor of e. ``trend`` is the change per print over all prints. ``measure_again_in`` is the number of
-    prints until the 95 % bound on the drift reaches ``tolerance``.
+    ``noticeable_step`` is a rise r that is noticed in 9 of 10 cases within three new prints, or within all
+    new prints if there are fewer than three. A fall by r/(1 + r) is noticed equally often.
+    ``noticeable_step`` is None if the rise exceeds a factor of e. ``trend`` is the change per print over all
+    prints. ``measure_again_in`` is the number of prints until the 95 % bound on the drift reaches
+    ``tolerance``.
     """
 
     name: str
@@ -174,7 +176,7 @@ class FigureCheck(Record):
 
 
 class Check(Result):
-    """The record ``check.json``; ``verdict`` is for people, ``alarm`` for machines.
+    """The record ``check.json``. ``verdict`` is meant for people, and ``alarm`` is meant for programs.
 
     ``false_alarm_rate`` is the chance that a data set like this from an unchanged printer raises an alarm.
     """

@@ -34,9 +34,10 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.heading("In numbers", folded=True)
     page.table(
         result.figures,
-        "All values except the mean are relative: 0.01 is 1 %. p is the chance that unchanged prints look as "
-        "changed as these at any print. An alarm is raised if p is at most “alarm at”, this quantity's share "
-        f"of {result.false_alarm_rate:g}.",
+        "All values except the mean are relative: 0.01 is 1 %. p is the chance that the prints of an "
+        "unchanged printer seem to change as clearly as these, no matter at which print. An alarm is raised "
+        "if p is at most the value in “alarm at”. This value is the quantity's share of the rate of false "
+        f"alarms, {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
         columns=_COLUMNS,
@@ -95,6 +96,7 @@ def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
 def _chart_text(one: FigureCheck) -> str:
     unit = " nm" if one.name == "error" else ""
     return (
-        f"Large dots are prints; small dots are their scans. 0 is the mean of {one.reference_prints} "
-        f"reference prints, {one.mean:.4g}{unit}. Dashed lines: tolerance, {100 * one.tolerance:.1f} %."
+        "Large dots are prints, and small dots are their scans. Differences are relative to the mean of "
+        f"{one.reference_prints} reference prints, {one.mean:.4g}{unit}. Dashed lines mark the tolerance of "
+        f"{100 * one.tolerance:.1f} %."
     )

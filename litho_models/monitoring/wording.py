@@ -48,8 +48,9 @@ def _sentences(template: str, **values: object) -> list[str]:
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
     """Return whether the errors of the reference are too small to be compared with errors on unseen prints.
 
-    On scans used in the fit, the error is too small by the ratio of parameters to independent pixels. Pixels
-    within one correlation length of the residual count as one.
+    On scans that were used in the fit, the error is too small. The relative difference is the number of
+    parameters divided by the number of independent pixels. Pixels within one correlation length of the
+    residual count as one.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))

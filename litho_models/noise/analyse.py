@@ -33,14 +33,14 @@ def analyse_noise(
     """Analyse the noise of a store; write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. Scans whose use is substrate, flat or steps, and scans that state a dose, are
-            analysed if the store has them.
+        store: dataset store. If the store contains scans whose use is substrate, flat or steps, or scans that
+            state a dose, these scans are analysed as well.
         out: result folder.
-        residuals: result folder of ``litho-models benchmark`` (out of fold), or a frozen model (a folder,
-            ``zoo:NAME``). The analysis then contains σ(x) and its calibration, and the budget if the
-            residuals are out of fold.
-        model: name of a model in the benchmark; by default the best one.
-        seed: seed that decides which pixels are drawn.
+        residuals: result folder of ``litho-models benchmark``, whose residuals are out of fold, or a frozen
+            model (a folder or ``zoo:NAME``). The analysis then contains σ(x) and its calibration. If the
+            residuals are out of fold, it also contains the budget.
+        model: name of a model in the benchmark; by default the best model.
+        seed: seed of the random choice of pixels.
 
     Raises:
         InputError: a store or residuals that cannot be read or do not match.
@@ -126,7 +126,10 @@ def analyse_noise_of_files(
             references=found,
             dose=None,
             spread=None,
-            notes=["Scans are used as read; an offset or a second-degree polynomial is removed, as stated."],
+            notes=[
+                "The scans are used as they were read, except that an offset or a second-degree polynomial "
+                "is removed where this is stated."
+            ],
         )
         write_noise_report(result, references, out)
         result.write(out)

@@ -1,7 +1,8 @@
 """Estimate the noise of ordinary prints from the out-of-fold residuals of a model.
 
-There are two upper estimates: the differences between residuals in similar surroundings
-(``estimated_floor``), and the roughness where the layout is flat and model errors are small.
+There are two upper estimates. The first is based on the differences between residuals in similar surroundings
+(``estimated_floor``). The second is the roughness in areas where the layout is flat and model errors are
+small.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,9 +41,9 @@ class FlatLevel(Record):
 class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 
-    ``flat_levels`` covers the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
-    ``flat_texture`` is the texture of the same pixels after the terms of policy ``full`` are removed, so it
-    contains line offsets.
+    ``flat_levels`` covers the quarter of the pixels at which the layout is flattest. The slope of the layout
+    is at most ``flat_slope`` at these pixels. ``flat_texture`` is the texture of the same pixels after the
+    terms of policy ``full`` are removed, so it contains line offsets.
     """
 
     model: str

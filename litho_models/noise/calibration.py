@@ -62,10 +62,10 @@ class Calibration(Record, extra="ignore"):
 
     Args:
         name: whether the spread is constant or depends on covariates.
-        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are the coverages of a calibrated
-            spread.
-        pit: histogram of the stated probability below r/s, in 20 bins that sum to one; flat if the shape is
-            right.
+        levels: the coverages that a calibrated spread would have.
+        nll, crps_nm, coverage, ence, ause: means over scans.
+        pit: histogram, in 20 bins that sum to one, of the probability that the stated distribution gives to
+            values below r/s. The histogram is flat if the shape of the distribution is right.
     """
 
     name: str
@@ -106,7 +106,7 @@ class SpreadAnalysis(Record, extra="ignore"):
     recorded variance model is fitted to all scans.
 
     ``nuisance`` names the terms that were removed from the residuals. ``left_out`` states whether each fit
-    leaves out prints or scans; the fit is then judged on those left out.
+    leaves out prints or scans. The fit is then judged on the prints or scans that it left out.
     """
 
     model: str
@@ -121,7 +121,9 @@ class SpreadAnalysis(Record, extra="ignore"):
 
 
 class Stated(NamedTuple):
-    """The stated distribution of one scan's residual: its scale at each pixel, nm, and its shape."""
+    """The stated distribution of the residual of one scan. ``scale_nm`` is the scale of the distribution at
+    each pixel, and ``tails`` is its shape.
+    """
 
     scale_nm: Array
     tails: Tails

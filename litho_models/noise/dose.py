@@ -40,13 +40,15 @@ class DoseRow(Record, extra="ignore"):
 
     Args:
         dose: dose relative to the nominal dose.
-        height_gain: printed over nominal height, from the slope of a straight line through the levels.
+        height_gain: ratio of printed height to nominal height, from the slope of a straight line through the
+            levels.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation within areas of one level.
-        lost_low, lost_high: number of steps at the low and the high end that are, per level, less than half
-            the median step of this dose. Low steps are lost to under-exposure (nothing remains), high steps
-            to over-exposure (nothing more reacts). Steps are compared with others of the same dose, so that
-            shrinkage does not count as a wrong exposure.
+        lost_low: number of steps that are lost at the low end because of under-exposure (nothing remains). A
+            step is lost if its height per level is less than half the median at this dose. Steps are compared
+            with others of the same dose, so that shrinkage does not count as a wrong exposure.
+        lost_high: number of steps that are lost at the high end because of over-exposure (nothing more
+            reacts).
         worst_readability: smallest ratio of a step to the σ of its two levels; if it is at least 3.92, single
             pixels of the two levels can be told apart.
     """
@@ -101,11 +103,12 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     fewest = min(row.lost_low + row.lost_high for row in rows)
     sound = [row for row in rows if row.lost_low + row.lost_high == fewest]
     best = min(sound, key=lambda row: abs(row.height_gain - 1))
-    told_apart = "can" if best.worst_readability >= READABLE_AT else "cannot all"
+    readable = best.worst_readability >= READABLE_AT
+    told_apart = "all neighbouring levels can" if readable else "some neighbouring levels cannot"
     reason = (
-        f"of the {len(sound)} doses that lose the fewest steps ({fewest}), this one prints nearest to the "
-        f"nominal height (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
-        f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
+        f"of the {len(sound)} doses that lose the fewest steps ({fewest}), this dose prints heights closest "
+        f"to the nominal heights (gain {best.height_gain:.3f}); single pixels of {told_apart} be told apart "
+        f"(the worst step is {best.worst_readability:.2f} σ, and {READABLE_AT:.2f} σ are needed)"
     )
     return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=_GUARD_UM), notes
 
@@ -133,8 +136,8 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
-    """Return mean and standard deviation of each level inside areas of one level, after the datum, the tilt
-    and the effect of the surroundings of each scan are removed.
+    """Return the mean and the standard deviation of the height of each level, computed inside areas of one
+    level. Before this, the datum, the tilt and the effect of the surroundings are removed from each scan.
     """
     found: dict[int, list[Array]] = {}
     for scan in scans:

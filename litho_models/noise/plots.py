@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Draw each reference scan as a map without its mean; all scans except steps share a colour scale."""
+    """Draw a map of each reference scan after subtracting its mean. All scans except those of steps share a
+    colour scale.
+    """
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
     grid = figure.subplots(1, len(references), squeeze=False)[0]
     rough = [one for one in references if one.use != "steps"]
@@ -40,7 +42,7 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Draw the heights of the levels and the readability against dose; doses at which steps are lost are
+    """Draw the heights of the levels and the readability against dose. Doses at which steps are lost are
     shaded.
     """
     figure = new_figure(8.5, 3.2)

@@ -30,7 +30,7 @@ _FEWEST_PIXELS = 64
 
 @dataclass(frozen=True)
 class Reference:
-    """A scan for measuring the noise; ``use`` is substrate, flat or steps; heights and pitch in µm."""
+    """A scan for measuring the noise. ``use`` is ``substrate``, ``flat`` or ``steps``."""
 
     id: str
     use: str
@@ -42,8 +42,8 @@ class ReferencePrints(Record):
     """Results of the reference scans: the roughness of each surface, the roughness of the print alone, and
     the steps.
 
-    ``textures`` are those of substrates and flat prints with square pixels, without a quadratic
-    background.
+    ``textures`` describes substrates and flat prints with square pixels, after a quadratic background is
+    removed.
     """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
@@ -54,7 +54,7 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """Return the levelled substrate, flat and step scans of a store, each on the grid of the scan."""
+    """Return the levelled scans of substrates, flat prints and steps in a store, each on its own grid."""
     pitches = store.recorded_pitches_um()
     return [
         Reference(
@@ -69,8 +69,8 @@ def store_references(store: Store) -> list[Reference]:
 
 
 def reference_prints(references: Sequence[Reference], level_height_um: float) -> ReferencePrints:
-    """Compute the roughness of substrates and flat prints with each of the two backgrounds removed, the
-    roughness of the print alone, and the results of the steps.
+    """Compute the results of the reference scans. The roughness of substrates and flat prints is computed
+    twice, once for each background that is removed.
     """
 
     def surfaces(use: str) -> list[SurfaceNoise]:

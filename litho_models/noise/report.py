@@ -45,7 +45,8 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     if result.repeats is not None:
         page.paragraph(
             f"Noise from {result.repeats.scans} repeated prints: σ = {result.repeats.sigma_nm:.2f} nm (95 %: "
-            f"{interval_text(result.repeats.ci95_nm)}). σ² is half the variance of a pair's difference."
+            f"{interval_text(result.repeats.ci95_nm)}). σ² is half the variance of the difference between "
+            "two prints."
         )
     if result.spread is not None:
         _spread(page, result.spread)
@@ -64,7 +65,7 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     page.heading("Reference prints")
     page.figure(
         plots.surfaces(references),
-        "Heights relative to their mean. Substrate and flat print share one scale.",
+        "Heights relative to their mean. The maps of substrate and flat print have the same scale.",
     )
     page.heading("Reference prints in numbers", folded=True)
     rows = [
@@ -94,11 +95,12 @@ def _texture(page: Page, found: Texture) -> None:
     page.paragraph(f"Texture of {found.id}: {found.verdict}.")
     page.table(
         found.lines,
-        f"The directional strength is {found.strength:.2f}: 0 if all directions are alike, 1 if all lines "
-        "have one direction. An isotropic surface is at least as directional with probability "
-        f"{found.isotropic_p:.1g}. Share: fraction of the variance in the means of the lines along each "
-        "axis; fraction of the squares of these means in the strongest period. p: probability of such a "
-        "peak in a smooth spectrum. Coherence: 1 if all surfaces have the same phase.",
+        f"The directional strength is {found.strength:.2f}. It is 0 if all directions are alike, and 1 if "
+        "all lines have one direction. An isotropic surface is at least as directional with probability "
+        f"{found.isotropic_p:.1g}. The share of the lines is the fraction of the variance that is in the "
+        "means of the lines along this axis. The share of the period is the fraction of the sum of squares "
+        "of these means that has the strongest period. p is the probability of such a peak in a smooth "
+        "spectrum. The coherence is 1 if the lines have the same phase on all surfaces.",
         f"texture_{found.id.replace(' ', '_')}.csv",
         digits=3,
     )
@@ -108,9 +110,9 @@ def _steps(page: Page, found: StepPrint) -> None:
     page.heading(f"Steps of {found.id}", folded=True)
     page.table(
         [{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)],
-        f"Steps along {found.axis}; tread σ {found.tread_sigma_nm:.2f} nm. Readability is height over σ; "
-        "misread pixels are nearer to the other tread. Single pixels resolve steps of at least "
-        f"{found.resolvable_step_nm:.1f} nm.",
+        f"Steps along {found.axis}. The σ of the treads is {found.tread_sigma_nm:.2f} nm. The readability is "
+        "the height of a step divided by σ. The height of a misread pixel is nearer to that of the other "
+        f"tread. Single pixels resolve steps of at least {found.resolvable_step_nm:.1f} nm.",
         f"steps_{found.id}.csv",
         digits=3,
     )
@@ -121,13 +123,15 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
         plots.dose(found),
-        "Green: recommended. Shaded: steps are lost. Above the dashed line, single pixels resolve levels.",
+        "The green line marks the recommended dose. Steps are lost at the shaded doses. Single pixels "
+        "resolve the levels if the value is above the dashed line.",
     )
     page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
     page.table(
         rows,
-        f"Values farther than {found.guard_um:g} µm from every edge. Gain is printed over nominal height.",
+        f"Only pixels farther than {found.guard_um:g} µm from every edge are used. The gain is the ratio of "
+        "printed height to nominal height.",
         "doses.csv",
         digits=3,
     )
@@ -141,15 +145,17 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     shared = "without" if found.nuisance.background == "none" else "with"
     background = f"{shared} the background shared by the training scans"
     page.paragraph(
-        f"Errors on scans {origin}, with {_FREE[found.nuisance.policy]}, {background}: RMS "
-        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They consist of noise and of "
-        f"effects that the model lacks. σ(x), the uncertainty at a pixel, is judged on {found.left_out} "
-        f"left out of its fit; the distribution is {_shape(found.variance.freedom)}."
+        f"The RMS error is {found.residual_rms_nm:.2f} nm, and the MAE is {found.residual_mae_nm:.2f} nm. "
+        f"These are errors on scans {origin}, with {_FREE[found.nuisance.policy]}, {background}. They "
+        "consist of noise and of effects that the model lacks. σ(x) is the uncertainty at a pixel. It is "
+        f"judged on {found.left_out} that its fit has not used. The distribution is "
+        f"{_shape(found.variance.freedom)}."
     )
     page.figure(
         plots.calibration(found),
-        "Scans left out of the fit. First: percentage of pixels inside their predicted 90 % intervals. "
-        "Second: predicted probability of a lower height than the measured one; flat if σ is right.",
+        "These scans were left out of the fit. The first plot shows the percentage of pixels inside their "
+        "predicted 90 % intervals. The second plot is a histogram of the predicted probability of a height "
+        "below the measured one; it is flat if σ is right.",
     )
     page.heading(f"Dependence of the uncertainty of {found.model} on its covariates", folded=True)
     page.figure(plots.spread(found), "Spread by level, slope, distance to the nearest edge, and radius.")
@@ -169,7 +175,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     )
     page.table(
         found.bins,
-        "By level, and by ranges of the other covariates with equal pixel counts; intervals over prints.",
+        "The spread for each level, and for ranges of the other covariates that contain equal numbers of "
+        "pixels. The intervals are confidence intervals over prints.",
         "spread.csv",
         digits=3,
     )
@@ -179,20 +186,22 @@ def _budget(page: Page, found: NoiseBudget) -> None:
     page.heading("Noise budget", folded=True)
     page.paragraph(
         f"These estimates come from residuals of {found.model} on scans that it had not seen. Both are upper "
-        "limits: effects that the model lacks count as noise unless similar surroundings share them. The "
-        "part that levelling removed from the scans, a few percent of the variance, is not included."
+        "limits, because an effect that the model lacks counts as noise unless it is the same in similar "
+        "surroundings. Levelling removed a few percent of the variance from the scans. This part is not "
+        "included."
     )
     if found.floor.by_policy:
         page.table(
             found.floor.by_policy,
-            "Noise for each set of fitted scan terms (k per scan), from similar layout surroundings in "
-            "different scans, with 95 % confidence intervals over prints.",
+            "Noise for each set of fitted scan terms (k terms per scan). It is estimated from pixels of "
+            "different scans with similar surroundings in the layout. The 95 % confidence intervals are over "
+            "prints.",
             "budget.csv",
         )
     page.table(
         found.flat_levels,
-        f"Noise where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels). "
-        "Tilt, bow, gain and line offsets are fitted to each scan.",
+        "Noise at the quarter of the pixels where the layout is flattest (its slope is at most "
+        f"{found.flat_slope:.3f}). Tilt, bow, gain and line offsets are fitted to each scan.",
         "flat_levels.csv",
     )
     if found.flat_texture is not None:

@@ -25,7 +25,8 @@ from litho_models.scoring.statistics import Interval, pixel_interval
 
 
 class Residuals(NamedTuple):
-    """The residuals of a model on each scan: measured minus predicted, nm; NaN where not scored.
+    """The residuals of a model on each scan. A residual is the measured minus the predicted height, nm; it is
+    NaN at pixels that are not scored.
 
     Attributes:
         maps_um: the map that the model expects for each scan, (ny, nx).
@@ -42,13 +43,15 @@ class Residuals(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Pixels of several scans, concatenated; ``used`` marks them in one bool map (ny, nx) per scan."""
+    """Concatenated pixels of several scans. ``used`` contains a bool map (ny, nx) for each scan, which marks
+    these pixels.
+    """
 
     scans: Sequence[PrintedScan]
     used: Sequence[Array]
 
     def of(self, maps: Sequence[Array]) -> Array:
-        """Return the values (n,) of one map per scan at the pixels."""
+        """Return the values (n,) at these pixels; ``maps`` contains one map for each scan."""
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
@@ -60,21 +63,24 @@ class Pool(NamedTuple):
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Return the residuals of each scan (measured minus predicted) without the scan's terms, which are fitted
-    on other pixels.
+    """Return the residuals of each scan (measured minus predicted) after its scan terms are removed. The
+    terms are fitted on other pixels.
 
-    The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
-    shared background. The mean absolute value of these residuals is therefore the error stated there.
+    The pixels, the policy and the shared background are those of the benchmark or, for a frozen model, those
+    of ``evaluate``. The mean absolute value of these residuals is therefore the error that the benchmark or
+    ``evaluate`` reports.
 
     Args:
         store: the store from which the source was made.
-        source: frozen model (a folder, ``zoo:NAME``), or result folder of ``litho-models benchmark``, whose
-            cache holds predictions of scans that the fit has not seen. Locked scans are left out.
-        model: name of a model in the benchmark; by default the best one.
+        source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``.
+            The cache of the benchmark contains predictions of scans that the fit has not seen. Locked scans
+            are left out.
+        model: name of a model in the benchmark; by default the best model.
 
     Raises:
-        InputError: a folder that is neither, a benchmark of another dataset or without its cache, a ``model``
-            given together with a frozen model, or no predicted scan.
+        InputError: the folder contains neither a frozen model nor a benchmark; the benchmark is of another
+            dataset or lacks its cache; ``model`` is given together with a frozen model; or no scan was
+            predicted.
     """
     folder = zoo.model_folder(source, other=["the result of a benchmark"])
     if not (folder / CARD_FILE).exists():

@@ -35,16 +35,16 @@ class NoiseAnalysis(Result, extra="ignore"):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """Choose the source of the noise floor: repeated prints; without these, a flat print; without either, the
-    residuals of a model.
+    """Choose the source of the noise floor: repeated prints if there are any, otherwise a flat print, and if
+    there is no flat print either, the residuals of a model.
     """
     if repeats is not None:
         return NoiseFloor(
             mae_nm=repeats.mae_nm,
             rmse_nm=repeats.sigma_nm,
             kind="measured",
-            source=f"half the variance between {repeats.scans} repeated prints, without offset and bow of "
-            "a pair",
+            source=f"half the variance of the difference between {repeats.scans} repeated prints, after "
+            "offset and bow are removed from each pair",
         )
     flats = [flat for flat in found.flats if flat.background == "offset"]
     if flats:
@@ -52,7 +52,7 @@ def floor_of(
             mae_nm=float(np.mean([one.mae_nm for one in flats])),
             rmse_nm=rms([one.sigma_nm for one in flats]),
             kind="measured",
-            source=f"flat print ({', '.join(one.id for one in flats)}), without its offset; it has only one "
-            "level, and edges and other levels may be rougher",
+            source=f"flat print ({', '.join(one.id for one in flats)}), after its offset is removed; it has "
+            "only one level, and edges and other levels may be rougher",
         )
     return budget.floor if budget is not None else UNKNOWN_FLOOR

@@ -56,8 +56,8 @@ class Tails:
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
-        """Return whether each pixel lies within the central interval that should contain a share ``level`` of
-        them.
+        """Return for each pixel whether it lies within the central interval. The share of pixels in this
+        interval should be ``level``.
         """
         return np.abs(residual) <= self.half_width(level) * scale
 
@@ -82,8 +82,8 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     """Return ENCE, the mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
     Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels with the
-    same σ are in the same bin, so a constant σ has only one bin. Even for a perfect σ, the result is about
-    ``1/√(π n)`` by chance, with n independent pixels per bin.
+    same σ are in the same bin, so a constant σ has only one bin. If each bin contains n independent pixels,
+    the result is about ``1/√(π n)`` by chance, even for a perfect σ.
 
     Args:
         residual, sigma: (pixels,), both in the same unit.
@@ -111,7 +111,7 @@ def sparsification_error(residual: Array, sigma: Array) -> float:
     order within the group does not matter.
 
     Args:
-        residual, sigma: (pixels,), both in the same unit; not all residuals may be zero.
+        residual, sigma: (pixels,), both in the same unit. At least one residual must not be zero.
     """
     error = np.abs(residual)
     value, group = np.unique(sigma, return_inverse=True)

@@ -69,7 +69,8 @@ def step_print(
         scan_id: name in the result.
         height_um: (ny, nx), µm; NaN where not measured.
         pitch_um: (y, x) sampling, µm.
-        level_height_um: nominal step; an edge counts if its treads differ by at least half of it.
+        level_height_um: nominal height of a step. An edge counts if the heights of its two treads differ by
+            at least half a nominal step.
 
     Raises:
         InputError: no step found.
@@ -112,8 +113,8 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
     """Find the axis of a staircase and the pixels at which a new tread starts, ascending.
 
     A piecewise-constant function is fitted to the profile of medians, minimising the squared error plus a
-    price per edge. The price is the squared error that one edge saves between two treads of the narrowest
-    width whose heights differ by half a level.
+    price per edge. The price is based on two treads of the narrowest width whose heights differ by half a
+    level. It is the amount by which an edge between these treads reduces the squared error.
 
     Raises:
         InputError: no edge along either axis.
@@ -162,8 +163,8 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the columns of each tread, leaving out a guard at both edges of at most a third of the tread's
-    width.
+    """Return the columns of each tread without a guard zone at both edges. The zone is at most a third as
+    wide as the tread.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]

@@ -24,9 +24,11 @@ class SurfaceNoise(Record, extra="ignore"):
     """Deviation of a surface from its background.
 
     Args:
-        background: the removed background: the mean (``offset``) or a polynomial of second degree.
-        sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm``: its standard uncertainty, from the number
-            of independent heights in the field.
+        background: the background that was removed, which is the mean (``offset``) or a polynomial of second
+            degree.
+        sigma_nm: root mean square (Sq).
+        sigma_uncertainty_nm: standard uncertainty of ``sigma_nm``, from the number of independent heights in
+            the field.
         mae_nm: mean absolute deviation from the median, computed from the pixels without assuming a
             distribution.
         independent_heights: number of pixels divided by the sum of the squared autocorrelation.
@@ -84,7 +86,9 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
 
 
 def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
-    """Subtract the least-squares background over the measured pixels from the height, float64 (ny, nx) µm."""
+    """Return the height minus its background, float64 (ny, nx) µm. The background is fitted to the measured
+    pixels by least squares.
+    """
     level = np.zeros(height_um.shape)
     return height_um - fitted_terms(height_um, level, np.isfinite(height_um), BACKGROUNDS[background])[1]
 
@@ -94,8 +98,8 @@ def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> Print
     microscope and substrate is independent of the print.
 
     Args:
-        flat: noise of the flat print; ``substrates``: noise of one or more substrates, with the same
-            background removed.
+        flat: noise of the flat print.
+        substrates: noise of one or more substrates, after the same kind of background is removed.
     """
     square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
     if square <= 0:

@@ -20,8 +20,8 @@ class Period(Record, extra="ignore"):
 
     Args:
         period_um: distance at which lines repeat.
-        share: fraction of the sum of squares of the lines' means that has this period.
-        p: chance of a peak this high anywhere in a smooth spectrum.
+        share: fraction of the sum of the squared line means that has this period.
+        p: chance that a smooth spectrum contains a peak of at least this height at any frequency.
         amplitude_nm: root mean square of the amplitude over the surfaces.
         coherence: 1 if the lines have the same phase in all surfaces, in the coordinates of the given arrays.
     """
@@ -53,9 +53,9 @@ class Texture(Record):
 
     Args:
         angle_deg: direction of the lines, 0 along x, positive from x to y.
-        strength: 0 if all directions are alike, 1 if all lines have one direction; ``isotropic_p``: the
-            chance of such a strength on an isotropic surface.
-        lines: along x and along y.
+        strength: directional strength; 0 if all directions are alike, 1 if all lines have one direction.
+        isotropic_p: the chance of at least this strength on an isotropic surface.
+        lines: the lines along x and the lines along y.
     """
 
     id: str
@@ -73,7 +73,8 @@ class Texture(Record):
         )
         periods = [
             f"period of {one.period.period_um:.3g} µm across lines along {one.along} "
-            f"(amplitude {one.period.amplitude_nm:.1f} nm, {100 * one.period.share:.0f} % of their squares)"
+            f"(amplitude {one.period.amplitude_nm:.1f} nm, {100 * one.period.share:.0f} % of the sum of "
+            "squares of the line means)"
             for one in self.lines
             if one.period is not None and one.period.p < RARE
         ]
@@ -81,8 +82,9 @@ class Texture(Record):
 
 
 def texture(name: str, heights_um: Sequence[np.ndarray], pitch_um: float) -> Texture:
-    """Measure the texture of levelled surfaces, (ny, nx) µm each, with square pixels; NaN pixels are left
-    out.
+    """Measure the texture of levelled surfaces with square pixels.
+
+    Each surface is an array (ny, nx) of heights in µm. Pixels that are NaN are left out.
 
     Raises:
         InputError: a surface of fewer than 64 rows or columns.

@@ -40,12 +40,16 @@ _STEPS = 60
 
 
 class VarianceModel(Record):
-    """The model ln s² = Σ β_j φ_j, s in nm, with ``coefficients`` in the order of ``covariates``.
+    """The model ln s² = Σ β_j φ_j, where s is in nm. ``coefficients`` has the order of ``covariates``.
 
-    The covariates are the level on 0 ... 1 of the range, linear between knots; the slope of the blurred
-    layout (height over length); the distance to the next change of level, at most 2 µm, in units of this
-    maximum; and the radius from the field's centre in units of half its diagonal. ``freedom`` is the degrees
-    of freedom of Student's t with scale s; None for a Gaussian.
+    The covariates are:
+
+    - the level, scaled to 0 ... 1, with a dependence that is linear between knots;
+    - the slope of the blurred layout (height over length);
+    - the distance to the nearest change of level, limited to 2 µm and divided by this limit;
+    - the distance from the centre of the field, divided by half the diagonal of the field.
+
+    ``freedom`` is the number of degrees of freedom of Student's t with scale s, or None for a Gaussian.
     """
 
     covariates: list[str]
@@ -54,7 +58,7 @@ class VarianceModel(Record):
 
 
 def place_maps(scan: PrintedScan) -> dict[str, Array]:
-    """Return the values of ``PLACES`` at each pixel of a scan, (ny, nx) each."""
+    """Return the values of ``PLACES`` at each pixel of a scan, as maps (ny, nx)."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
@@ -72,7 +76,9 @@ def place_maps(scan: PrintedScan) -> dict[str, Array]:
 
 
 def covariates_of(places: dict[str, Array]) -> Array:
-    """Return φ of each pixel, (..., covariates), from ``place_maps`` or a selection of its pixels."""
+    """Return φ of each pixel, (..., covariates). ``places`` is the result of ``place_maps`` or a selection of
+    its pixels.
+    """
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
     return np.stack([*between, slope, slope**2, edge, radius2, radius2**2], axis=-1)

@@ -28,11 +28,13 @@ MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Return the power with ``prints`` prints like those of the contrast.
+    """Return the power of an experiment with ``prints`` prints, which are assumed to be like those of the
+    contrast.
 
-    The difference of two squared errors has the squared distance as its mean. The variance of this difference
-    has two sources: the noise along the distance, and the distance itself, which varies between prints by
-    the question's ``spread``. As in the decision, the part that ``form_nm`` may explain is subtracted.
+    The mean of the difference between two squared errors is the squared distance. The variance of this
+    difference has two sources. One is the noise along the distance. The other is the distance itself, which
+    varies between prints by ``question.spread``. As in the decision, the part of the difference that
+    ``form_nm`` may explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -78,22 +80,23 @@ def prints_needed(powers: Sequence[float]) -> int | None:
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Return by how many noise standard deviations a gain exceeds the allowance for the model's own error.
+    """Return how far a gain exceeds the allowance for the model's own error, in standard deviations of the
+    noise.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose A is
     true except for noise n and an error e of the form that both rivals share. Prints then show y = A + e + n,
     and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise
     averages out over prints, but e recurs in every print of similar texture. The angle between e and D is
     unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference up to 2 |D| |e| is inconclusive, and no
-    number of prints separates rivals with |D| below 2 |e|. The new prints show part of e: without e,
-    the gain would be |D|². A deviation from |D|² beyond noise therefore also counts as an error. The larger
-    of the two allowances is used.
+    number of prints separates rivals with |D| below 2 |e|. The new prints show part of e, because the gain
+    would be |D|² without e and without noise. A deviation of the gain from |D|² that is larger than noise
+    therefore also counts as an error. The larger of the two allowances is used.
 
     Args:
-        gain: squared error of one rival minus that of the other; if negative, it favours the other.
+        gain: |y - B|² - |y - A|². A positive gain favours A, and a negative gain favours B.
         difference: |D|², squared difference of their predictions.
         sd: standard deviation of the gain by noise.
-        form: |e|², squared error of the form; 0 if unknown. All four arguments are sums over the same
+        form: |e|², squared error of the form; 0 if it is unknown. All four arguments are sums over the same
             pixels, in the same unit.
     """
     if sd <= 0:
@@ -128,17 +131,20 @@ def of_rivals(
     names = [rival.name for rival in question.rivals]
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
     why = [
-        f"difference between the two most similar rivals on one random print, in standard deviations: {ways}"
+        "the two most similar rivals differ on one random print by this number of standard deviations: "
+        f"{ways}"
     ]
     if question.spread:
-        why.append(f"beyond noise, the evidence varies by {100 * question.spread:.0f} % between prints")
+        why.append(
+            f"in addition to noise, the evidence varies by {100 * question.spread:.0f} % between prints"
+        )
     if question.form_nm is not None:
         why.append(
             f"the model's own error is at most {question.form_nm:.1f} nm, and the two rivals differ by "
             f"{hardest.difference_nm:.1f} nm"
         )
     if _status(hardest.power, prints) == _HOPELESS:
-        why.append(f"no experiment of this plan separates them, but this one might: {question.experiment}")
+        why.append(f"no experiment of this plan separates them, but another one might: {question.experiment}")
     return _planned(
         question,
         hardest.power,
@@ -159,7 +165,9 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Return the pairs of rivals, each in the direction with the smaller power, averaged over the draws."""
+    """Return the pairs of rivals. Of the two directions of a pair, the one with the smaller power is used.
+    The power is averaged over the draws.
+    """
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
     for _ in range(DRAWS):
@@ -194,7 +202,7 @@ def of_others(
             prints,
             "in a rotated scan, scan lines and written lines run along different axes of the layout",
             [
-                "if the offsets follow the layout's rows in rotated scans, too, they come from the printer",
+                "if the offsets follow the layout's rows even in rotated scans, they come from the printer",
                 "if they follow the scan lines, they come from the microscope",
             ],
         )
@@ -205,7 +213,7 @@ def of_others(
             prints,
             "every print is remounted and scanned again, so the printer's part of the term repeats",
             [
-                "if scans of one print agree, the term comes from the printer, and differs between prints",
+                "if scans of one print agree, the term comes from the printer and differs between prints",
                 "if they agree no better than scans of different prints, it comes from the microscope",
             ],
         )

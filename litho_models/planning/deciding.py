@@ -4,8 +4,8 @@ Every rival is fitted to all prints, old and new, and judged only on the new pri
 squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
 standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
 one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
-better, with p <= 0.005 and by at least 1 % of the squared error of the better one. If only one rival remains,
-it is the answer.
+better. The difference must have p <= 0.005, and it must be at least 1 % of the squared error of the better
+rival. If only one rival remains, it is the answer.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def decide(
     """Return the decision on every declared question that scans can answer.
 
     Args:
-        closed: the loop that asked the questions; ``new``: scans that it did not use.
+        closed: the loop that asked the questions.
+        new: scans that this loop did not use.
     """
     judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
     kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
@@ -67,7 +68,8 @@ class Judge:
     """New scans, together with the scans to which a model was fitted.
 
     Attributes:
-        twin: the corrected model with common strengths; ``study``: the study that it was fitted to.
+        twin: the corrected model with common strengths.
+        study: the study to which this model was fitted.
         new: scans that were not used in the fits of the study.
     """
 
@@ -104,12 +106,17 @@ class Judge:
         ratio = float(np.median(f_oneway(*repeated).statistic))
         law = f_distribution(count - 1, total - count)
         expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
-        told = f"between prints, relative to repeats: F({count - 1}, {total - count}) = {ratio:.2f}"
+        told = (
+            "the ratio of the variance between prints to the variance between repeats is "
+            f"F({count - 1}, {total - count}) = {ratio:.2f}"
+        )
         left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
-        """Compare the offsets along the layout's rows with those along the scan lines, in rotated scans."""
+        """In rotated scans, compare the offsets along the rows of the layout with the offsets along the scan
+        lines.
+        """
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
             return _decision(question, self.new, BOTH, "no scan is rotated", UNSEEN)
@@ -130,7 +137,9 @@ class Judge:
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """Enter the decisions into the result. An effect that alone remains is explained, and gets its owner."""
+    """Add the decisions to the result. If an effect is the only remaining answer, its verdict becomes
+    ``explained``, and its role is set to that of its owner.
+    """
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
         rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
@@ -213,7 +222,7 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
-    """Return the owners that the scans still support."""
+    """Return the owners that remain possible after the test."""
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
 

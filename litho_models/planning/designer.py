@@ -37,9 +37,9 @@ _MOST_REPEATING = 0.7
 class Chosen(NamedTuple):
     """How prints are made and scanned for one question or for all questions.
 
-    ``ways`` are the scans of each print. Successive prints use the ``places`` (in the write field) and
-    ``doses`` in turn. ``tried`` is the separation, in standard deviations, with one plain scan, and with each
-    other way in addition.
+    ``ways`` lists how each print is scanned. Successive prints cycle through the ``places`` in the write
+    field and through the ``doses``. ``tried`` contains separations in standard deviations: the separation
+    with one plain scan, and the separations with other ways in addition to the plain scan.
     """
 
     ways: tuple[Way, ...]
@@ -77,7 +77,9 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 
 def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
-    """Combine the choices for all questions; ``asked`` contains ways for questions that need no layout."""
+    """Combine the choices for all questions. ``asked`` contains the ways to scan that are needed for
+    questions without a layout.
+    """
     ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
     places = max((one.places for one in choices), key=len, default=("centre",))
     return Chosen(tuple(ways), places, max((one.doses for one in choices), key=len, default=(1.0,)), {})
@@ -99,7 +101,8 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> tuple[list[np.ndarray], list[str]]:
-    """Optimise tiles for the questions in turn; return their soft levels and the names of their starts.
+    """Optimise tiles for one question after the other. Return the soft levels of the tiles and the names of
+    the layouts from which they started.
 
     Args:
         kept: folder of finished tiles; tiles of an interrupted run are reused.

@@ -99,7 +99,10 @@ def schedule(
 
 
 def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
-    """Write card, table, layouts and sheets; ``layouts`` contains the level map of each scan."""
+    """Write the card, the table, the layouts and the sheets.
+
+    ``layouts`` contains the level map of each scan.
+    """
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
     write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])

@@ -46,8 +46,8 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Allow levels that cover at least a thousandth of earlier prints, and no finer structure than
-        they have.
+        """Derive the limits from earlier prints. A level is allowed if it covers at least a thousandth of
+        these prints, and structures may not be finer than in these prints.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
@@ -74,8 +74,8 @@ class Limits:
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
-        """Make a random layout, (size, size) whole levels; ``finest`` is its cut-off as a share of the
-        largest cut-off.
+        """Make a random layout with whole levels (size, size). ``finest`` is its cut-off frequency as a
+        fraction of the largest allowed one.
         """
         level = random_layout(
             (size_px, size_px),

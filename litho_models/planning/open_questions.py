@@ -1,8 +1,8 @@
 """List the open questions of a closed loop, with everything that is needed to plan an experiment.
 
 Effects that look the same become rivals: each of them in turn is added to the corrected model, which is
-refitted to all scans. If it is unknown whether printer or microscope causes an effect, the effect becomes two
-rivals: one rotates with the print, the other with the scan.
+refitted to all scans. If it is unknown whether the printer or the microscope causes an effect, the effect
+becomes two rivals. One of them rotates with the print, and the other rotates with the scan.
 """
 
 from __future__ import annotations
@@ -90,7 +90,9 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """Return the question which effect of a set, or which owner, is right; None if nothing is open."""
+        """Return the question about a cause: which effect of a set is present, or which owner an effect has.
+        Return None if neither is open.
+        """
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
@@ -107,7 +109,9 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Return the question which significant but unconfirmed effect explains the residual, if any does."""
+        """Return the question about effects that are significant but not confirmed: which of them explains
+        the residual, if any.
+        """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
@@ -156,11 +160,12 @@ class _Asking:
         return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
 
     def _spread(self, name: str) -> float:
-        """Return how much the evidence for an effect varies over scans beyond noise, relative to its mean.
+        """Return the spread of the evidence for an effect over scans, after the spread due to noise is
+        subtracted. The result is relative to the mean of the evidence.
 
         Let a be the multiple of the change d that fits a scan best. The difference of the scan's squared
         errors is |d|² (2 a - 1) plus noise, so it varies by twice the spread of a. Differences between groups
-        are part of d and do not count.
+        are part of d, so they do not contribute to this spread.
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
@@ -180,7 +185,8 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible owners of an effect: printer and microscope, or None for that of the catalogue.
+    """Return the possible owners of an effect: the printer and the microscope, or None for the owner stated
+    in the catalogue.
 
     Both are possible if scans of one orientation cannot distinguish them.
 
@@ -191,7 +197,7 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
 
 
 def _of_single_scans(result: CloseLoop) -> list[Question]:
-    """Return the questions about per-scan terms of unknown owner, and about line offsets."""
+    """Return the questions about line offsets and about per-scan terms whose owner is unknown."""
     return [
         _question(
             "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",

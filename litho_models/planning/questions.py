@@ -1,8 +1,8 @@
 """The open questions of a closed loop, ``open_questions.json``, from which experiments are planned.
 
-Rivals are fitted from the same starting points, because the base has more than one optimum: an almost
-straight projection and a steep one are different optima. If two equivalent effects were fitted from different
-starts, they would differ by several nm² on new layouts.
+Rivals are fitted from the same starting points, because the base has more than one optimum. For example, an
+almost straight projection and a steep projection are different optima. If two equivalent effects were fitted
+from different starts, they would differ by several nm² on new layouts.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _TILE_PX = 64
 
 
 class NoiseSpectrum(Record):
-    """The power spectrum of the noise, nm²: the mean over tiles of residuals.
+    """The power spectrum of the noise, nm², averaged over tiles of the residuals.
 
-    ``power_nm2`` has shape (n, n), at the frequencies of ``np.fft.fft2`` of a tile; its mean is the variance
-    of a pixel.
+    ``power_nm2`` has the shape (n, n) and the frequencies of ``np.fft.fft2`` for a tile. Its mean is the
+    variance of a pixel.
     """
 
     power_nm2: list[list[float]]
@@ -91,12 +91,15 @@ Owner = Literal["printer", "microscope"]
 
 
 class Rival(Record):
-    """One answer to a question: the base with these effects at common strengths, fitted to earlier prints.
+    """One answer to a question. The model is the base with these effects at common strengths, and it is
+    fitted to earlier prints.
 
     Attributes:
-        effect: the assumed effect; ``owner``: its owner, if that is the question.
-        vector: all fitted parameters, those of the base first; ``information``: (p, p), normal matrix of the
-            fit over all pixels, µm²; ``covariance``: (p, p), robust over prints or scans.
+        effect: the assumed effect.
+        owner: the assumed owner of the effect, if the question is about the owner.
+        vector: all fitted parameters, (p,). The parameters of the base come first.
+        information: normal matrix of the fit over all pixels, (p, p), µm².
+        covariance: cluster-robust covariance of the parameters, (p, p). The clusters are prints or scans.
     """
 
     effect: str
@@ -112,7 +115,8 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, bare: Twin) -> Twin:
-        """Return the model of this answer; its effect rotates with the print or with the scan.
+        """Return the model of this answer. If the owner is known, the effect rotates with the print (printer)
+        or with the scan (microscope).
 
         ``bare`` is the base without effects.
         """
@@ -127,9 +131,10 @@ class Question(Record):
     """An open question of a loop.
 
     Attributes:
-        spread: how much the evidence for the effect varies between prints beyond noise, relative to its mean.
-        form_nm: upper bound on the rms error of the model's form, from what could still be learned in
-            addition to the best answer; None if unknown.
+        spread: spread of the evidence for the effect between prints, after the spread due to noise is
+            subtracted. It is relative to the mean of the evidence.
+        form_nm: upper bound on the rms error of the form of the model; None if it is unknown. The bound is
+            derived from the part of the residual of the best answer that could still be learned.
         sizes: sizes of per-scan terms, by name and unit.
     """
 
@@ -144,7 +149,8 @@ class Question(Record):
 
 
 class OpenQuestions(Result):
-    """``open_questions.json``: the open questions, and the noise against which they are decided.
+    """The record ``open_questions.json``, which contains the open questions and the noise that limits their
+    decision.
 
     ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` is the frequency of
     their finest structure, cycles/µm.
@@ -162,7 +168,9 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each twin from its own values and from the base values of the best twin; keep the better fit."""
+    """Fit each twin from its own values, and again from the base values of the best twin. Keep the better of
+    the two fits.
+    """
 
     def fitted(twin: Twin) -> LeastSquaresFit:
         return fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)

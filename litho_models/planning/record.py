@@ -15,8 +15,8 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One planned scan. ``field_x_um`` and ``field_y_um`` are its position in the write field, and ``dose``
-    is the dose of its print.
+    """One planned scan. ``field_x_um`` and ``field_y_um`` are the position of the scan in the write field,
+    and ``dose`` is the dose of the print.
     """
 
     id: str
@@ -34,8 +34,10 @@ class PlannedScan(Record):
 
 
 class PlannedPair(Record):
-    """Two rivals, the difference of their refitted predictions on the planned prints, and the noise of this
-    difference, nm rms.
+    """Two rivals.
+
+    ``difference_nm`` is the rms difference between their refitted predictions on the planned prints, and
+    ``noise_nm`` is the rms noise of this difference.
     """
 
     rivals: tuple[str, str]
@@ -47,10 +49,11 @@ class PlannedPair(Record):
 class PlannedQuestion(Record):
     """An open question and how the plan answers it.
 
-    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is this
-    probability for random layouts with the same scans, and ``random_difference_nm`` is the smallest
-    difference of any pair on them. ``prints_needed`` is the number of prints for a power of 0.95.
-    ``form_nm`` is an upper bound on the error of the model's form, or None if unknown.
+    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is the same
+    probability for random layouts that are scanned in the same way. ``random_difference_nm`` is the
+    difference between the two most similar rivals on these random layouts. ``prints_needed`` is the number of
+    prints for a power of 0.95. ``form_nm`` is an upper bound on the error of the model's form, or None if
+    unknown.
     """
 
     name: str
@@ -71,8 +74,9 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan: the prints, the scans, and the questions that they decide; ``settings`` are those that the
-    user gave.
+    """A plan, which contains the prints, the scans, and the questions that the prints and scans decide.
+
+    ``settings`` contains the settings that the user gave.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"

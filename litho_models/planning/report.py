@@ -72,7 +72,7 @@ def write_report(
                 "first rival, nm.",
             )
     page.heading("Scans", folded=True)
-    page.table(plan.scans, "All scans, in the order in which to make them.", "order.csv")
+    page.table(plan.scans, "All scans in the order in which they must be made.", "order.csv")
     return page.write(folder)
 
 

@@ -37,7 +37,7 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made; the fields are columns of the plan's table.
+    """How one scan is made. The fields of this class are columns in the table of the plan.
 
     ``turned_deg`` is the angle of the print under the microscope. ``direction`` is -1 for the retrace, and
     ``tip`` is 2 for a second, sharp tip. ``pixel_size`` is the size of a pixel relative to earlier scans,
@@ -67,7 +67,9 @@ class PlannedPrint:
 
 @dataclass(frozen=True)
 class Printing:
-    """Common settings of all prints: pitch, level height, highest level, write field (µm, or None)."""
+    """The settings that all prints share: pitch, level height, highest level, and width of the write field
+    (µm, or None).
+    """
 
     pitch_um: float
     level_height_um: float
@@ -130,7 +132,9 @@ class Contrast:
         return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
 
     def separation(self, spread: float) -> Tensor:
-        """Return the distance in standard deviations, differentiable; ``spread`` is that of the question."""
+        """Return the distance in standard deviations, which is differentiable. ``spread`` is the spread that
+        the question states.
+        """
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
 
@@ -177,8 +181,8 @@ class Rivalry:
         """For each directed pair, fit the second model to the prediction of the first.
 
         Args:
-            prints: planned prints; no derivatives flow to their levels.
-            rounds: Gauss-Newton steps; one is the linearised refit.
+            prints: planned prints. The fit is not differentiable in the levels of these prints.
+            rounds: number of Gauss-Newton steps. With one step, the refit is linearised.
             first: the result of ``linearised`` on these prints, if known.
         """
         predicted = [self._predict(chain, prints) for chain in self.true]
@@ -212,15 +216,17 @@ class Rivalry:
         ]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Return the separation of each directed pair (pairs,), in standard deviations; differentiable in the
-        levels.
+        """Return the separation of each directed pair, (pairs,), in standard deviations. It is differentiable
+        in the levels.
         """
         return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
     ) -> Contrast:
-        """Compare two models; differences are added over the scans of a print, which share its roughness."""
+        """Compare two models. The differences are added over the scans of a print, because all of these scans
+        show the same roughness.
+        """
         found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
             squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
@@ -243,7 +249,7 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
-        """Linearise a twin on each scan of the prints; the residual is taken from zero height."""
+        """Linearise a twin on each scan of the prints. The residual is zero minus the predicted height."""
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)
         moved = [twin.at(twin.vector + one) for one in np.diag(steps)]

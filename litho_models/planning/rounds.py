@@ -29,7 +29,7 @@ def close_loop(
     Args:
         new_prints: further stores of the same printer. They decide the open questions (see ``deciding``) and
             change nothing that was found on the first store.
-        settings: those of ``loop.run.close_loop``.
+        settings: settings of ``loop.run.close_loop``.
 
     Raises:
         InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
@@ -49,7 +49,8 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Return the scans of a further store, after checking that printer and orientation are as stated.
+    """Return the scans of a further store, after checking that it is of the same printer and that the scans
+    have the orientation stated in the card.
 
     Raises:
         InputError: the store is of another printer, or a scan has another orientation than its card states.
@@ -67,7 +68,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             f"store {store.path}",
             got=f"prints planned for dataset {planned[:12]}…",
             wanted=f"prints planned for {first.path}, {first.sha256[:12]}…",
-            hint="as the first store, give the one for which these prints were planned",
+            hint="the first store must be the dataset for which these prints were planned",
         )
     scans = store.scans()
     for scan in scans:

@@ -48,11 +48,13 @@ def next_print(
 
     Args:
         loop: folder of a closed loop.
-        out: folder of the plan; it appears when the plan is complete.
-        prints: largest number of prints; ``field_um``: side of each.
-        seed: seed of random layouts; ``steps``: ascent steps of each tile.
+        out: folder of the plan, which appears only when the plan is complete.
+        prints: largest number of prints.
+        field_um: side length of each print.
+        seed: seed of the random layouts.
+        steps: number of ascent steps for each tile.
         layouts: ``random`` plans the same scans with random layouts, as a control.
-        report: gets progress messages.
+        report: function that receives the progress messages.
 
     Raises:
         InputError: there is no closed loop, the prints have an impossible size, or the folder contains a plan
@@ -76,7 +78,7 @@ def next_print(
         raise InputError(
             "planned prints",
             got=f"{prints} of {field_um:g} µm",
-            wanted=f"at least one, of at least {_SMALLEST_PX * card.pitch_um:g} µm",
+            wanted=f"at least one print with a side of at least {_SMALLEST_PX * card.pitch_um:g} µm",
         )
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
         base = load_simulator(folder / MODEL_FOLDER, card)

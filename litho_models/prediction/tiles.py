@@ -18,7 +18,8 @@ TILE_PX = 1024
 
 
 def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
-    """Predict the height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
+    """Predict the height (b, 1, y, x), µm, of a layout (b, 1, y, x), µm. The height is differentiable in the
+    layout.
 
     A field larger than ``tile_px`` is computed in tiles, each with a margin of the receptive radius. The
     heights equal those of the whole field computed at once. For a model without a receptive radius, the field
@@ -35,8 +36,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
     """Predict the height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x -
     2r), µm.
 
-    Gradients flow to the layout. The field is computed in tiles of at most ``tile_px``, which does not change
-    the result.
+    The height is differentiable in the layout. The field is computed in tiles of at most ``tile_px``, which
+    does not change the result.
 
     Raises:
         InputError: a model without a receptive radius, or a layout that has no interior.
@@ -61,11 +62,11 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 
 
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
-    """Predict the height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the
-    layout.
+    """Predict the height of the pixels farther than ``border_px`` from the edge, µm. The height is
+    differentiable in the layout.
 
-    The border must be less than half the layout. The result is that of ``predict_field`` with the border
-    cropped. If the model allows it, only the pixels that the result needs are computed: see
+    The border must be less than half the layout. The result equals that of ``predict_field`` after the border
+    is cropped. If the model allows it, only the pixels that the result needs are computed: see
     ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
@@ -81,15 +82,15 @@ def blend_tiles(
 ) -> Tensor:
     """Average ``function`` over overlapping tiles with weights that sum to one at each pixel.
 
-    The first tile starts ``overlap_px`` before the field, whose outermost pixels are repeated there. Every
-    pixel of the field is therefore covered by the same number of overlapping tiles.
+    The first tile starts ``overlap_px`` outside the field. Outside the field, its outermost pixels are
+    repeated. Every pixel of the field is therefore covered by the same number of overlapping tiles.
 
     Args:
         function: maps tiles (b, 1, T, T) to their heights.
         layout_um: (b, 1, y, x), any size, µm.
         tile: side T and overlap.
-        border_px: width of the border that is cropped from the result, less than half the field; tiles that
-            lie wholly in the border are not computed.
+        border_px: width of the border that is cropped from the result; it must be less than half the field.
+            Tiles that lie entirely in the border are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.

@@ -1,4 +1,6 @@
-"""The terms that a scan adds to the height; they are fitted to pixels that are not scored, and removed."""
+"""The terms that a scan adds to the height. They are fitted to pixels that are not scored, and then removed
+from the scan.
+"""
 
 from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.cross_fit import CrossFit, cross_fit, fitted_terms, freed_um, least_squares

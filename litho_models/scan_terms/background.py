@@ -24,7 +24,8 @@ _SAME_SIZE = 0.01
 
 
 class Background(Record):
-    """Mean coefficients of x, y, x², xy and y² over ``scans`` training scans, nm.
+    """The coefficients of x, y, x², xy and y², in nm, averaged over the training scans. ``scans`` is the
+    number of these scans.
 
     x and y run from -1 to 1 over a field of ``field_um`` (y, x). Each term has zero mean, so a background
     does not change the datum.
@@ -67,7 +68,8 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
     background is the mean of the five smooth terms over the scans.
 
     Args:
-        scans: training scans of one size; ``predictions_um``: the model's heights (ny, nx).
+        scans: training scans, all of the same size.
+        predictions_um: heights (ny, nx) that the model predicts for these scans.
     """
     coefficients = [
         fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]

@@ -2,8 +2,8 @@
 
 Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
 to one half of a checkerboard and subtracted from the other half. The offset of a line is estimated from few
-pixels, and their roughness correlates with that of their neighbours (along x, the correlation is still 0.2 at
-32 px). Line offsets are therefore fitted on the other side of the scan, beyond a gap.
+pixels, and the roughness of neighbouring pixels is correlated. (Along x, the correlation is still 0.2 at a
+distance of 32 px.) Line offsets are therefore fitted on the other side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ BoolMap = NDArray[np.bool_]
 
 
 class Blocks(NamedTuple):
-    """The geometry of the two halves, which every result records.
+    """The geometry of the two halves. Every result records this geometry.
 
     Attributes:
         block_px: side of a block of the checkerboard.
-        buffer_px: fitted pixels are farther than this from every scored pixel. It is about one correlation
-            length of the measured prints' residuals, whose correlation at 5 px is 0.5.
-        line_gap_px: for line offsets, distance between fitted and scored pixels along the line.
+        buffer_px: all fitted pixels are farther than this distance from every scored pixel. The distance is
+            about one correlation length of the residuals of measured prints; at 5 px, their correlation is
+            0.5.
+        line_gap_px: distance along the line between fitted and scored pixels, for line offsets.
         seed: moves the origin of the checkerboard.
     """
 
@@ -40,14 +41,18 @@ class Blocks(NamedTuple):
 
 
 class Half(NamedTuple):
-    """One half of a scan: terms are fitted on ``calibrate`` and applied to ``score``; bool (ny, nx)."""
+    """One half of a scan. Terms are fitted on the pixels ``calibrate`` and applied to the pixels ``score``,
+    which are bool maps (ny, nx).
+    """
 
     calibrate: BoolMap
     score: BoolMap
 
 
 class Cell(NamedTuple):
-    """A part of the scan to score and, for each axis, the pixels to which line offsets are fitted."""
+    """A part of the scan that is scored, and the pixels on the other side to which line offsets along each
+    axis are fitted.
+    """
 
     score: BoolMap
     other_side: dict[int, BoolMap]
@@ -78,7 +83,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
 
     Args:
         shape: (ny, nx).
-        axes: axes along which lines run; 1: along x.
+        axes: axes along which the lines run; axis 1 is x.
         gap_px: smallest distance along a line from a scored pixel to the pixels that determine its offset.
     """
     axes, cells = sorted(set(axes)), []
@@ -94,7 +99,7 @@ def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list
 
 
 def thinned(used: BoolMap, count: int) -> NDArray[np.intp]:
-    """Return the flat indices of about ``count`` used pixels (ny, nx), on a square lattice."""
+    """Return the flat indices of about ``count`` used pixels that lie on a square lattice."""
     stride = max(1, round((used.sum() / count) ** 0.5))
     lattice = np.zeros_like(used)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True

@@ -28,10 +28,11 @@ class CrossFit:
     """The residual of a scan without its terms.
 
     Attributes:
-        residual_um: measured minus predicted minus terms, (ny, nx) µm, NaN where not scored.
-        degrees_of_freedom: effective number of terms for each scored pixel; shrunk line offsets count with
-            their weight.
-        line_sd_um: standard deviation of the line offsets, 0 without them.
+        residual_um: measured height minus predicted height minus terms, (ny, nx) µm. It is NaN at pixels that
+            are not scored.
+        degrees_of_freedom: effective number of terms, averaged over the scored parts of the scan. A line
+            offset that is shrunk counts with its weight.
+        line_sd_um: standard deviation of the line offsets; 0 if there are no line offsets.
     """
 
     residual_um: FloatMap
@@ -51,12 +52,13 @@ def cross_fit(
     """Return the residual of a scan without its terms, which are fitted to pixels that are not scored.
 
     Args:
-        height_um: measured height (ny, nx), µm; NaN allowed where not valid.
+        height_um: measured height (ny, nx), µm. It may be NaN at pixels that are not valid.
         prediction_um: the model's height (ny, nx), µm.
         valid: bool (ny, nx), pixels that count.
         terms: names in the catalogue; see ``POLICIES`` for the usual sets.
-        blocks: division of the pixels, by default the standard one.
-        scan_line: index of the scan line of each pixel (ny, nx), from 0; rows of the array if None.
+        blocks: division of the pixels; by default the standard division.
+        scan_line: index of the scan line of each pixel, (ny, nx), counted from 0. If it is None, the rows of
+            the array are the scan lines.
 
     Raises:
         InputError: an unknown term, shapes that differ, a prediction that is not finite, or a scan that is

@@ -1,7 +1,7 @@
 """Ridge regression over scans, for columns whose strengths are common to all scans or differ by group.
 
-The regression needs only the inner products of residual and columns of each scan. From these it finds the
-strengths fitted to any scans, and the squared error of any other scans.
+The regression needs only the inner products of residual and columns of each scan. From these products, it
+computes the strengths that fit any selection of scans, and the squared error of any other scans.
 """
 
 from __future__ import annotations
@@ -48,10 +48,11 @@ def label_of(scan: PrintedScan, by: str) -> str:
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
     """Return the label of each scan in every grouping, with ``all`` first.
 
-    Groups come from the card (print, field, tip, direction and rotation of a scan) and from each varying
-    character of the ids. With ``by_order``, they also come from the order: the scans before and after each
-    position at which something may have changed. A grouping needs at least two labels, and at least half of
-    the labels must have two or more scans. If two groupings are identical, only the first is used.
+    Groups are derived from the card (print, field, tip, direction and rotation of a scan) and from each
+    character that varies between the ids. With ``by_order``, they are also derived from the printing order.
+    The two groups are then the scans before and after a position at which something may have changed. A
+    grouping needs at least two labels, and at least half of the labels must have two or more scans. If two
+    groupings are identical, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -84,8 +85,9 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Return the positions in the printing order at which a change is possible: between prints, or anywhere
-    with two scans on each side.
+    """Return the positions in the printing order at which a change is possible. If the prints are known,
+    these are the positions between prints. Otherwise, they are all positions with at least two scans on each
+    side.
     """
     orders = sorted({scan.order for scan in scans})
     if prints is not None:
@@ -106,9 +108,10 @@ class Block:
     """Columns whose strengths are fitted jointly.
 
     Attributes:
-        columns: indices of the columns in the inner products, from 1; 0 is the residual.
-        by: name of the grouping; each label has its own strengths.
-        shrinking: weight, in scans, of the prior for zero strength; 0: no prior.
+        columns: indices of the columns in the inner products, counted from 1. The index 0 is the residual.
+        by: name of the grouping. Each label of the grouping has its own strengths.
+        shrinking: weight of the prior for zero strength, as a number of scans. With a weight of 0, there is
+            no prior.
     """
 
     columns: tuple[int, ...]
@@ -121,8 +124,8 @@ class Products:
     """The inner products of the scans, and their groups.
 
     Attributes:
-        grams: (scans, 1 + m, 1 + m), per pixel; index 0 is the residual.
-        groups: label of each scan by grouping.
+        grams: inner products per pixel, (scans, 1 + m, 1 + m). The index 0 is the residual.
+        groups: label of each scan, for every grouping.
     """
 
     grams: np.ndarray
@@ -134,9 +137,10 @@ class Products:
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the best strengths (columns,) for the scans with these indices, by block and label.
+        """Return the strengths (columns,) that fit the scans with these indices best, for every block and
+        label.
 
-        Labels that none of these scans has are absent.
+        Labels that do not occur among these scans are absent.
         """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
@@ -145,9 +149,10 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Return the mean squared residual (scans,) of these scans with the strengths of their groups.
+        """Return the mean squared residual of each of these scans, (scans,), after its columns are subtracted
+        with the strengths of its groups.
 
-        A scan whose label has no strengths is unchanged.
+        A block is not subtracted from a scan whose label has no strengths.
         """
         left = np.empty(len(scans))
         for number, scan in enumerate(scans):
@@ -161,7 +166,9 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Return the mean squared residual (scans,) of each scan, with strengths fitted without its fold."""
+        """Return the mean squared residual of each scan, (scans,), with strengths that are fitted without the
+        fold of this scan.
+        """
         left = np.empty(len(fold_of))
         for fold in np.unique(fold_of):
             own = np.flatnonzero(fold_of == fold)
@@ -170,7 +177,7 @@ class Products:
         return left
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """Project these blocks, fitted to all scans, out of the residual and the other columns.
+        """Fit these blocks to all scans and project them out of the residual and the other columns.
 
         The columns of the blocks become zero. A later fit of common strengths then gives the same result as a
         joint fit. For strengths by group, this holds only if the projected part is the same in all groups.
@@ -194,8 +201,10 @@ class _Expanded:
     """Normal equations with one row for every strength and label.
 
     Attributes:
-        columns: columns of all blocks; ``rows``: rows of each block's strengths, by label.
-        alike: scans in the same groups, and the rows of their strengths, in the order of ``columns``.
+        columns: columns of all blocks.
+        rows: for each block, the rows of its strengths by label.
+        alike: sets of scans that are in the same groups, each with the rows of its strengths in the order of
+            ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
@@ -223,7 +232,9 @@ class _Expanded:
         self._shrunk = np.array(shrunk)
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return least-squares strengths (rows, targets) for these columns, or for the residual."""
+        """Return the least-squares strengths (rows, targets) that fit each target. A target is the index of a
+        column, or 0 for the residual.
+        """
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows in self.alike:

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
 def scan_line_index(
     shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
 ) -> LineIndex:
-    """Return the index, from 0, of the scan line (constant y in the scan's frame) under each layout pixel,
-    (ny, nx).
+    """Return the index of the scan line under each layout pixel, (ny, nx), counted from 0. A scan line has
+    constant y in the frame of the scan.
 
     Args:
         shape: (ny, nx) of the layout.
-        scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan frame to the layout frame.
+        scan_to_layout: matrix (3, 3) that maps (x_um, y_um, 1) in the frame of the scan to the frame of the
+            layout.
         pitch_um: layout pitch, which is also the distance between counted lines.
         bend_um: bend of the scan, which ``scan_to_layout`` does not contain.
     """
@@ -46,14 +47,17 @@ def axis_along(line: LineIndex) -> int:
 def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
-    """Estimate line offsets as a variance component: the best linear prediction of s_i ~ N(0, v).
+    """Estimate line offsets as a variance component. The result is the best linear prediction of s_i ~ N(0,
+    v).
 
     The scatter of block means within a line gives the noise of the line's mean and includes correlation along
     the line. The variance of the line means minus this noise is v. If all lines have the same number of
     blocks, this moment estimate equals REML. A line without used pixels gets 0.
 
     Args:
-        residual_um: (ny, nx), µm; ``used``: pixels to use; ``line``: line of each pixel.
+        residual_um: residual (ny, nx), µm.
+        used: mask of the pixels to use.
+        line: index of the line of each pixel.
         block_px: length of a block along the lines.
 
     Returns:

@@ -42,11 +42,13 @@ class SharedPart(Record):
     """One part of the measurement model.
 
     Attributes:
-        what: ``background`` and displacements are sums of Legendre polynomials of x and y, -1 to 1 over the
-            field, up to the total ``degree``; the gain is one relative number.
-        by: grouping; ``coefficients``: by label, in µm; those of the gain are relative. A part without
-            coefficients adds nothing.
-        shrinking: weight, in scans, of the prior for zero in the fit.
+        what: kind of the part. A background or a displacement is a sum of Legendre polynomials of x and y up
+            to the total ``degree``, where x and y run from -1 to 1 over the field. A gain is a single
+            relative number.
+        by: name of the grouping.
+        coefficients: coefficients for each label, in µm; the coefficient of a gain is relative. A part
+            without coefficients adds nothing.
+        shrinking: weight of the prior for zero coefficients in the fit, as a number of scans.
     """
 
     what: Shared
@@ -61,7 +63,7 @@ class SharedPart(Record):
         return sum(len(own) for own in self.coefficients.values())
 
     def of(self, scan: PrintedScan) -> list[float]:
-        """Return the coefficients of the scan's group; empty if it has none."""
+        """Return the coefficients of the scan's group. The list is empty if the group has no coefficients."""
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
@@ -74,10 +76,11 @@ class MeasurementModel(Record):
     """The changes by the measurement that scans share.
 
     Attributes:
-        levelling: surface that was fitted to whole files and subtracted; predictions are treated in the same
-            way.
+        levelling: kind of surface that was fitted to whole files and subtracted. Predictions are levelled in
+            the same way.
         parts: further parts, in the order in which they were found.
-        field_um: size (y, x) of the training fields; ``scans``: number of training scans.
+        field_um: size (y, x) of the training fields.
+        scans: number of training scans.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -114,7 +117,8 @@ class MeasurementModel(Record):
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """Return the model of the differences between groups: each part without its mean over the labels.
+        """Return a model of the differences between groups, in which the mean over the labels is subtracted
+        from each part.
 
         Gains are left out, because differences between prints may come from the printer.
         """

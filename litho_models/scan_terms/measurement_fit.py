@@ -93,7 +93,7 @@ def learn_measurement(
 
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
-    """Return the inner products of all parts to try, at the current measurement model."""
+    """Return the inner products of all parts that may be tried, computed at the current measurement model."""
     grams = []
     for scan, prediction in pairs:
         rows = _rows(scan, prediction, model)
@@ -102,7 +102,7 @@ def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
 
 
 def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
-    """Choose the parts to add; ``fold_of``: (scans,)."""
+    """Choose the parts to add. ``fold_of`` contains the fold of each scan, (scans,)."""
     chosen: list[_Offer] = []
     if len(fold_of) < 2:
         return chosen
@@ -150,10 +150,11 @@ def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Return the residual and columns (1 + m, n) at thinned pixels, without their means.
+    """Return the residual and the columns, (1 + m, n), at a thinned set of pixels. The mean of each row is
+    subtracted.
 
-    The contribution of the current parts is added back to first order. Each round then fits the full
-    strengths, so that they are shrunk only once, whatever the number of rounds.
+    The contribution of the current parts is added back to the residual, to first order. Each round therefore
+    fits the full strengths, and the strengths are shrunk only once, regardless of the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
@@ -176,7 +177,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
-    """Return the columns of a part among the rows of a scan."""
+    """Return the indices of the columns of a part in the result of ``_rows``."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,

@@ -52,11 +52,11 @@ def usual_background(film: bool) -> BackgroundUse:
 class NuisanceProtocol(Record):
     """The terms that are removed from scans before scoring, and the pixels to which they are fitted.
 
-    ``k`` is the number of smooth terms per scan. ``k`` excludes the effective number of line offsets of
-    ``full+rows``, which depends on the prediction (``PolicyError.k``). ``background`` is ``training`` if
-    predictions include the smooth background of the training scans, and ``shared`` if they include the whole
-    measurement model. No part of the background is fitted to the scored scan. ``border_px``, the number of
-    pixels left out at the edge of a scan, is zero.
+    ``k`` is the number of smooth terms per scan. It does not include the line offsets of ``full+rows``,
+    because their effective number depends on the prediction (``PolicyError.k``). ``background`` is
+    ``training`` if predictions include the smooth background of the training scans, and ``shared`` if they
+    include the whole measurement model. No part of the background is fitted to the scored scan. ``border_px``
+    is the number of pixels that are left out at the edge of a scan, which is always zero.
     """
 
     policy: Policy = "offset"
@@ -106,8 +106,8 @@ def smooth_training_terms(policy: Policy) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """Estimate the terms that each scan adds to the model's height, float32 (ny, nx) µm, from all its valid
-    pixels.
+    """Estimate the terms that each scan adds to the height of the model, from all valid pixels of the scan.
+    Return a float32 map (ny, nx), µm, for each scan.
 
     Use these terms only for training. Reported errors use the terms that ``cross_fit`` estimates.
     """

@@ -27,8 +27,9 @@ class TermPixels:
 
     Attributes:
         prediction_um: predicted height (ny, nx), µm.
-        line: index of the scan line under each pixel (ny, nx); None: rows of the array.
-        at: flat indices of the pixels; None: all, in order.
+        line: index of the scan line under each pixel, (ny, nx). If it is None, the rows of the array are the
+            scan lines.
+        at: flat indices of the pixels. If it is None, all pixels are used in order.
     """
 
     prediction_um: np.ndarray
@@ -43,7 +44,7 @@ class TermPixels:
 
     @cached_property
     def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Return the change of the predicted height per pixel along y and along x, (n,) µm each."""
+        """Return the change of the predicted height per pixel along y and along x, two arrays (n,) in µm."""
         slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
         return self._taken(slopes[0]), self._taken(slopes[1])
 
@@ -69,13 +70,16 @@ class ScanTerm:
     """One term that a scan adds to the height.
 
     Attributes:
-        name: its name in sets of terms.
-        effect: the effect that it represents; several terms may share one. None for a control.
-        unit: unit of its coefficients: ``µm`` of height, ``1``, or ``px`` of displacement.
+        name: name of the term in sets of terms.
+        effect: the effect that the term represents, or None for a control. Several terms may represent the
+            same effect.
+        unit: unit of the coefficients, which is ``µm`` for a height, ``px`` for a displacement, or ``1``.
         labels: description of each map; line offsets have one description.
-        maps: function of the pixels, returns (k, n); maps other than the datum have zero mean over the scan.
-        lines: for line offsets: (shape, scan line index) to the line index of each pixel.
-        frame: for line offsets: the frame of the lines.
+        maps: function that returns the smooth maps (k, n) at the pixels. All maps except the datum have zero
+            mean over the scan.
+        lines: for line offsets, function that returns the line index of each pixel, given the shape of the
+            scan and the index of the scan lines.
+        frame: for line offsets, the name of the lines that the offsets follow.
     """
 
     name: str
@@ -144,7 +148,9 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
 
 @lru_cache(maxsize=8)
 def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
-    """Return x, y, x², xy, y² on -1 ... 1 over a scan (ny, nx), each of zero mean: (5, ny, nx), read-only."""
+    """Return maps of x, y, x², xy and y² over a scan, (5, ny, nx), where x and y run from -1 to 1. The mean
+    of each map is subtracted. The array is read-only.
+    """
     ny, nx = shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     shapes = np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])

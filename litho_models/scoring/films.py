@@ -1,7 +1,7 @@
 """Compare films by area and by missing, extra or merged features.
 
-A feature is a connected part of the film, or of the ground within the film, of at least four pixels; films
-are cut at half their height.
+A feature is a connected part of the film or of the ground with at least four pixels. Pixels count as film if
+they are higher than half the height of the film.
 """
 
 from typing import NamedTuple
@@ -15,14 +15,14 @@ _LEAST_PX = 4
 FILMS_TEXT = (
     "The area error is the absolute difference between the predicted and the measured area of the film. "
     "Features are connected parts of film or ground of at least four pixels. Measured features that share no "
-    "pixel with the prediction are missing; predicted features that share none with the measurement are "
-    "extra. Merged counts films that are joined only in the prediction or only in the measurement."
+    "pixel with the prediction are missing, and predicted features that share no pixel with the measurement "
+    "are extra. Films that are joined only in the prediction or only in the measurement count as merged."
 )
 
 
 class FilmErrors(NamedTuple):
-    """``area_error_percent`` is relative to the measured area, or None if that is zero; the other fields are
-    counts of features.
+    """The errors of a predicted film. ``area_error_percent`` is relative to the measured area, or None if the
+    measured area is zero. The other fields are counts of features.
     """
 
     area_error_percent: float | None
@@ -45,8 +45,9 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
     """Compare two films.
 
     Args:
-        measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape, without NaN.
-        edge_um: height at which the films have their edges.
+        measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
+        expected_um: the same shape, without NaN.
+        edge_um: height of the contour that is the edge of a film, µm.
     """
     known = np.isfinite(measured_um)
     measured, expected = (known & (one > edge_um) for one in (measured_um, expected_um))

@@ -2,7 +2,7 @@
 
 Residuals that are the same in similar surroundings can still be learned by a model of the layout; differences
 between such residuals are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
-compared with pixels of other scans, so datum, gain and bow of single scans count as noise.
+compared with pixels of other scans, so the datum, the gain and the bow of an individual scan count as noise.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,13 @@ _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
 
 class LikePixels(NamedTuple):
-    """Pixels of several scans, each with its most similar pixels in ``PARTNERS`` other scans.
+    """A sample of pixels, and for each pixel the most similar pixels of ``PARTNERS`` other scans.
 
     Attributes:
-        owner: number of the scan of each pixel, (n,); ``pixel``: its flat index in that scan, (n,).
-        partners: positions in these arrays, (n, m); each row contains at most one pixel of a scan.
+        owner: (n,) the number of the scan that contains each pixel.
+        pixel: (n,) the flat index of each pixel in its scan.
+        partners: (n, m) the positions in these arrays of the pixels that are most similar to each pixel. The
+            pixels in one row belong to different scans.
     """
 
     owner: Array
@@ -34,15 +36,15 @@ class LikePixels(NamedTuple):
     partners: Array
 
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
-        """Return each pixel's estimate of the variance of its noise, and its squared residual, (n,) each.
+        """Return an estimate of the noise variance at each pixel, (n,), and the squared residuals, (n,).
 
         Each residual r₀, r₁ ... r_m is noise plus a misfit that similar surroundings share. The mean of (r₀ −
         r_j)(r₀ − r_k), j ≠ k, is therefore the variance of the noise in r₀ alone, whatever the noise of the
-        partners. Half a squared difference would be too small for rare surroundings, which are rougher than
-        their partners.
+        partners. Half of a squared difference would be too small for pixels with rare surroundings, which are
+        rougher than the surroundings of their partners.
 
         Args:
-            residuals: one map per scan, (ny, nx); the result is in their unit squared.
+            residuals: one map (ny, nx) per scan. The results are in the square of its unit.
         """
         value = np.empty(len(self.owner))
         for number, residual in enumerate(residuals):
@@ -54,12 +56,14 @@ class LikePixels(NamedTuple):
 
 
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
-    """Draw pixels, and find for each the pixels of other scans with the most similar surroundings.
+    """Draw pixels at random. For each of them, find the pixels of other scans with the most similar
+    surroundings.
 
     Only prints of one dose are compared, because the dose changes the height even for equal layouts.
 
     Args:
-        scans: scans with layouts that vary, at least three of them of one dose; otherwise the result is None.
+        scans: scans whose layouts vary. At least three of them must have the same dose. Otherwise, the result
+            is None.
         scored: for each scan, bool (ny, nx), True for pixels that count.
         seed: decides which pixels are drawn.
     """
@@ -97,7 +101,9 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Return features of each pixel's surroundings: blurred layouts and two slopes, (k, ny·nx), µm."""
+    """Return features that describe the surroundings of each pixel: blurred layouts and two slopes, all in
+    µm. The array is (k, ny·nx).
+    """
     maps = [blurred_layout_um(scan, sigma_um) for sigma_um in _BLURS_UM]
     slopes = np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM))
     maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
@@ -105,7 +111,9 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
-    """Blur the layout of a scan by a Gaussian, (ny, nx) float64; its outermost pixels are repeated."""
+    """Return the layout of a scan blurred by a Gaussian, (ny, nx) float64. Beyond the edge of the layout, its
+    outermost pixels are repeated.
+    """
     from scipy.ndimage import gaussian_filter
 
     return gaussian_filter(scan.layout_um.astype(np.float64), sigma_um / scan.pitch_um, mode="nearest")

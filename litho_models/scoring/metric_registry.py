@@ -30,14 +30,17 @@ class Metric(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Return the name in results and tables: with the unit, unless the unit is ``1``."""
+        """Return the name of the metric in results and tables. It ends with the unit, unless the unit is
+        ``1``.
+        """
         return self.name if self.unit == "1" else f"{self.name}_{self.unit}"
 
 
 class Measurement(NamedTuple):
-    """The metrics that one function returns, in this order, with a sentence that explains them.
+    """The metrics that a function returns, in the same order, and a sentence that explains them.
 
-    ``of_films`` says whether only films (True) or only heights (False) have them; None means all scans.
+    ``of_films`` is True if only films have these metrics, False if only heights have them, and None if all
+    scans have them.
     """
 
     metrics: tuple[Metric, ...]
@@ -76,9 +79,10 @@ def register_metric(
 ) -> Metric:
     """Register a metric, which every later evaluation and benchmark of this process then computes.
 
-    ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan``, the predicted map, and
-    measured minus predicted heights without the per-scan terms, (ny, nx) in µm, NaN where not scored. The
-    function returns a number, or None if there is nothing to measure. Example::
+    ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps, both (ny, nx) in
+    µm. The first map is the prediction. The second map is the measured minus the predicted height after the
+    per-scan terms are removed; it is NaN at pixels that are not scored. The function returns a number, or
+    None if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
@@ -88,11 +92,12 @@ def register_metric(
     Results list it by scan and by model as ``metrics: {"worst_pixel_nm": …}``.
 
     Args:
-        name: letters, digits and underscores; ``unit``: ``1`` if it has none.
+        name: letters, digits and underscores.
+        unit: the same characters; ``1`` for a metric without a unit.
         function: as above.
         explanation: a sentence for the report.
-        over_scans: how the value of a model is computed from its scans: mean of the known values, or their
-            sum.
+        over_scans: whether the value of a model is the ``mean`` or the ``sum`` of the known values of its
+            scans.
 
     Raises:
         InputError: a name or unit that is not an identifier, a name that is already taken, or an unknown
@@ -122,7 +127,7 @@ def metrics_text(keys: Collection[str]) -> str:
 
 
 def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> dict[str, Any]:
-    """Compute all metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
+    """Compute all metrics of one scan from maps (ny, nx) in µm. Return them as fields of ``MetricValues``.
 
     Raises:
         InputError: a metric that returns neither a number nor None.
@@ -137,7 +142,9 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
 
 
 def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
-    """Combine the metrics of scans into those of a model: means of known values, or sums, as fields."""
+    """Combine the metrics of scans into the metrics of a model: the mean or the sum of the known values of
+    each metric. Return them as fields of ``MetricValues``.
+    """
     values = {}
     for metric in registered_metrics():
         if not any(metric.key in ScanRow.model_fields or metric.key in row.metrics for row in rows):

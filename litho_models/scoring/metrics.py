@@ -19,7 +19,7 @@ INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """The line measured height = slope · prediction + intercept, and the standard error of the slope.
+    """A fitted line, measured height = slope · prediction + intercept, and the standard error of its slope.
 
     A value is None if it cannot be computed: a constant prediction has no slope, and a single block gives no
     error.
@@ -33,14 +33,16 @@ class PrintGain(NamedTuple):
 def print_gain(
     height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
-    """Fit a least-squares line to the used pixels of a scan.
+    """Fit a least-squares line to the selected pixels of a scan.
 
     Residuals of neighbouring pixels are correlated, so the variance is computed from whole blocks (Liang and
-    Zeger 1986). The sums of residual times regressor over a block are taken as independent between blocks,
-    which holds if blocks are wide compared with the correlation length (7 px on the measured prints).
+    Zeger 1986). In each block, the products of residual and regressor are summed. The sums of different
+    blocks are assumed to be independent, which holds if the blocks are wide compared with the correlation
+    length (7 px on the measured prints).
 
     Args:
-        height_um, prediction_um: (ny, nx), float; ``used``: (ny, nx) bool with at least one pixel.
+        height_um, prediction_um: (ny, nx), float.
+        used: (ny, nx), bool; True for the selected pixels, of which there is at least one.
         block_px: side of a block.
     """
     x, y = (np.asarray(a, np.float64)[used] for a in (prediction_um, height_um))
@@ -59,9 +61,9 @@ def print_gain(
 
 
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
-    """Score one prediction against one scan, (ny, nx) µm each, on the pixels that ``cross_fit`` scores.
+    """Score a prediction against a scan, both (ny, nx) in µm, on the pixels that ``cross_fit`` scores.
 
-    ``print_gain`` computes slope and intercept, the gain and offset of the print.
+    ``print_gain`` computes the slope and the intercept, which are the gain and the offset of the print.
 
     Raises:
         InputError: no valid pixel.
@@ -85,16 +87,16 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
 
 
 def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtocol) -> Array:
-    """Return the measured minus the expected map of a scan, (ny, nx) µm, without its per-scan terms; NaN
-    where not scored.
+    """Return the measured minus the expected map of a scan after its per-scan terms are removed. The result
+    is (ny, nx) in µm, and NaN at pixels that are not scored.
     """
     terms = policy_terms(protocol.policy)
     return cross_fit(scan.height_um, expected_um, scan.valid, terms, protocol.blocks).residual_um
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the mean over scans of the datum-free error of a model's heights (ny, nx), under policy
-    ``offset``.
+    """Return the datum-free error of a model under policy ``offset``, averaged over scans. ``heights_um``
+    contains the predicted heights (ny, nx) of each scan.
     """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))

@@ -1,4 +1,5 @@
-"""Estimate the noise floor of a dataset: the smallest possible error of any model, for each set of terms.
+"""Estimate the noise floor of a dataset: the smallest possible error of any model, for each set of per-scan
+terms.
 
 The floor is measured on flat or repeated prints if there are any. Otherwise it is estimated from the
 out-of-fold residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
@@ -24,10 +25,10 @@ NOISE_FILE = "noise.json"
 
 
 class PolicyFloor(Record):
-    """The floor of the errors under one nuisance policy, nm, with 95 % confidence intervals over prints.
+    """The floor of the errors (in nm) under one nuisance policy, with 95 % confidence intervals over prints.
 
-    ``k`` is the number of terms per scan, or the effective number if lines have offsets. There is no interval
-    with fewer than six prints.
+    ``k`` is the number of terms per scan. If the policy includes line offsets, it is the effective number of
+    terms. The intervals are None if there are fewer than six prints.
     """
 
     policy: Policy
@@ -41,9 +42,10 @@ class PolicyFloor(Record):
 class NoiseFloor(Record):
     """The error that noise alone causes; ``kind`` states how it was estimated.
 
-    ``mae_nm`` and ``rmse_nm`` are those of policy ``offset``. ``by_policy`` has a floor for each policy; it
-    is empty in older result files, or if only the floor of ``offset`` is known. The kinds ``lower-bound`` and
-    ``literature`` occur in older files, and the first also in loops on fewer than three scans.
+    ``mae_nm`` and ``rmse_nm`` are the floors under policy ``offset``. ``by_policy`` has a floor for each
+    policy; it is empty in older result files, or if only the floor of ``offset`` is known. The kinds
+    ``lower-bound`` and ``literature`` occur in older files; ``lower-bound`` also occurs in loops on fewer
+    than three scans.
     """
 
     mae_nm: float | None
@@ -53,11 +55,11 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """Return the floor of the errors under this policy; None if unknown."""
+        """Return the floor of the errors under this policy; None if it is unknown."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
-        """Return the mean absolute error of the floor under this policy, nm."""
+        """Return the floor of the mean absolute error under this policy, in nm; None if it is unknown."""
         row = self.at(policy)
         return row.mae_nm if row else self.mae_nm if policy == "offset" else None
 
@@ -66,7 +68,8 @@ UNKNOWN_FLOOR = NoiseFloor(
     mae_nm=None,
     rmse_nm=None,
     kind="unknown",
-    source="no flat or repeated print, and no out-of-fold residuals of three scans of one dose",
+    source="there are no flat or repeated prints, and no out-of-fold residuals of three scans with the same "
+    "dose",
 )
 
 
@@ -85,10 +88,11 @@ def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
-        analysis: ``noise.json`` of this dataset or of scans without a dataset, or the folder of this file.
+        analysis: path of ``noise.json`` or of its folder. The analysis must describe this dataset, or scans
+            without a dataset.
 
     Raises:
-        InputError: no noise analysis there, or an analysis of another dataset.
+        InputError: no noise analysis at this path, or an analysis of another dataset.
     """
     if analysis is None:
         return UNKNOWN_FLOOR
@@ -109,9 +113,10 @@ def estimated_floor(
 
     Args:
         model: its name, for ``source``.
-        scans: held-out scans; ``maps_um``: the map that the model expects for each, (ny, nx) µm.
-        blocks: choice of the pixels that fit terms and of those that are scored, as for the errors that are
-            compared with the floor.
+        scans: held-out scans.
+        maps_um: for each scan, the map that the model expects, (ny, nx) in µm.
+        blocks: selects the pixels to which terms are fitted and the pixels that are scored. Use the same
+            blocks as for the errors that are compared with the floor.
         seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
@@ -123,8 +128,8 @@ def freed_by_policy(
     blocks: Blocks | None = None,
     policies: Iterable[Policy] = tuple(POLICIES),
 ) -> dict[Policy, list[CrossFit]]:
-    """Return the residuals of each scan under each policy; ``maps_um`` contains the expected maps (ny, nx),
-    µm.
+    """Return the residuals of each scan under each policy. ``maps_um`` contains the expected maps, (ny, nx)
+    in µm.
     """
     return {
         policy: [
@@ -143,17 +148,18 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """Estimate an upper limit on the floor from the residuals of held-out scans.
 
-    On a random sample of pixels, ``LikePixels`` finds the part of the squared error that pixels with similar
-    surroundings do not share. The floor is the error over all scored pixels times the square root of this
-    part. For the mean absolute error, this assumes that noise and residual have distributions of the same
-    shape, that is, the same E|n|/σ. The noise need not be Gaussian, because it makes up nearly all of the
-    residual. If a misfit of another shape made up half of the squared error (Laplace in Gaussian noise or the
-    reverse), the floor would be wrong by up to 6 %.
+    On a random sample of pixels, ``LikePixels`` finds the fraction of the squared error that pixels with
+    similar surroundings do not share. The floor is the error over all scored pixels times the square root of
+    this fraction. For the mean absolute error, this assumes that the distributions of the noise and of the
+    residual have the same shape, that is, the same E|n|/σ. The noise need not be Gaussian, because nearly all
+    of the residual is noise. Suppose that half of the squared error came from a misfit with another
+    distribution than the noise (a Laplace distribution in Gaussian noise, or the reverse). Then the floor
+    would be wrong by up to 6 %.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        freed: from ``freed_by_policy``, including ``offset``.
+        freed: result of ``freed_by_policy``, which must include the policy ``offset``.
         seed: decides which pixels are drawn.
     """
     # Scans are taken in the order of their ids, so that the same scans always give the same pixels.
@@ -172,9 +178,9 @@ def floor_of_residuals(
         mae_nm=offset.mae_nm,
         rmse_nm=offset.rmse_nm,
         kind="upper-estimate",
-        source=f"residuals of {model} on scans that it had not seen, {len(drawn.owner):,} pixels compared "
-        "with those of similar layout surroundings in other scans; effects of the layout from farther away "
-        "or in finer detail than is compared still count as noise",
+        source=f"residuals of {model} on scans that it had not seen; {len(drawn.owner):,} pixels are "
+        "compared with pixels of other scans that have similar layout surroundings. Effects of layout "
+        "details that are farther away or finer than those compared still count as noise",
         by_policy=rows,
     )
 

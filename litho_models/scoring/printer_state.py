@@ -17,13 +17,14 @@ _SURFACE = frozenset({"offset", "bow"})
 
 
 class ScanFigures(Record):
-    """Values that compare one scan with a model, without the scan's offset, tilt and bow.
+    """Values that compare a scan with a model, after the offset, tilt and bow of the scan are removed.
 
-    ``gain`` is measured over predicted height, with its standard error, which is computed over blocks (see
-    ``print_gain``; None for a single block). ``error_nm`` is the mean absolute error with the gain fitted too
-    (policy ``full``, k = 7), and with terms fitted on other pixels. ``order`` is the position in printing
-    order. ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height,
-    which characterise the layout. ``held_out`` says that the model was not trained on the scan.
+    ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is its
+    standard error, which is computed over blocks and is None for a single block (see ``print_gain``).
+    ``error_nm`` is the mean absolute error under policy ``full`` (k = 7), which also fits the gain. Its terms
+    are fitted on pixels other than those that are scored. ``order`` is the position in printing order.
+    ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height, which
+    characterise the layout. ``held_out`` is True if the model was not trained on the scan.
     """
 
     scan: str
@@ -44,11 +45,12 @@ def scan_figures(
 ) -> ScanFigures | None:
     """Return the values that compare a scan with a model; None for a flat layout, which has no gain.
 
-    Offset, tilt and bow are removed from both height and prediction, which gives the same gain as a joint fit
-    of all terms (Frisch and Waugh 1933).
+    Offset, tilt and bow are removed from both the measured and the predicted height. This gives the same gain
+    as a joint fit of all terms (Frisch and Waugh 1933).
 
     Args:
-        scan: the scan; ``prediction_um``: expected map (ny, nx), µm.
+        scan: the scan.
+        prediction_um: the map that the model expects, (ny, nx) in µm.
         held_out: whether the model was not trained on the scan.
 
     Raises:
@@ -83,8 +85,8 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Return the values of a model's training scans for its card; an empty list if the scans are too
-    small.
+    """Return the ``ScanFigures`` of the scans on which a model was trained, as entries of its card. The list
+    is empty if the scans are too small.
     """
     pairs = zip(scans, predictions_um, strict=True)
     try:

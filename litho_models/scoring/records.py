@@ -27,8 +27,8 @@ LEADING["sem"] = "edge_mean_nm"
 
 
 class Prediction(NamedTuple):
-    """The maps that a model predicts for a scan, (ny, nx) µm: the print and, if known, the part that scans
-    share.
+    """The maps that a model predicts for a scan, (ny, nx) in µm: the height of the print and, if it is known,
+    the background that all scans share.
     """
 
     height_um: Array
@@ -36,7 +36,7 @@ class Prediction(NamedTuple):
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """Make the prediction of a print with a learned background, if there is one."""
+        """Make the prediction of a print, including a learned background if there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
@@ -63,8 +63,9 @@ class PolicyError(Record):
 class MetricValues(Record):
     """Metrics in addition to the errors, computed on maps without the per-scan terms (``metric_registry``).
 
-    SSIM is as in ``structural_similarity`` and edges are as in ``EdgePlacement``; others are listed by name
-    and unit under ``metrics``. A metric is None if there was nothing to compare, and in older result files.
+    ``structural_similarity`` computes the SSIM, and ``EdgePlacement`` explains the edge metrics. Other
+    metrics are listed by name and unit under ``metrics``. A metric is None if there was nothing to compare,
+    or if the result file is older than the metric.
     """
 
     ssim: float | None = None
@@ -84,9 +85,10 @@ class MetricValues(Record):
 class ScanErrors(Record, extra="ignore"):
     """The error of one model on one scan over the scored pixels.
 
-    ``*_abs`` and ``bias`` (measured minus predicted) use no fit to the scan; for ``*_datum_free``, terms
-    fitted on other pixels are removed. Slope and intercept are the gain and offset of the measured relative
-    to the predicted height (``print_gain``).
+    ``*_abs`` and ``bias`` (measured minus predicted) are computed without any fit to the scan.
+    ``*_datum_free`` are computed after per-scan terms are removed, which are fitted on other pixels.
+    ``slope`` and ``intercept_nm`` are the gain and the offset of the measured height relative to the
+    predicted height (see ``print_gain``).
     """
 
     pixels: int
@@ -113,9 +115,9 @@ class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model: means over scans, sums of counts, and confidence intervals from resampled
     scans.
 
-    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies that
-    have no smooth terms themselves. It is empty if the protocol has no background. ``phase_rms_waves`` is the
-    RMS phase error of light that passes through the print.
+    ``without_background`` contains the errors of ``by_policy`` as they are without the background of the
+    protocol. It covers only the policies without smooth terms, and is empty if the protocol has no
+    background. ``phase_rms_waves`` is the RMS phase error of light that passes through the print.
     """
 
     model: str
@@ -139,8 +141,8 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_nm(self) -> float:
-        """Return the error by which models are ranked: the error of edges for films, otherwise of heights;
-        infinite if a film has no edge.
+        """Return the error by which models are ranked. For films it is the error of edges, and infinite if
+        there are no edges. Otherwise, it is the error of heights.
         """
         value = getattr(self, LEADING[self.seen_by])
         return math.inf if value is None else float(value)
@@ -158,11 +160,11 @@ class ModelScores(MetricValues, extra="ignore"):
 
 
 class Paired(Record):
-    """The mean over scans of the first model's leading error minus the second's; a negative mean favours the
-    first model.
+    """The leading error of the first model minus that of the second model, averaged over scans. A negative
+    mean favours the first model.
 
-    ``over_prints`` is the same comparison with whole prints resampled; None for a single print, or in older
-    result files.
+    ``over_prints`` is the same comparison, but resamples whole prints. It is None for a single print and in
+    older result files.
     """
 
     first: str
@@ -176,7 +178,8 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of the same scans, paired by id, because results list scans by fold.
+    """Compare the leading errors of two models on the same scans. Scans are paired by id, because results
+    list scans by fold.
 
     Raises:
         InputError: scores of different scans.

@@ -29,8 +29,10 @@ def score_model(
 
     Args:
         name: name of the model.
-        scans: the scans; ``predictions``: the model's prediction of each.
-        protocol: terms to remove from scans, and whether the predictions include backgrounds.
+        scans: the scans.
+        predictions: the prediction of the model for each scan.
+        protocol: states which terms are removed from the scans, and whether the predictions include
+            backgrounds.
 
     Raises:
         InputError: predictions that are not finite, or a scan too small for the policies.

@@ -26,16 +26,17 @@ SIMILARITY_TEXT = (
     f"range of {SSIM_RANGE_UM:g} µm."
 )
 EDGES_TEXT = (
-    "Edge shifts are distances from measured to predicted contours at the heights half way between nominal "
-    f"levels, for pieces of contour that have a partner within {SEARCH_UM:g} µm (for films: at half their "
-    f"height, within {FILM_SEARCH_PX:g} px). The counts are the pieces of measured contours with and without "
-    "a partner, and the pieces of predicted contours without one."
+    "Edge shifts are distances from measured to predicted contours. The contours are taken at the heights "
+    "halfway between nominal levels; for films, they are taken at half the height of the film. Only pieces "
+    f"of contour that have a partner within {SEARCH_UM:g} µm (within {FILM_SEARCH_PX:g} px for films) are "
+    "included. The counts state how many pieces of measured contours have a partner, how many have none, and "
+    "how many pieces of predicted contours have none."
 )
 
 
 class EdgePlacement(NamedTuple):
-    """The distances of the pieces of the measured contours (each at most a pixel long) from the expected
-    contour.
+    """Distances between measured and expected contours. The contours are divided into pieces, each of which
+    lies within one pixel.
 
     A piece has a partner if the expected contour of the same height passes within the search distance and
     rises to the same side. ``mean_nm`` and ``p95_nm`` cover the pieces with a partner and are None if no
@@ -55,8 +56,8 @@ class _Contour(NamedTuple):
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
-    """Return the SSIM between the prediction and the scan without its per-scan terms (prediction plus
-    residual).
+    """Return the SSIM between the predicted and the measured map. The measured map without its per-scan terms
+    is the prediction plus the residual.
     """
     return structural_similarity(prediction_um + residual_um, prediction_um)
 
@@ -76,7 +77,8 @@ def structural_similarity(measured_um: Array, expected_um: Array) -> float | Non
     data range is ``SSIM_RANGE_UM`` for all maps. Only windows within the scored pixels count.
 
     Args:
-        measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape.
+        measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
+        expected_um: the same shape.
 
     Returns:
         None if no window lies within the scored pixels.
@@ -111,11 +113,12 @@ def edge_placement(
     """Compare the contours of two maps.
 
     Args:
-        measured_um: (ny, nx) µm, NaN where not scored; contours end there in both maps.
-        expected_um: (ny, nx) µm.
-        heights_um: heights of the contours, µm (see ``mid_step_heights_um``); ``pitch_um``: sampling of the
-            maps, µm.
-        search_um: largest distance of a partner.
+        measured_um: (ny, nx) in µm. Pixels that are not scored are NaN, and the contours of both maps end at
+            them.
+        expected_um: (ny, nx) in µm.
+        heights_um: heights of the contours, µm (see ``mid_step_heights_um``).
+        pitch_um: sampling of the maps, µm.
+        search_um: largest distance between a piece of contour and its partner, µm.
     """
     expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
     distances, missing, unexpected = [np.empty(0)], 0, 0
@@ -136,8 +139,8 @@ def edge_placement(
 
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
-    """Return the heights half way between neighbouring nominal levels, µm; if there are many levels, only 24
-    evenly spaced heights.
+    """Return the heights halfway between neighbouring nominal levels, in µm. If there are many levels, return
+    only 24 evenly spaced heights.
     """
     steps = min(levels - 1, _MOST_HEIGHTS)
     return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)
@@ -154,8 +157,8 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
 
 
 def _distance_px(of: _Contour, to: _Contour, search_px: float) -> Array:
-    """Return the distance of the middle of each piece from the nearest piece that rises to the same side; inf
-    if there is none.
+    """Return the distance from the middle of each piece of one contour to the nearest piece of the other
+    contour that rises to the same side; inf if there is none.
     """
     from scipy.spatial import KDTree
 

@@ -1,6 +1,6 @@
 """Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are
-resampled, and sign-flip tests flip whole scans. If the scans of a print share its day and batch, whole prints
-are used instead.
+resampled, and sign-flip tests flip whole scans. If the scans of a print share a day and a batch, whole prints
+are resampled instead of scans.
 """
 
 from collections.abc import Hashable, Sequence
@@ -46,7 +46,8 @@ def bootstrap_interval(
     A single scan or group cannot be resampled, so both ends are NaN.
 
     Args:
-        values: one per scan; ``groups``: the print of each scan, if prints are resampled instead of scans.
+        values: one per scan.
+        groups: the print of each scan, if prints are resampled instead of scans.
     """
     sums, counts = _by_group(values, groups)
     if sums.size < 2:
@@ -55,13 +56,15 @@ def bootstrap_interval(
 
 
 def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
-    """Return the confidence interval of a mean over pixels, from resampling prints; each print is weighted by
-    its number of pixels.
+    """Return the confidence interval of a mean over pixels. Whole prints are resampled, and each print is
+    weighted by its number of pixels.
 
     Return None if the pixels come from fewer than ``FEWEST_FOR_INTERVAL`` prints.
 
     Args:
-        values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
+        values: one per pixel.
+        owner: the number of the scan that contains each pixel.
+        groups: the print of each scan.
     """
     sums, counts = (
         _by_group(np.bincount(owner, own, minlength=len(groups)), groups)[0] for own in (values, None)
@@ -80,7 +83,9 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
 
 
 def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
-    """Return the sum and count of the values of each group; without groups, each value is a group."""
+    """Return the sum and the number of the values in each group. Without groups, each value is a group of its
+    own.
+    """
     sample = np.asarray(values, np.float64)
     if groups is None:
         return sample, np.ones(sample.size)
@@ -94,8 +99,8 @@ def interval(values: Sequence[float]) -> Interval:
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
-    """Return signs (draws, count), the observed signs first: all combinations for up to ``exact_scans``
-    scans, otherwise 10,000 draws.
+    """Return combinations of signs, (draws, count); the observed signs come first. For up to ``exact_scans``
+    scans, all combinations are returned. For more scans, 10,000 combinations are returned.
     """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
@@ -104,7 +109,7 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
 
 
 def one_sided_flip_p(values: Array) -> float:
-    """Return the share of sign flips of the scans' values whose sum reaches the observed sum."""
+    """Return the share of sign flips for which the sum of the values is at least the observed sum."""
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
 
@@ -122,9 +127,9 @@ class OverUnits(Record):
     prints.
 
     ``count`` is the number of units, and ``positive`` the number of units with a positive difference.
-    ``ci95_nm`` is a bootstrap interval, None with fewer than ``FEWEST_FOR_INTERVAL`` units. ``p`` comes from
-    two-sided sign flips: all combinations for up to 14 units, and for more units the observed signs and 9,999
-    random combinations. It is never below ``smallest_p``.
+    ``ci95_nm`` is a bootstrap interval, or None if there are fewer than ``FEWEST_FOR_INTERVAL`` units. ``p``
+    is that of a two-sided sign-flip test. For up to 14 units, the test uses all combinations of signs. For
+    more units, it uses the observed signs and 9,999 random combinations. ``p`` is never below ``smallest_p``.
     """
 
     count: int
@@ -137,8 +142,8 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test a difference that is given for each scan, by resampling scans, or ``groups`` (the print of each
-    scan).
+    """Test a difference that is given for each scan, by resampling scans. If ``groups`` states the print of
+    each scan, whole prints are resampled instead.
 
     Raises:
         InputError: no difference.
@@ -158,7 +163,9 @@ def over_units(
 
 
 def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
-    """Test a difference that is given for each scan, by resampling ``prints``; None for a single print."""
+    """Test a difference that is given for each scan, by resampling whole prints. Return None if there is only
+    one print.
+    """
     return over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
 
 
@@ -166,10 +173,11 @@ class ByPrint(Record):
     """A one-way analysis of variance of one estimate per scan, with prints as groups.
 
     Args:
-        f: mean square between prints divided by the mean square within prints, with ``degrees`` of freedom
-            (between, within).
+        f: mean square between prints divided by the mean square within prints.
+        degrees: degrees of freedom between prints and within prints.
         icc: share of the variance that scans of one print have in common; a negative estimate is set to 0.
-        p: share of permutations of the scans, including the observed order, whose ``f`` is at least as large.
+        p: share of permutations of the scans for which ``f`` is at least as large as in the observed order.
+            The observed order is one of the permutations.
     """
 
     f: float

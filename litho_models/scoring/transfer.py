@@ -28,11 +28,11 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """The prediction H compared with the measurement Z at each frequency: |H·Z*| / |Z|² and coherence γ²,
-    along x and y.
+    """A comparison of the spectra of the prediction H and the measurement Z along x and y. At each frequency,
+    it states the gain |H·Z*| / |Z|² and the coherence γ².
 
-    ``error_psd`` is the one-sided power density of the error along lines, nm² per cycle/µm, with line means
-    removed.
+    ``error_psd`` is the one-sided power spectral density of the error along lines, in nm² per cycle/µm. The
+    mean of each line is removed first.
     """
 
     frequency_per_um: list[float]
@@ -45,11 +45,12 @@ class TransferCurves(Record, extra="ignore"):
 
 
 def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
-    """Return the bias (measured minus predicted) and standard deviation for each layout level, over scored
-    pixels.
+    """Return the bias (measured minus predicted) and the standard deviation of the error for each layout
+    level. Only scored pixels count.
 
     Args:
-        scans: the scans; ``residuals_um``: measured minus predicted (ny, nx), NaN where not scored.
+        scans: the scans.
+        residuals_um: measured minus predicted (ny, nx); NaN at pixels that are not scored.
     """
     levels = np.concatenate([s.mask_level[np.isfinite(r)] for s, r in zip(scans, residuals_um, strict=True)])
     errors = np.concatenate([r[np.isfinite(r)] for r in residuals_um]) * NM_PER_UM
@@ -89,10 +90,10 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Return sums over all lines and over the frequencies of each band, (5, bands): cross, measured,
-    predicted, error, count.
+    """Return five rows, (5, bands): cross, measured, predicted, error and count. Each value is a sum over all
+    lines and over the frequencies of one band.
 
-    The error is a one-sided density (µm² per cycle/µm), and the count is the number of its terms.
+    The error is a one-sided density (µm² per cycle/µm), and the count is the number of terms in its sum.
     """
     window = np.hanning(height.shape[1])
     measured, predicted = (

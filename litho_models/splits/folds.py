@@ -21,7 +21,9 @@ QUADRANTS = (0, 1, 2, 3)
 
 
 class Split(Record):
-    """The division of a dataset; ``lock_box`` contains its locked scans, scored or not."""
+    """How a dataset is divided into folds. ``lock_box`` lists its locked scans, whether or not they were
+    scored.
+    """
 
     kind: str
     folds: int = 0
@@ -79,8 +81,8 @@ def plan_folds(
     seed: int = 0,
     open_lock_box: bool = False,
 ) -> list[Fold]:
-    """Return the folds of a split. No fold contains scans of the lock box, except in the split ``paper``,
-    which leaks.
+    """Return the folds of a split. The split ``paper`` leaks, and it also uses the scans of the lock box. The
+    other splits use these scans only if ``open_lock_box`` is set.
 
     Raises:
         InputError: too few scans, no lock box to open, or an unknown split.
@@ -120,15 +122,15 @@ def plan_folds(
 
 
 def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
-    """Divide the scans into ``k`` folds. Each fold lists the ids that its training leaves out.
+    """Divide the scans into ``k`` folds. Return the ids that each fold holds out.
 
     Raises:
-        InputError: repeated ids, fewer than two ids, or ``k`` outside 2 ... number of scans.
+        InputError: repeated ids, fewer than two ids, or a ``k`` that is below 2 or above the number of scans.
     """
     require_unique(ids)
     if len(ids) < 2:
         raise InputError(
-            "scans to divide into folds", got=len(ids), wanted="at least 2, one of them held out"
+            "scans to divide into folds", got=len(ids), wanted="at least 2, so that one can be held out"
         )
     if not 2 <= k <= len(ids):
         raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
@@ -153,7 +155,7 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 
 
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
-    """Return the crops held out in one random draw over quadrants, as in the paper (24 of 96).
+    """Draw quadrants at random, and return them as the held-out crops. The paper draws 24 of 96 in this way.
 
     Quadrants of one scan are in both the training and the held-out set, so this split leaks. Use it only for
     comparison with the paper.
@@ -166,8 +168,8 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose the training scans that are set aside to select the checkpoint: ``count`` scans, but at most a
-    quarter of all.
+    """Choose the training scans that are set aside to select the checkpoint. These are ``count`` scans, but
+    at most a quarter of all.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))

@@ -2,7 +2,7 @@
 
 A function that treats both axes alike returns the transposed result for a transposed field. A function that
 uses a pitch, a size or a position of the wrong axis does not, because the fields and pixels are not square.
-Positions are checked by each room's own tests; here they are checked only for functions that resample.
+Positions are checked by other tests; here, they are checked only for functions that resample.
 """
 
 from __future__ import annotations

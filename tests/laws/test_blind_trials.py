@@ -1,4 +1,4 @@
-"""Check the blind trials: draws, sizes, judgements, interrupted campaigns, and whole trials."""
+"""Test the draws, sizes and judgements of blind trials, interrupted campaigns, and whole trials."""
 
 from __future__ import annotations
 
@@ -241,7 +241,9 @@ def test_a_full_hill_response_replaces_the_logistic():
     ],
 )
 def test_a_planted_form_has_the_size_that_it_claims(name):
-    """Check the size of a planted form: the residual that the plain fab and the scan terms cannot explain."""
+    """Check the size of a planted form. It is the residual that the plain fab and the scan terms cannot
+    explain.
+    """
     # A short reach of the polymer network saves time.
     draw = drawn(cause(name, 9.0), printer={"network_reach_um": 0.3})
     jobs = trial_jobs(draw, 2, 96)
@@ -260,7 +262,7 @@ def test_a_planted_form_has_the_size_that_it_claims(name):
 
 @pytest.mark.long
 def test_what_the_base_can_imitate_does_not_count():
-    """Check that Physics fits a plain fab with other parameters without residual, from any start."""
+    """Check that Physics fits a plain fab with other parameters exactly, from any starting point."""
     other = {"threshold_steepness": 2.2, "loose_retention": 0.45, "network_reach_um": 1.6}
     draw = drawn(printer=other)
     jobs = trial_jobs(draw, 4, 96)
@@ -332,9 +334,9 @@ def said(
     seen: Sequence[str] = (),
     **more: str,
 ) -> Answer:
-    """Return a loop's result with findings ``seen`` in single scans and verdicts ``more`` on candidates.
+    """Return the result of a loop. ``seen`` lists its findings in single scans; ``more`` gives its verdicts.
 
-    A candidate is named with _ in place of -.
+    The keywords in ``more`` are the names of candidates, with _ in place of -.
     """
     result = CloseLoop.model_construct(
         base_model="",
@@ -572,9 +574,10 @@ def test_the_published_table_is_the_committed_scoreboard():
 
 
 def earlier_row(seed: int, rows: pd.DataFrame) -> str:
-    """Return the row of an earlier board by its own rules.
+    """Return the row of an earlier board. It is computed by the rules of that board.
 
-    They required a final error of at most 1.05 × the floor, or 1.3 × for other forms.
+    These rules required a final error of at most 1.05 times the floor. For other forms, the limit was 1.3
+    times the floor.
     """
     other, empty = ("other-form", "off-catalogue"), ("empty", "none")
     large = rows[pd.to_numeric(rows.rms_nm, errors="coerce") > 8]

@@ -68,7 +68,9 @@ def test_jobs_know_command_folder_and_large_objects(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="these settings exist only in Linux")
 def test_a_worker_uses_freed_memory_again() -> None:
-    """Check that workers keep freed memory. Dask's default is to return it: 256 new pages per MiB."""
+    """Check that workers keep freed memory. By default, Dask returns it, which costs 256 new pages for each
+    MiB.
+    """
     with (
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster, set_as_default=False) as client,

@@ -1,4 +1,5 @@
-"""Check that a command that is stopped after any write and run again leaves the same files as without a stop.
+"""Check that a command that is stopped after any write and run again leaves the same files as an
+uninterrupted run.
 
 ``python -m tests.stopped_commands NAME FOLDER every`` stops a command after each of its writes.
 """

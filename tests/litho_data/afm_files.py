@@ -99,9 +99,11 @@ def write_ibw(path: Path, channels: dict[str, np.ndarray], note: str) -> None:
 
 
 def write_jpk(path: Path, counts: np.ndarray) -> None:
-    """Write a JPK image: TIFF pages with private tags, rows from bottom to top, and two scalings of one page.
+    """Write a JPK image: a TIFF file with private tags. One of its pages has two scalings, and its rows run
+    from bottom to top.
 
-    The slot "nominal" is a decoy: 7 nm + 3 nm per count. The default slot has 5 nm + 0.25 nm per count.
+    The slot "nominal" is a decoy with an offset of 7 nm and 3 nm per count. The default slot has an offset of
+    5 nm and 0.25 nm per count.
     """
     import tifffile
 

@@ -13,7 +13,7 @@ OVER = 4
 def print_under_tip(
     kind: str, radius_um: float, height_um: float, seed: int = 11, size_px: int = SIZE_PX
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image of a surface by a paraboloid, in µm, and the share of each pixel that it touches."""
+    """Scan a surface with a paraboloid. Return the image in µm and the touched share of each pixel."""
     fine_um = PITCH_UM[0] / OVER
     reach = int(np.ceil(np.sqrt(2 * radius_um * height_um) / fine_um)) + 1
     parabola = -((np.arange(-reach, reach + 1) * fine_um) ** 2) / (2 * radius_um)
@@ -33,7 +33,7 @@ def print_under_tip(
 
 
 def fine_surface(kind: str, height_um: float, seed: int, size_px: int = SIZE_PX) -> np.ndarray:
-    """Return a surface in µm of equal pillars, or of different spikes or bumps, on the fine grid."""
+    """Return a surface in µm on the fine grid. It has pillars of equal height, or varied spikes or bumps."""
     rng, size = np.random.default_rng(seed), size_px * OVER
     surface = np.zeros((size, size))
     for _ in range(size_px**2 // 2000):

@@ -39,7 +39,7 @@ def layout_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
 
 
 def print_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
-    """Return the true heights in µm on the layout's grid, including the bare substrate around them."""
+    """Return the true heights of a print and of the substrate around it, in µm on the grid of the layout."""
     level = np.pad(layout_of(scan_id, side_px).astype(float) + 2.0, 2 * MARGIN_PX)
     exposed = ndimage.gaussian_filter(level, 1.6)
     return LEVEL_HEIGHT_UM * (exposed + 0.015 * exposed**2)

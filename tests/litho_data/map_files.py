@@ -20,10 +20,11 @@ from tests.litho_data import afm_files
 
 @dataclass
 class MapFile:
-    """Describe a written map: its heights in µm, NaN where missing, and the arguments that a reader needs.
+    """Describe a written map by its heights in µm and by the arguments that a reader needs. Missing pixels
+    are NaN.
 
     ``says_size`` tells whether the file states the size of the map. ``asks`` tells whether the file cannot be
-    read without the arguments. ``atol_um`` is half a step of the written numbers.
+    read without the arguments. ``atol_um`` is half the resolution of the numbers in the file.
     """
 
     height_um: np.ndarray
@@ -50,9 +51,9 @@ class MapFile:
         self.asks = True
 
     def needs_mark(self) -> None:
-        """Record that the reader must be told which value marks missing pixels.
+        """Record that the reader must be told which value marks missing pixels, if there are any.
 
-        The file itself does not say so.
+        The file itself does not state this value.
         """
         if self.mark is not None and np.isnan(self.height_um).any():
             self.needs(missing=[self.mark])
@@ -197,7 +198,7 @@ def surfer(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def esri(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write an ESRI grid, which states its mark of missing pixels."""
+    """Write an ESRI grid, which states the value that marks missing pixels."""
     one.mark = mark = one.mark if isinstance(one.mark, float) else -9999.0
     ny, nx = one.height_um.shape
     head = [
@@ -298,7 +299,7 @@ def matlab(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
-    """Write a Nanosurf file with two signals as int32 counts, each image flat or in lines."""
+    """Write a Nanosurf file with two signals as int32 counts. Each array has one or two dimensions."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     counts = np.round(one.height_um * 1e-6 / 2e-6 * (2**31 - 1)).astype(np.int32)

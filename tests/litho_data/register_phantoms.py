@@ -45,7 +45,7 @@ def warp_about_centre(
     margin_px: tuple[float, float] = (14.0, 14.0),
     perspective: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:
-    """Return the matrix from layout to scan indices, given a warp about the centre; pairs are (x, y)."""
+    """Return the matrix from layout indices to scan indices for a warp about the centre. Pairs are (x, y)."""
     angle = np.radians(rotation_deg)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     middle = centre(shape)
@@ -68,7 +68,8 @@ def scan_of(
     orientation: str = "identity",
     polarity: int = 1,
 ) -> np.ndarray:
-    """Return a scan in µm: the blurred print, warped, with noise, re-oriented, and times ``polarity``.
+    """Return a scan in µm. The print is blurred, warped and multiplied by ``polarity``; then noise is added
+    and the scan is re-oriented.
 
     ``snr`` is the standard deviation of the print divided by that of the white noise. The function
     ``orient(result, orientation)`` makes the result upright again.
@@ -86,7 +87,9 @@ def scan_of(
 def true_scan_to_layout(
     layout_to_scan: np.ndarray, orientation: str, scan_shape: tuple[int, int]
 ) -> np.ndarray:
-    """Return the true matrix in µm of a result of ``scan_of``; ``scan_shape`` is that of the upright scan."""
+    """Return the true matrix in µm of a result of ``scan_of``; ``scan_shape`` is the shape of the upright
+    scan.
+    """
     back = INVERSE.get(orientation, orientation)
     frame = index_to_um((PITCH_UM, PITCH_UM))
     to_turned = orientation_matrix(back, scan_shape) @ layout_to_scan
@@ -94,7 +97,7 @@ def true_scan_to_layout(
 
 
 def warp_error_px(found: np.ndarray, true: np.ndarray, layout_shape: tuple[int, int]) -> float:
-    """Return by how many layout pixels two ``scan_to_layout`` matrices differ at most on the layout."""
+    """Return the largest difference of two ``scan_to_layout`` matrices on the layout, in layout pixels."""
     ny, nx = layout_shape
     y, x = np.meshgrid(np.linspace(0, ny, 9), np.linspace(0, nx, 9), indexing="ij")
     points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
@@ -117,9 +120,9 @@ def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rms_error_px(found: Registration, warp: np.ndarray, seen: Seen | None = None) -> float:
-    """Return the rms error of a registration in layout pixels, without a border of 8 px.
+    """Return the rms error of a registration in layout pixels. A border of 8 px does not count.
 
-    ``seen`` maps true points of the scan to the points where they appear.
+    ``seen`` maps true positions in the scan to the positions where they appear.
     """
     truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
     y, x = np.meshgrid(*(np.linspace(8, n - 8, 33) for n in SHAPE), indexing="ij")
@@ -142,7 +145,9 @@ def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def missing_corner(scan: np.ndarray, rng: np.random.Generator, share: float) -> np.ndarray:
-    """Replace a corner of the print by bare substrate. Its sides are this share of the sides of the print."""
+    """Replace a corner of the print by bare substrate. ``share`` is the length of its sides divided by that
+    of the sides of the print.
+    """
     scan, side = scan.copy(), 28 + round(share * SHAPE[0])
     scan[:side, :side] = BARE_UM * rng.standard_normal((side, side))
     return scan
@@ -168,9 +173,9 @@ DEFECTS: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 def creeping(
     layout: np.ndarray, warp: np.ndarray, creep_um: float, slow: int, constant: float = 0.25
 ) -> tuple[np.ndarray, Seen]:
-    """Return a scan by a scanner that creeps exponentially, and the function of its distortion.
+    """Return a scan by a scanner that creeps exponentially, and a function that describes its distortion.
 
-    The function takes true points in µm to the points where they appear.
+    The function maps true positions in µm to the positions where they appear.
     """
     place = np.arange(SCAN_SHAPE[0])
     settling_px = creep_um / PITCH_UM * np.exp(-place / (constant * SCAN_SHAPE[0]))

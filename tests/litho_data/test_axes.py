@@ -81,9 +81,9 @@ def test_the_matrix_of_an_orientation_says_where_each_pixel_goes(
 def test_a_bend_read_from_the_store_equals_the_one_that_registration_found(
     orientation: str, shape: tuple[int, int], pitch_um: tuple[float, float]
 ) -> None:
-    """Check that a bend is the same in the store.
+    """Check that the store contains the bend that registration finds.
 
-    Registration finds the bend in indices of the re-oriented scan, but the store states it for the raw scan.
+    Registration finds the bend in the re-oriented scan, but the store states it for the raw scan.
     """
     layout_pitch_um = 0.1
     case = _Case(np.zeros(shape), np.zeros((50, 62), int), pitch_um, layout_pitch_um, 0, None, {})

@@ -89,7 +89,9 @@ def test_a_begun_folder_is_continued_by_the_same_command_only(tmp_path: Path) ->
 
 
 def test_continuing_a_folder_does_not_rewrite_its_mark(tmp_path: Path) -> None:
-    """Check this because a process stopped while it rewrites the mark would leave parts without a mark."""
+    """Check this because a process that is stopped while it rewrites the mark would leave parts without a
+    mark.
+    """
     assert stopped_after(5, lambda: grow(tmp_path), tmp_path)
     os.utime(tmp_path / BEGUN, (0, 0))
     with growing_folder(tmp_path, "sums.json", FACTS) as begun:

@@ -1,4 +1,6 @@
-"""Check that a fetch from a server keeps correct files, and names wrong files and never uses them."""
+"""Check that a fetch from a server keeps correct files, and that it reports wrong files and does not use
+them.
+"""
 
 from __future__ import annotations
 

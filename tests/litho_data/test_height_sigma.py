@@ -1,4 +1,6 @@
-"""Test the uncertainty of heights: each part against its closed form, and all on prints of known surface."""
+"""Test the uncertainty of heights: its parts against closed forms, and the whole on prints whose surface is
+known.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ from tests.litho_data.campaigns import layout_of
 
 
 def _print(seed: int, size: int) -> np.ndarray:
-    """Return a print with an rms of 0.5 µm, blurred like that of a 0.25 µm spot on a grid of 0.1 µm."""
+    """Return a print with an rms height of 0.5 µm. It is blurred as if by a spot of 0.25 µm on a grid of 0.1
+    µm.
+    """
     white = np.random.default_rng(seed).standard_normal((size, size))
     return 0.5 * gaussian_filter(white, 2.5) / gaussian_filter(white, 2.5).std()
 
@@ -73,7 +77,8 @@ def test_the_stated_loss_of_resampling_is_that_of_a_resampled_wave(frequency):
 
 
 def test_an_uncertain_warp_moves_a_plane_by_its_slope():
-    """Check a plane with slopes p, q whose shifts along x, y and rotation have the uncertainties a, b, c.
+    """Check a plane with slopes p and q. Its shifts along x and y have the uncertainties a and b, and its
+    rotation has the uncertainty c.
 
     The variance of its height is (pa)² + (qb)² + c²(qx − py)².
     """
@@ -197,7 +202,9 @@ def test_an_error_surface_counts_only_if_it_is_significant_or_the_scan_was_level
 
 
 def test_errors_of_virtual_prints_are_as_large_as_stated(tmp_path):
-    """Compare σ with the error: the stored height minus the true rough surface, minus the mean of this."""
+    """Compare σ with the error. This is the stored height minus the true rough surface, with the mean of this
+    difference subtracted.
+    """
     card = simulate(tmp_path / "fab", count=3, size_px=192, seed=20271, knobs=["scan-line-stripes=8"])
     build_dataset(card, tmp_path / "prints.zarr", workers=1)
     ratios = []

@@ -253,7 +253,9 @@ def test_matching_ignores_an_inclusion_mask_in_the_last_column_only() -> None:
 
 
 def test_the_modus_of_a_row_does_not_depend_on_the_unit_of_the_file() -> None:
-    """Check that the unit does not decide between the many equally short windows of five-digit values."""
+    """Check values of five digits, for which many windows are equally short. The unit must not decide which
+    of them is used.
+    """
     digits = np.random.default_rng(3).integers(10000, 99999, (40, 300))
     from_metres = np.array([[float(f"{n}e-11") for n in row] for row in digits]) * 1e6
     from_um = np.array([[float(f"{n}e-5") for n in row] for row in digits])
@@ -353,9 +355,9 @@ def test_what_cannot_be_levelled_is_refused(operate, message: str) -> None:
 @pytest.mark.parametrize("method", ["median", "median-of-differences", "trimmed-mean", "matching"])
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_row_alignment_warns_where_a_block_moves_lines(method: str, direction: str) -> None:
-    """Check the warning for lines of which a block covers 55 %.
+    """Check the warning about lines in which a block covers 55 % of the pixels.
 
-    Row alignment shifts these lines, although 45 % of their pixels are right.
+    Row alignment shifts these lines, although the other 45 % of their pixels are at the right height.
     """
     rng = np.random.default_rng(0)
     offsets = 0.05 * rng.standard_normal((128, 1))

@@ -138,9 +138,10 @@ def test_a_missing_recipe_and_a_missing_layout_are_refused(tmp_path: Path) -> No
 
 
 def test_the_page_states_which_operations_were_tested_against_gwyddion() -> None:
-    """Check the tables of operations on the page.
+    """Check the tables of operations on the page about levelling.
 
-    The first column names all operations. Those that follow Gwyddion are also in one of two cells below.
+    The first column names all operations. Each operation that follows Gwyddion must also be named in one of
+    two cells further down.
     """
     page = (Path(__file__).parents[2] / "docs" / "levelling.md").read_text(encoding="utf-8")
     lines = [line for line in page.splitlines() if line.startswith("|")]

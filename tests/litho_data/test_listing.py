@@ -1,4 +1,6 @@
-"""Check that files are paired by id, unpaired files listed, and paths out of the folder refused."""
+"""Check that files are paired by id, that unpaired files are listed, and that paths out of the folder are
+refused.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Check the first dataset of a new lab: correct if the page is followed, and otherwise with a warning."""
+"""Check that a new lab gets a correct first dataset if it follows the page, and a warning if it does not."""
 
 from __future__ import annotations
 

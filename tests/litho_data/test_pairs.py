@@ -1,4 +1,4 @@
-"""Check that data survive an export to the authors' pair format, to half a grey value."""
+"""Check that an export to the authors' pair format preserves data to within half a grey value."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
 def test_an_import_begun_with_other_options_is_not_continued(
     other: dict[str, Any], campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check this because a continued import would mix fields with two pitches in one store."""
+    """Check this because continuing such an import would mix fields with two pitches in one store."""
     export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
     add, added = PartialStore.add, []
 

@@ -66,7 +66,7 @@ def silent() -> None:
 
 
 def spoken() -> None:
-    """Report progress, then work for longer than a command may be silent."""
+    """Report progress, then work silently for longer than a command is allowed to."""
     say("working")
     time.sleep(1)
 

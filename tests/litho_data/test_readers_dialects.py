@@ -1,4 +1,6 @@
-"""Read texts and arrays of other programs and people: either the map is right, or one line says why not."""
+"""Read texts and arrays from other programs and people. Either the map is right, or one line says why it
+cannot be read.
+"""
 
 from __future__ import annotations
 

@@ -72,7 +72,9 @@ def test_a_nanoscope_channel_without_calibration_does_not_hide_the_heights(tmp_p
 
 
 def write_jpk_series(path: Path) -> None:
-    """Write JPK's HDF5 with x fastest, y upwards, a column of counts for each frame, and a thumbnail."""
+    """Write an HDF5 file as JPK does. In it, x varies fastest, y points upwards, each frame has a column of
+    counts, and there is a thumbnail.
+    """
     ny, nx = SHAPE
     with h5py.File(path, "w") as file:
         file.attrs["file-format-info"] = np.bytes_("JPK SCAN")
@@ -211,9 +213,9 @@ def test_real_files_agree_with_another_reader(oracles: Path) -> None:
     """Compare every 8th pixel with AFMReader 0.0.7, whose WSxM maps are first rotated by 180°.
 
     An example at https://spmimages.ftmc.uam.es/file-specifications shows one WSxM image as a matrix and as
-    points. The first number of the matrix is the point with the largest x and the smallest y, so WSxM writes
-    x decreasing and y increasing. This point is the lower right pixel, but AFMReader puts it at the upper
-    left.
+    points. The first number of the matrix belongs to the point with the largest x and the smallest y. WSxM
+    therefore writes numbers in the order of decreasing x and increasing y. This point is the lower right
+    pixel, but AFMReader puts it at the upper left.
     """
     reference = np.load(oracles / "vendor" / "reference.npz")
     for name, channel, key, turned in (

@@ -158,7 +158,9 @@ _LONG = 200_000
     ],
 )
 def test_no_line_makes_a_regular_expression_slow(tmp_path: Path, text: str) -> None:
-    """Check long lines, which take hours if two adjacent repetitions can match the same characters."""
+    """Check long lines. They take hours if two adjacent repetitions in a pattern match the same
+    characters.
+    """
     path = tmp_path / "scan.txt"
     path.write_text(text)
     started = time.process_time()

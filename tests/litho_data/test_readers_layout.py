@@ -1,4 +1,4 @@
-"""Read layouts stored as levels, as grey pictures, or as exported by the design package."""
+"""Read layouts that are stored as levels or as greyscale images, or exported by the design package."""
 
 from __future__ import annotations
 

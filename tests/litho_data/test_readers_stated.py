@@ -1,4 +1,6 @@
-"""Check that a statement of a file is applied, or named in the refusal, without harm to its other parts."""
+"""Check that each statement in a file is either applied or named in a refusal. The other parts of the file
+remain readable.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,7 @@ def test_a_unit_that_is_no_length_makes_no_height(tmp_path: Path) -> None:
 
 
 def test_a_picture_beside_an_unknown_private_tag_is_no_map(tmp_path: Path) -> None:
-    """Check such a TIFF because instrument makers store a preview in its page, and the heights elsewhere."""
+    """Check this because instrument makers store a preview in a TIFF page, and the heights elsewhere."""
     path = tmp_path / "scan.tif"
     tag = (55555, "B", 4 * HEIGHT_UM.size, HEIGHT_UM.astype("<f4").tobytes(), False)
     tifffile.imwrite(path, np.ones(SHAPE, np.uint8), extratags=[tag], metadata=None)

@@ -17,7 +17,9 @@ PITCH_UM = (0.1, 0.1)
 
 @pytest.fixture(scope="module", params=[4, pytest.param(1, marks=pytest.mark.long)], ids=["fourth", "all"])
 def registered(measured_prints, request):
-    """Return (height µm, layout, quality, authors' height µm) by id for every fourth scan, or for all."""
+    """Return a dict by id for every fourth scan, or for all scans. Each value consists of the height in µm,
+    the layout, the quality, and the authors' height in µm.
+    """
     full_scale_m = json.loads((measured_prints / "src_max_dict.txt").read_text())
     results = {}
     paths = sorted((measured_prints / "afm_ug").glob("*.txt"))

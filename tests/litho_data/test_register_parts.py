@@ -1,4 +1,4 @@
-"""Compare a fast algorithm of the registration with its plain definition."""
+"""Compare the fast masked correlation of the registration with a computation by its definition."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ SHAPE = (112, 112)
 
 
 def built(card: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Build a store, and return by id the warnings about its scans and the reasons for refused scans."""
+    """Build a store. Return two dicts by scan: the warnings, and the reasons why scans were refused."""
     result = build_dataset(card, card.parent / "prints.zarr")
     quality = open_store(card.parent / "prints.zarr").quality
     warnings = dict(zip(quality["scan"], quality["warning"], strict=True))
@@ -38,7 +38,9 @@ DOSES = {0.8: 0.85, 0.9: 0.93, 1.0: 1.0, 1.1: 1.06}
 
 
 def doses(layouts: int, seed: int) -> dict[str, dict[str, Any]]:
-    """Return scans P<dose><layout> of every layout at every dose, with heights proportional to a gain."""
+    """Return scans P<dose><layout> of every layout at every dose. Their heights are scaled by the gain of the
+    dose.
+    """
     prints = {}
     for block, (dose, gain) in enumerate(DOSES.items(), start=1):
         for field in range(1, layouts + 1):
@@ -122,10 +124,10 @@ def test_doses_in_the_wrong_order_throughout_are_named(left_out: tuple[float, ..
 
 @pytest.mark.parametrize(("exposure", "expected"), [(0.5, 2), (6.0, 0)])
 def test_in_a_saturated_print_more_dose_may_lower_its_slope(exposure: float, expected: int) -> None:
-    """Check heights of 1 - exp(-exposure · dose · level), of which high exposures saturate.
+    """Check heights of 1 - exp(-exposure · dose · level), which saturate at high exposures.
 
-    At an exposure of 0.5, the slope grows with the dose. At 6, it falls with the dose, although the order of
-    the doses is right.
+    The slope is that of the height over the level. At an exposure of 0.5, the slope grows with the dose. At
+    an exposure of 6, the slope falls with the dose, although the order of the doses is right.
     """
     prints = doses(1, 0)
     for name, dose in zip(prints, DOSES, strict=True):

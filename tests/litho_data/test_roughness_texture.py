@@ -54,7 +54,9 @@ def test_stated_probabilities_are_right() -> None:
 
 
 def test_a_period_is_found_with_its_amplitude_and_phase() -> None:
-    """Check a weak wave of 1.3 µm with the same phase in all surfaces, or an independent phase in each."""
+    """Check a weak wave with a period of 1.3 µm. Its phase is the same in all surfaces, or random in each
+    surface.
+    """
     random = np.random.default_rng(3)
     at = np.arange(256)
     noise = gaussian_filter(random.normal(size=(12, 256)), (0, 1.0)) * 0.01

@@ -93,7 +93,7 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
 
 @pytest.mark.parametrize("seed", [5002, 5004, 5010, 5011])
 def test_a_few_tops_that_are_sharper_than_the_others_are_not_taken_for_the_tip(seed: int) -> None:
-    """Check rounded bumps of many radii r, in whose image tops have the radii R + r."""
+    """Check rounded bumps of many radii r. A tip of radius R images their tops with radii R + r."""
     image, _ = print_under_tip("bumps", 0.15, 1.0, seed=seed)
     found = peak_radius(image + noise_of_snr(image.shape, 1.0, 50, seed), PITCH)
     # If they were given as estimates, these radii would be 15 to 52 % too large.

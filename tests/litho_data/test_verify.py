@@ -1,4 +1,6 @@
-"""Check that verify names any changed byte, replay reproduces all arrays, and history leads to raw files."""
+"""Check that ``verify`` names any changed byte, that ``replay`` reproduces all arrays, and that ``history``
+leads to the raw files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test the virtual fab: the physics of plain printing, noise, files, truth, and reproducibility."""
+"""Test the virtual fab: the physics of plain prints, the noise, the files, the truth, and reproducibility."""
 
 from __future__ import annotations
 
@@ -308,7 +308,9 @@ class TestDeterminism:
 
 
 class OnePoint:
-    """Generate one point in place of white noise, so that filtered squares add up to the noise variance."""
+    """Generate a single point in place of white noise. The squares of the filtered point add up to the
+    variance of filtered noise.
+    """
 
     def standard_normal(self, shape):
         point = np.zeros(shape)

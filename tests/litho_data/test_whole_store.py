@@ -27,7 +27,9 @@ def files_of(store: Path) -> list[Path]:
 
 
 def test_every_chunk_has_a_file_even_if_it_is_all_zeros(campaign: Path) -> None:
-    """Check this because a lost chunk could otherwise not be told from one that was never written."""
+    """Check this because otherwise a lost chunk could not be told apart from a chunk that was never
+    written.
+    """
     root = zarr.open_group(campaign / "prints.zarr", mode="r", use_consolidated=False)
     stored: Any = [(path, one) for path, one in root.members(max_depth=None) if isinstance(one, zarr.Array)]
     assert len(stored) > 50

@@ -1,4 +1,4 @@
-"""Check that each job runs once on any worker, few jobs wait at a time, and an error is one line.
+"""Check that each job runs once on any worker, that few jobs wait at a time, and that an error is one line.
 
 The tests on a cluster are in tests/laws/test_cluster.py.
 """

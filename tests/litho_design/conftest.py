@@ -19,7 +19,9 @@ from litho_design.printers.printer import Printer
 
 
 class BlurPrinter(nn.Module):
-    """Predict gain * (layout * Gaussian) + offset, with the interface of a frozen model."""
+    """Predict ``gain * blurred + offset_um``, where ``blurred`` is the layout convolved with a Gaussian. The
+    interface is that of a frozen model.
+    """
 
     def __init__(self, sigma_um=0.2, gain=0.62, offset_um=0.164, pitch_um=0.1, name="blur"):
         super().__init__()
@@ -49,9 +51,10 @@ def make_printer():
 
 @pytest.fixture(scope="session")
 def small_settings() -> HologramSettings:
-    """Return settings of a hologram of 12.8 µm at 30 µm, with 30 iterations from a random start.
+    """Return settings for a hologram that is 12.8 µm wide and has its image at a distance of 30 µm. The
+    search has 30 iterations and starts at random.
 
-    The start is far from the optimum. The yield uses ten prints, as a hundred would take too long.
+    The start is far from the optimum. The yield uses ten prints, because a hundred would take too long.
     """
     default = hologram_settings("default")
     return default.model_copy(

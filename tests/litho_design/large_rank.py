@@ -23,7 +23,7 @@ SIZE, BAND, ITERATIONS = 160, 32, 20
 
 
 def settings(iterations: int = ITERATIONS) -> HologramSettings:
-    """Return the settings of a hologram of 16 µm at 30 µm."""
+    """Return settings for a hologram that is 16 µm wide and has its image at a distance of 30 µm."""
     changes = {"layout.size_px": SIZE, "optics.distance_um": 30.0}
     changes |= {"search.iterations": iterations, "search.checkpoint_every": 8, "search.evaluate_every": 5}
     return hologram_settings(changes=changes)

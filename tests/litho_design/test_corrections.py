@@ -1,4 +1,4 @@
-"""Test the benchmark of corrections, which are scored by judges that were not used to make them."""
+"""Test the benchmark of corrections. Each correction is scored by judges that were not used to make it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ SEEDS = (5, 6, 7)
 
 
 class Hidden(BlurPrinter):
-    """Imitate a printer that its models lack: slopes along x lose height, and high places shrink."""
+    """Imitate a printer with two effects that its models lack: slopes along x lose height, and high places
+    shrink.
+    """
 
     def __init__(self, seed: int):
         draw = np.random.default_rng(seed)
@@ -33,7 +35,9 @@ class Hidden(BlurPrinter):
 
 
 def fitted(name: str, sigma_um: float, hidden: Hidden, layout) -> Printer:
-    """Return a blur model fitted to prints of smooth layouts, with its errors on them in its card."""
+    """Return a blur model that is fitted to prints of smooth layouts. Its card states its errors on these
+    prints.
+    """
     generator = torch.Generator().manual_seed(0)
     coarse = torch.rand(6, 1, 12, 12, generator=generator) * 1.2
     layouts = torch.nn.functional.interpolate(coarse, size=96, mode="bicubic").clamp(0, 1.2)

@@ -56,7 +56,9 @@ def test_a_thick_element_is_that_of_the_designs(make_printer):
 
 
 def test_the_gradient_passes_straight_through_rounding_and_limits(element):
-    """Check that whole levels have the gradient of real levels at the same place, also at the limits."""
+    """Check that integer levels have the same gradient as real-valued levels at the same place, also at the
+    limits.
+    """
 
     def slope():
         (found,) = torch.autograd.grad(element.height_um().square().sum(), element.free.height)
@@ -215,7 +217,9 @@ def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch
     ],
 )
 def test_examples_train_through_the_printer(monkeypatch, capsys, name, options, better):
-    """Check that an element designed through the printer model beats one for a perfect printer."""
+    """Check that an element designed through the printer model performs better than an element designed for a
+    perfect printer.
+    """
     if name == "structured_light_4f":
         pytest.importorskip("torchoptics")
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

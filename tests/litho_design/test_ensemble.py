@@ -1,4 +1,4 @@
-"""Test designs with several models: the formula of the penalty, its effect, and the check of tiles."""
+"""Test designs with several models: the formula and the effect of the penalty, and the check of tiles."""
 
 from __future__ import annotations
 
@@ -147,7 +147,9 @@ def test_a_model_that_depends_on_the_whole_image_is_detected():
 
 
 def test_models_disagree_most_on_the_level_whose_heights_are_farthest_apart():
-    """Check the level with the largest disagreement; each model counts heights from its own level 0."""
+    """Check which level has the largest disagreement. The heights of each model are counted from its own
+    level 0.
+    """
     heights = {"one": [0.1, 0.3, 0.6, 0.7], "two": [0.5, 0.8, 1.4, 1.2]}
     width = Width(searched_with=1, figures={}, returned="", figure="", less=False, level_heights_um=heights)
     assert width.open_level == pytest.approx((2, 0.5, 0.9))

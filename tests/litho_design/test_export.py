@@ -1,4 +1,4 @@
-"""Check that every format is read back level for level, with its size and orientation."""
+"""Check that files of every format can be read back with the same levels, size and orientation."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
 
 
 def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
-    """Check that a model predicts an export from its sidecar, and refuses one with another pitch."""
+    """Check that a model predicts an exported design by means of its sidecar file, and that it refuses a
+    design with another pitch.
+    """
     from litho_models.frozen.files import load_frozen
     from litho_models.frozen.on_store import predict_file
 
@@ -269,7 +271,9 @@ def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
 
 
 def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tmp_path):
-    """Check a GDS file with a parser of its own, which follows references without gdstk or the writer."""
+    """Check a GDS file with an independent parser, which follows references and uses neither gdstk nor the
+    writer.
+    """
     tile = np.random.default_rng(0).integers(0, 4, (128, 128)).astype(np.uint8)
     levels = np.tile(tile, (3, 2))
     levels[300, 200] = 5
@@ -296,7 +300,7 @@ def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tm
 
 
 def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, design, monkeypatch):
-    """Check with Pillow and libtiff a file that tifffile wrote."""
+    """Use Pillow and libtiff to check a file that tifffile wrote."""
     monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
     levels = np.kron(LETTER * 7, np.ones((50, 50), np.uint8))
     write_tiff(tmp_path / "f.tif", levels, 0.13, 0.1)
@@ -312,7 +316,7 @@ def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, desi
 
 
 class _Tall:
-    """Provide random levels, 512 px wide, of which only the requested rows are in memory."""
+    """Provide random levels in rows of 512 px. Only the requested rows are in memory."""
 
     def __init__(self, height):
         self.shape = (height, 512)
@@ -349,7 +353,9 @@ def test_memory_of_an_export_does_not_grow_with_its_rows(tmp_path, kind, monkeyp
 
 
 def _gds_cells(file) -> dict[str, dict[str, list]]:
-    """Return boundaries (layer, corners) and references (name, place) of each GDSII cell, in file units."""
+    """Return the boundaries (layer, corners) and the references (name, place) of each GDSII cell. Coordinates
+    are in file units.
+    """
     data, at, cells = file.read_bytes(), 0, {}
     while at < len(data):
         length, kind = struct.unpack_from(">HB", data, at)
@@ -538,9 +544,9 @@ def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
     linear = import_levels(export_design(LETTER * 12, "png16", tmp_path / "png"))[1]
     assert linear.white_height_um == pytest.approx(65535 / (65535 // 12) * 0.1)
     (tmp_path / "curve.csv").write_text("grey,height_um\n0,0\n255,1.0\n")
-    with pytest.raises(InputError, match=r"dose curve, got 1 µm of heights for 1\.2 µm of levels"):
+    with pytest.raises(InputError, match=r"dose curve, got a height range of 1 µm, but levels over 1\.2 µm"):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "curve.csv")
-    with pytest.raises(InputError, match="rising columns"):
+    with pytest.raises(InputError, match="both increasing"):
         export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "none.csv")
 
 

@@ -1,4 +1,4 @@
-"""Test the far field, and light other than a uniform plane wave, against closed forms."""
+"""Test the far field, and illumination other than a uniform plane wave, against closed forms."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def test_the_adjoint_and_the_largest_angle():
 
 
 def test_a_gaussian_beam_and_a_near_point():
-    """Check that a beam of radius w has a spot of radius lambda f / (pi w), and the phase of a near point."""
+    """Check that a beam of radius w gives a spot of radius lambda f / (pi w). Also check the phase of the
+    light from a nearby point.
+    """
     size, beam_um = 128, 4.0
     grid = centred_grid((size, size), 0.2)
     optics = FAR.model_copy(update={"beam_um": beam_um})

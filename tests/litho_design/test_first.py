@@ -1,4 +1,6 @@
-"""Check that the first result judges both designs alike, and warns if diffraction blurs the target."""
+"""Check that the first result judges both designs in the same way, and that it warns if diffraction blurs the
+target.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_pa
         for one in (one for one in result.summary if one.figure == figure):
             assert shown.loc[one.arm, f"printed by {one.judge}"] == pytest.approx(one.judged_mean, abs=6e-4)
     # The judge is a model that was not used in the designs. The page says what may be chance.
-    assert "Printed by physics, layouts designed with" in page
+    assert "If physics prints the layouts, those designed with" in page
     assert "1 seed cannot tell this difference from chance" in page
     for arm in ("none", "pbl"):
         place = f"designs/{arm}/seed0/report.html"

@@ -1,4 +1,4 @@
-"""Check that large elements give the same result in bands, on any number of processes, as in one piece."""
+"""Check that a large element gives the same result as a whole and in bands, on any number of processes."""
 
 from __future__ import annotations
 

@@ -127,7 +127,9 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
 
 
 def test_errors_of_a_computational_lens_by_independent_code(settings, make_printer):
-    """Check the errors against a float64 computation in NumPy and SciPy, from the wave to Richardson-Lucy."""
+    """Check the errors against a float64 computation in NumPy and SciPy. It covers all steps from the wave to
+    the Richardson-Lucy deconvolution.
+    """
     computational = settings.model_copy(update={"task": "computational"})
     imaging, n, window, z, wavelength = computational.imaging, 300, 128, 100.0, 0.6328
     bench = LensBench(LAYOUT, OPTICS, settings.view)
@@ -256,7 +258,7 @@ def test_ring_path_needs_rings(settings, make_printer, change, message):
 
 
 def test_an_mtf_is_interpolated_linearly_between_samples():
-    """Check the MTF of a spot that is wider along one axis, which is the mean of both axes."""
+    """Check the MTF of a spot that is wider along one axis. It is the mean of the MTFs along both axes."""
     y, x = np.meshgrid(*(np.arange(32) - 16.0,) * 2, indexing="ij")
     psf, pitch_um = torch.from_numpy(np.exp(-(x**2) / 18 - y**2 / 4.5)), 0.2
     curve = mtf(psf)

@@ -1,4 +1,6 @@
-"""Check that the object is recovered from a photograph through a lens, simulated with a known PSF."""
+"""Check that an object is recovered from its photograph through a lens. The photograph is simulated with a
+known PSF.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,7 @@ def picture(tmp_path):
 
 
 def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
-    """Write the photograph of an object ``wanted`` (n, n) through a printed lens.
+    """Write a photograph of an object ``wanted`` (n, n), taken through a printed lens.
 
     Return the PSF and the matrix from photograph to window.
     """
@@ -93,7 +95,9 @@ def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.0
 
 
 def estimate(loaded, recorded, psf, wanted):
-    """Return the deconvolved image without registration, scaled to the least error."""
+    """Deconvolve a recorded image without registration. Return the result at the scale that minimises its
+    error.
+    """
     found = richardson_lucy(recorded, psf, loaded.task.settings.imaging.iterations)
     return found * matched_scale(found, wanted)
 

@@ -44,7 +44,7 @@ class Camera:
     gamma: float = 1.0
 
     def counts(self, light: np.ndarray, pitch_um: float, seed: int) -> np.ndarray:
-        """Return a uint16 photograph of light (n, n) given on pixels of ``pitch_um``."""
+        """Return a uint16 photograph of the light (n, n), which is given on pixels of ``pitch_um``."""
         step = self.pitch_um / pitch_um / self.scale
         side = round(1.15 * len(light) / step)
         place = (np.arange(side * _FINER) + 0.5) / _FINER - side / 2
@@ -96,7 +96,9 @@ def test_a_measured_print_scores_like_the_print_it_is(tmp_path, printed_design):
 
 
 def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, printed_design):
-    """Check that such a scan does not score worse; a tilt of 0.05 µm/µm once cost 1.8 dB unnoticed."""
+    """Check that such a scan scores no worse than its print. A tilt of 0.05 µm/µm once cost 1.8 dB
+    unnoticed.
+    """
     loaded = LoadedDesign(printed_design)
     expected = loaded.expected_um.numpy().astype(np.float64)
     generator = np.random.default_rng(3)
@@ -133,7 +135,7 @@ def test_a_tilted_bowed_turned_and_noisy_scan_scores_like_its_print(tmp_path, pr
 
 @dataclass(frozen=True)
 class Widened:
-    """Provide the attributes of a scan that tip correction needs."""
+    """Provide those attributes of a scan that tip correction needs."""
 
     height_um: np.ndarray
 
@@ -267,7 +269,9 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
 def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
-    """Check cameras with fewer bits than their files, whose pixels do not reach the limit of the file."""
+    """Check cameras that have fewer bits than their files. Their pixels saturate below the limit of the file
+    type.
+    """
     light = np.random.default_rng(0).uniform(0, 1, (100, 100)) ** 2 * 2**bits
     assert _saturated(np.minimum(light * 1.1, 2**bits - 1).astype(np.uint16)) == pytest.approx(
         0.046, abs=0.01
@@ -276,14 +280,16 @@ def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
 
 
 class Power(Record):
-    """Hold a score that is linear in the measured values and one that is not."""
+    """Hold two scores: one is linear in the measured values, the other is not."""
 
     mean: float
     power: float
 
 
 def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
-    """Check that the s^2 that noise of sd s adds to a mean square is subtracted, and nothing from a mean."""
+    """Check that the mean contribution of noise is subtracted. Noise of standard deviation s adds s^2 to a
+    mean square, and nothing to a mean.
+    """
     generator = np.random.default_rng(0)
     truth, sd = generator.uniform(0, 1, 4000), 0.3
     drawn, freed = [], []

@@ -48,7 +48,7 @@ def settings():
 
 @pytest.fixture
 def folder(tmp_path):
-    """Write five pictures whose names sort in another order than that of writing."""
+    """Write five pictures. Their alphabetical order differs from the order in which they are written."""
     place = tmp_path / "pictures"
     place.mkdir()
     for seed, name in enumerate("cebda"):
@@ -182,7 +182,7 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
     split = ("--objects", folder / "c.png", "--objects", folder / "a.png", "--held-out-objects")
     split = (*split, folder / "b.png", "--held-out-objects", folder / "d.png")
     told = run("lens", *SMALL, *split, "--out", tmp_path / "d")
-    assert "uses the objects c.png, a.png; b.png, d.png are held out" in told.err
+    assert "design are c.png, a.png; the held-out objects are b.png, d.png" in told.err
     assert "MAE" in told.out
     imaging = Design.read(tmp_path / "d").settings["imaging"]
     run(
@@ -205,7 +205,7 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
         (("--objects", "pictures", "--held-out-objects", "extra.png"), "1 held out"),
         (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "given twice"),
         (("--objects", "black.png"), "without any light"),
-        (("--objects", "pictures", "--task", "direct"), "images no objects"),
+        (("--objects", "pictures", "--task", "direct"), "does not image objects"),
         (("--objects", "pictures", "compare"), "the hoe task"),
     ],
 )  # fmt: skip

@@ -48,7 +48,9 @@ class Corner(Task):
 
 
 def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, capsys):
-    """Check that the example has at most fifteen lines, and gets a yield and report like built-in tasks."""
+    """Check that the example has at most fifteen lines, and that it gets a yield and a report as built-in
+    tasks do.
+    """
     text = (ROOT / "examples" / "own_task.py").read_text("utf-8")
     body = text.split("class ColoursInPlanes")[1].split("def spots")[0].splitlines()
     assert len([line for line in body if line.strip() and '"""' not in line]) <= 15
@@ -76,7 +78,9 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path, monkeypatch, 
 
 
 def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsys, refused):
-    """Check that ``--plugin`` loads the task, and the messages without it or if the file fails."""
+    """Check that ``--plugin`` loads the task. Also check the messages if the option is missing or if the file
+    fails.
+    """
     file, out = tmp_path / "far_corner.py", tmp_path / "design"
     file.write_text(
         "import litho_design\n@litho_design.register_task\nclass FarCorner(litho_design.Task):\n"
@@ -136,7 +140,9 @@ def test_robust_and_ensemble_losses_serve_an_own_task(tmp_path, make_printer):
 
 
 def test_an_oblique_wave_goes_where_its_angle_says():
-    """Check that at the sine s the shadow shifts by z tan(asin s), with the phase of a tilted plane wave."""
+    """Check light at an angle of incidence whose sine is s. The shadow shifts by z tan(asin s) and has the
+    phase of a tilted plane wave.
+    """
     layout = Printer(None, design_settings(TINY).layout, source="none").layout
     sine, distance_um = 0.3, 10.0
     bench = ElementBench(layout, Optics(distance_um=distance_um, incidence_x=sine))

@@ -96,7 +96,9 @@ def test_cells_must_fill_the_element():
 
 @pytest.mark.parametrize("layout", [SQUARE.model_copy(update={"size_px": 44}), RINGS])
 def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient(layout):
-    """Check that one free cell changes its neighbours by the kernel, and receives their gradients by it."""
+    """Check that the kernel describes both how one free cell changes its neighbours and how it receives their
+    gradients.
+    """
     filtered = layout.model_copy(update={"cell_filter_um": 0.8 * layout.cell_um})
     parameters = DirectLevels(filtered)
     middle = tuple(side // 2 for side in parameters.cells.cells)

@@ -1,4 +1,6 @@
-"""Test variations of print and optics: depth of focus of a perfect lens, draws, measured spreads."""
+"""Test variations of the print and the optics: the depth of focus of a perfect lens, draws, and measured
+spreads.
+"""
 
 from __future__ import annotations
 

@@ -91,7 +91,9 @@ def test_every_separation_lies_at_its_index_of_a_circular_convolution(here, ther
     ("here", "there"), [((30, 33), (400, 21)), ((401, 64), (26, 333)), ((32, 32), (32, 32))]
 )
 def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offset_um, distance):
-    """Check that the band has the frequencies whose rays hit the target once, not again a period away."""
+    """Check that the band contains the frequencies whose rays hit the target once and do not hit it again a
+    period away.
+    """
     source, target = centred_grid(here, 0.4), centred_grid(there, 0.4, (offset_um, -offset_um))
     for axis, band in enumerate(spectrum_axes(source, target, distance, WAVELENGTH_UM)):
         sine = WAVELENGTH_UM * band.frequency.numpy()
@@ -113,7 +115,7 @@ def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offs
     ("there", "offset"), [((70, 41), (3, -9)), ((25, 90), (0, 0)), ((31, 32), (-11, 20))]
 )
 def test_asm_to_a_part_of_a_plane_equals_that_part_of_asm_to_the_whole_plane(there, offset):
-    """Check that the wave at a point does not depend on the size and place of the target."""
+    """Check that the wave at a point does not depend on the size or the position of the target."""
     source = centred_grid((34, 45), 0.4)
     whole = centred_grid((160, 170), 0.4)
     row, column = ((n - m) // 2 + shift for n, m, shift in zip(whole.shape, there, offset, strict=True))
@@ -175,7 +177,7 @@ def test_asm_and_rs_agree_on_a_rough_element():
 
 @pytest.mark.parametrize("distance", [5.0, 30.0])
 def test_asm_is_exact_on_pixels_too_coarse_for_the_kernel(distance):
-    """Check a wave within its band on pixels for which the Rayleigh-Sommerfeld kernel is aliased."""
+    """Check a band-limited wave on pixels so coarse that the Rayleigh-Sommerfeld kernel is aliased."""
     count, pitch = 64, 0.4
     coarse, fine = centred_grid((count,) * 2, pitch), centred_grid((4 * count,) * 2, pitch / 4)
     assert distance < 2 * sampling_limit_um(coarse, coarse, WAVELENGTH_UM)

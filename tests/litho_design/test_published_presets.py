@@ -80,7 +80,9 @@ def test_presets_are_as_stated(preset, stated):
 
 
 def test_the_display_is_imaged_at_its_scale():
-    """Check the scale of images: of a display of 36 mm at 140 mm, or 120 µm as in the published code."""
+    """Check the size of images. In the preset ``paper``, a display of 36 mm is imaged from a distance of 140
+    mm. In the preset ``authors``, an image is 120 µm wide, as in the published code.
+    """
     for variant, image_um in (("paper", 36e3 * 0.4 / 140), ("authors", 120.0)):
         made = lens_settings("computational", variant)
         frame_px, pixel_um = made.imaging.object_px, made.imaging.pixel_px * made.layout.pitch_um
@@ -200,7 +202,9 @@ def test_a_resumed_search_goes_on_with_its_rate(schedule, tmp_path):
 
 
 def test_photon_noise_grows_with_the_signal_and_leaves_the_gradient_alone():
-    """Check images by a point PSF with half of the light, whose variance is b² + a · image."""
+    """Check images by a point PSF that contains half of the light. The variance of an image is b² + a ·
+    image.
+    """
     grey = torch.tensor([0.25, 1.0])[:, None, None].expand(2, 400, 400).clone().requires_grad_()
     imaging = ImagingSettings(read_noise=0.02, photon_noise=0.004)
     seen = record(grey, torch.full((1, 1), 0.5), imaging, seed=1)

@@ -52,7 +52,9 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
 
 
 def test_the_baselines_use_nominal_heights_and_the_best_gain_and_offset(make_printer):
-    """Check the baselines of a printer with gain 1/2, offset 0.1 µm and no blur, which are known by hand."""
+    """Check the baselines of a printer with a gain of 1/2, an offset of 0.1 µm and no blur. They can be
+    computed by hand.
+    """
     settings = relief_settings({"layout.size_px": 48, "layout.levels": 13})
     printer = make_printer(settings.layout, sigma_um=1e-3, gain=0.5, offset_um=0.1)
     wanted = np.repeat(0.1 * (np.arange(48) // 12), 48).reshape(48, 48).astype(np.float32)
@@ -71,7 +73,9 @@ def test_the_baselines_use_nominal_heights_and_the_best_gain_and_offset(make_pri
 
 
 def test_no_correction_is_returned_if_the_available_models_prefer_it(tmp_path, make_printer):
-    """Check a model of gain 0.4, which corrects by 2.5, with two judges that print near nominal heights."""
+    """Check a model with a gain of 0.4, which corrects by a factor of 2.5. Two judges print nearly the
+    nominal heights.
+    """
     settings = relief_settings({"layout.size_px": 48, "search.iterations": 10, "height_um": 0.4})
     layout = settings.layout
     model = make_printer(layout, sigma_um=0.05, gain=0.4, offset_um=0.0, name="low")
@@ -125,7 +129,9 @@ def test_the_offset_of_a_print_does_not_affect_the_yield(make_printer):
 
 
 def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_printer, refused):
-    """Check a second round if the printer's gain falls by 20 % across the field and the model's does not."""
+    """Check a second round for a printer whose gain falls by 20 % across the field. The gain of the model is
+    constant.
+    """
     settings = relief_settings(TINY | {"off_blur_um": 0.2})
     model = make_printer(settings.layout, sigma_um=0.15)
     cells = torch.from_numpy(np.random.default_rng(0).integers(3, 10, (24, 24))).float()
@@ -171,7 +177,9 @@ def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_pr
 
 
 def test_the_part_of_a_relief_that_no_layout_prints_is_shown(tmp_path, monkeypatch, capsys):
-    """Check a relief with steps of one pixel and heights beyond the levels, which cannot be printed."""
+    """Check a relief that cannot be printed: its steps are one pixel wide, and some heights lie beyond the
+    levels.
+    """
     words = ["correct", "staircase", "--model", "zoo:physics", "--size-px", "48", "--iterations", "10"]
     words += ["--set", "search.polish_rounds=0", "--set", "window.yield_draws=2", "--height-um", "1.5"]
     words += ["--judge", "none", "--out", str(tmp_path / "out")]

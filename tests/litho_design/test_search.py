@@ -22,7 +22,9 @@ def objective(level):
 @pytest.mark.parametrize("keep", ["best", "last"])
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
 def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
-    """Check the history against runs of 1, 2 … iterations, which end like a longer run after as many."""
+    """Compare the history with runs of 1, 2 … iterations. Each of these runs ends in the state that a longer
+    run has after the same number of iterations.
+    """
     told, shown = [], []
     for iterations in range(1, 6):
         # Soft samples are used to the end, and differ much from the printable layout.
@@ -47,7 +49,9 @@ def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
 
 
 def test_a_search_takes_the_same_steps_in_height_for_any_number_of_levels():
-    """Check different numbers of levels for the same height, although gradients per level differ."""
+    """Check searches with different numbers of levels for the same height. They take the same steps in
+    height, although the gradients per level differ.
+    """
     ways = []
     for levels in (2, 13, 121):
         layout = LayoutSettings(size_px=16, cell_um=0.4, levels=levels)

@@ -1,4 +1,6 @@
-"""Check that each setting is stated in one field and can be set by option, by --set and from a file."""
+"""Check that each setting is stated in one field, and that it can be set by an option, by --set and in a
+file.
+"""
 
 from __future__ import annotations
 
@@ -253,7 +255,9 @@ def test_help_needs_no_torch():
 
 
 def test_designs_with_removed_choices_stay_readable():
-    """Check that removed choices can still be read, and that other unknown choices are refused."""
+    """Check that settings with removed choices can still be read, and that other unknown choices are
+    refused.
+    """
     now = hologram_settings().model_dump(mode="json")
     older = {
         **now,

@@ -1,4 +1,6 @@
-"""Check that light outside the signal window of a hologram is free, which improves the image inside."""
+"""Check that the light outside the signal window of a hologram is not constrained, and that this improves the
+image inside the window.
+"""
 
 from __future__ import annotations
 

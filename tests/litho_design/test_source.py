@@ -35,7 +35,9 @@ def test_a_point_of_one_colour_is_the_plane_wave_bit_for_bit(height):
 
 
 def test_a_wide_source_blurs_the_image_by_its_disc(height):
-    """Check that a disc of sines s blurs the image by a disc, as each shifts it by z s (Fresnel)."""
+    """Check that a disc-shaped source blurs the image by a disc. Light that arrives at the sine s shifts the
+    image by z s (Fresnel).
+    """
     sine, z_um = 0.02, OPTICS.distance_um
     wide = HologramBench(LAYOUT, OPTICS.model_copy(update={"source_sine": sine}))(height).numpy()
     point = HologramBench(LAYOUT, OPTICS)(height).numpy()
@@ -70,7 +72,9 @@ def test_a_bandwidth_is_the_mean_over_a_gaussian_spectrum(height):
 
 
 def test_scores_add_up_the_light_of_the_source(height):
-    """Check that a wide source reduces speckle and keeps the power, except for light outside the window."""
+    """Check that a wide source reduces speckle and preserves the power, except for the light outside the
+    window.
+    """
     target = torch.zeros(128, 128)
     target[30:100, 30:100] = 1
     contrast, power = {}, {}

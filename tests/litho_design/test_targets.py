@@ -1,4 +1,4 @@
-"""Test targets that are drawn by code or read from picture files."""
+"""Test targets that are drawn by code or read from image files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Test light through reliefs of finite height against rigorous gratings and closed forms."""
+"""Compare the light behind reliefs of finite height with rigorous results for gratings and with closed
+forms.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ WAVELENGTH_UM, INDEX = 0.6328, 1.548
 
 
 def first_order(period_um: float, count: int = 128) -> float:
-    """Return the share of light in order +1 behind a blaze of eight levels and one wave, in resist."""
+    """Return the share of the light in order +1 behind a blazed grating in resist. The blaze has eight levels
+    and a height of one wave.
+    """
     steps = torch.arange(count) * 8 // count
     height = (steps.double() * WAVELENGTH_UM / (INDEX - 1) / 8)[None].expand(2, count)
     field = torch.ones(2, count, dtype=torch.complex128)

@@ -70,7 +70,9 @@ def planted(
     seed: int = 0,
     base: Simulator | None = None,
 ) -> list[PrintedScan]:
-    """Return scans of a base model with effects (name, grouping, values by label), datums and white noise."""
+    """Return scans of a base model with effects, each given as (name, grouping, values by label). Every scan
+    has a datum and white noise.
+    """
     rng = np.random.default_rng(seed)
     scans = blank_scans(count, size_px)
     prepared = prepare_scans(scans)
@@ -85,7 +87,7 @@ def planted(
 
 
 def study_of(scans: Sequence[PrintedScan], folds: int = 3, seed: int = 0) -> Study:
-    """Return a study of the scans, which are assigned to the folds in turn."""
+    """Return a study in which the scans are assigned to the folds in turn."""
     prepared: list[PreparedScan] = prepare_scans(scans)
     return Study(prepared, np.arange(len(scans)) % folds, seed)
 

@@ -16,7 +16,7 @@ BLUR_UM = 0.25
 
 
 def printed_height_um(layout_um: np.ndarray) -> np.ndarray:
-    """Return the true heights of a print: blurred by 0.25 µm, with a saturating height."""
+    """Return the true heights of a print, which are blurred by 0.25 µm and saturate."""
     dose = gaussian_filter(layout_um.astype(np.float64), BLUR_UM / PITCH_UM, mode="nearest", truncate=6)
     return 0.03 + 0.9 * dose - 0.25 * dose**2
 
@@ -24,7 +24,9 @@ def printed_height_um(layout_um: np.ndarray) -> np.ndarray:
 def make_scan(
     number: int, size_px: int = 96, *, noise_um: float = 0.004, datum_um: float = 0.03, bow_um: float = 0.0
 ) -> PrintedScan:
-    """Return a scan with its own layout, a datum of alternating sign, a bow of zero mean and white noise."""
+    """Return a scan with its own layout, a bow of zero mean and white noise. The sign of the datum alternates
+    from scan to scan.
+    """
     random = np.random.default_rng([7, number])
     level = random_layout(
         (size_px, size_px), levels=LEVELS, cutoff_per_um=0.4, pitch_um=PITCH_UM, seed=number

@@ -1,4 +1,6 @@
-"""Check the background that scans share: learned on training scans, reported, and never part of a design."""
+"""Check that the background that scans share is learned on training scans and reported, but never part of a
+design.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +110,7 @@ def test_the_background_changes_only_errors_by_policies_without_smooth_terms(res
 
 
 def test_the_shared_part_of_a_prediction_is_learned_on_training_scans_only(result, scans, store, tmp_path):
-    """Check the shared part of scans that share only a bow, which a background describes equally well."""
+    """Check scans that have nothing but a bow in common. A background describes this bow equally well."""
     shared = benchmark(store, tmp_path / "shared", models=("affine",), folds=2, background="shared")
     (scores,) = shared.scores
     usual = next(one for one in result[0].scores if one.model == "affine")

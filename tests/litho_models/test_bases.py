@@ -1,4 +1,6 @@
-"""Check bases that are trained without each fold, or frozen: no leaks, and missing effects are found."""
+"""Check bases that are frozen, or trained without each fold. They must not leak, and the effects that they
+lack must be found.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:
 
 
 def trained(scans: Sequence[PrintedScan]) -> Simulator:
-    """Return a base trained on these scans outside the loop: only its gain and offset are fitted."""
+    """Return a base that is trained on these scans outside the loop. The fit changes its gain and its offset,
+    and nothing else.
+    """
     model = base_model()
     with torch.no_grad():
         own = [model(torch.from_numpy(scan.layout_um)[None, None]).numpy().ravel() for scan in scans]
@@ -80,7 +84,9 @@ def bases_of(scans: Sequence[PrintedScan], study: Study) -> dict[str, nn.Module]
 def test_no_height_of_a_held_out_scan_changes_its_prediction(
     base: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check that base, law, print and shared terms do not depend on the held-out scan's heights."""
+    """Check that the base, the law, the print and the shared terms do not depend on the heights of held-out
+    scans.
+    """
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
     scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
     study = study_of(scans)
@@ -156,7 +162,7 @@ def test_a_frozen_base_is_taken_as_it_is_and_only_at_its_pitch(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_the_loop_starts_where_the_benchmark_ends(tmp_path: Path) -> None:
-    """Check that loop and benchmark use the same fits of a network and state the same error."""
+    """Check that the loop and the benchmark use the same fits of a network and state the same error."""
     store, out = write_store(tmp_path / "s.zarr", make_scans(6, size_px=56, bow_um=0.02)), tmp_path / "l"
     scored = benchmark(store, tmp_path / "b", models=["features"], folds=2).scores[0]
     loop = close_loop(store, out, base="features", folds=2, cache=tmp_path / "b" / "cache")

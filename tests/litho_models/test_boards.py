@@ -79,7 +79,9 @@ def test_the_judge_compares_names_with_what_is_hidden(board, tmp_path, answer, w
 
 
 def test_a_trial_has_the_errors_of_the_loop_and_of_the_true_models(board, tmp_path):
-    """Check that a trial records the error that the loop states and that of the true models, the noise."""
+    """Check that a trial records two errors: the error that the loop states, and the error of the true
+    models, which is the noise.
+    """
     said = iter([Answer(before_nm=30, after_nm=20), Answer(before_nm=30, after_nm=10)])
     first, second = judge_board(board, tmp_path / "one", lambda store, folder: next(said)).trials
     assert first.errors is not None

@@ -95,7 +95,9 @@ def test_an_unchanged_printer_alarms_no_more_often_than_stated(n, m):
 
 
 def test_a_normal_distribution_in_place_of_students_would_alarm_too_often():
-    """Check that with 5 reference prints a normal distribution gives over 3 % false alarms, not 0.5 %."""
+    """Check that a normal distribution would give over 3 % false alarms with 5 reference prints, instead of
+    0.5 %.
+    """
     random = np.random.default_rng(1)
     series = _equal(random.normal(size=(20_000, 5)), random.normal(size=(20_000, 1)))
     z = (series.new[:, 0] - series.reference.mean(axis=1)) / series.reference.std(axis=1, ddof=1)
@@ -104,7 +106,9 @@ def test_a_normal_distribution_in_place_of_students_would_alarm_too_often():
 
 @pytest.mark.parametrize(("n", "m"), [(12, 3), (48, 3), (24, 1), (10, 7)])
 def test_a_step_is_noticed_as_often_as_the_closed_form_says(n, m):
-    """Check Gaussian prints, of which the last three are shifted by three standard deviations."""
+    """Check prints whose values are Gaussian. The values of the last three prints are shifted by three
+    standard deviations.
+    """
     rate, draws, soon = 0.004, 20_000, min(3, m)
     stated = chance_to_notice(3, np.ones(n), np.ones(m), rate)
     moved = np.where(np.arange(m) >= m - soon, 3.0, 0.0)
@@ -122,7 +126,9 @@ def test_the_noticeable_step_is_noticed_in_nine_of_ten_cases():
 
 
 def test_the_page_has_the_chance_to_notice_three_spreads_within_three_prints():
-    """Check the table of docs/checking.md: our rule, the most powerful test, and the noticeable step."""
+    """Check the table in docs/checking.md, which describes our rule, the most powerful test, and the
+    noticeable step.
+    """
     page = (Path(__file__).parents[2] / "docs" / "checking.md").read_text("utf-8")
     own = rates(DEFAULT_RATE)[0]
     for prints in (6, 12, 24, 30, 48):
@@ -146,7 +152,7 @@ def test_an_alarm_names_the_first_changed_print_and_the_size_of_the_step():
 
 
 def _scans(values: np.ndarray, first_print: int = 0) -> list[ScanFigures]:
-    """Return the figures of scans whose gains are given by print and scan."""
+    """Return the figures of scans. ``values`` contains their gains, by print and scan."""
     return [
         ScanFigures(
             scan=f"P{p}F{f}",
@@ -166,7 +172,9 @@ def _scans(values: np.ndarray, first_print: int = 0) -> list[ScanFigures]:
 
 @pytest.mark.parametrize(("between", "within"), [(0.02, 0.0), (0.0, 0.02), (0.01, 0.02)])
 def test_prints_of_one_scan_beside_prints_of_four_keep_the_rate(between, within):
-    """Check prints with one scan, whose values vary more; ignoring this would cause too many alarms."""
+    """Check prints with one scan. Their values vary more than those of prints with several scans. Ignoring
+    this would cause too many alarms.
+    """
     draws, rate = 800, 0.05
     random = np.random.default_rng(11)
     alarms = 0
@@ -230,7 +238,9 @@ def test_a_flat_layout_has_no_gain():
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """Write a model of twelve prints and new sets: one unchanged, one 8 % taller from the second print on."""
+    """Write a model of twelve prints and two new sets of prints. One set is unchanged; the other is 8 %
+    taller from the second print on.
+    """
     folder = tmp_path_factory.mktemp("check")
     scans = make_scans(44, size_px=64)
     made = write_store(folder / "made.zarr", scans[:24])
@@ -261,7 +271,9 @@ def test_unchanged_prints_raise_no_alarm_whatever_their_datum(lab, tmp_path):
 
 
 def test_an_error_that_the_fit_has_made_small_is_not_judged(lab, tmp_path):
-    """Check this because the error of unchanged new prints is larger than that of prints used in the fit."""
+    """Check this because new prints have a larger error than prints that were used in the fit, even if
+    nothing has changed.
+    """
     shutil.copytree(lab / "model", tmp_path / "model")
     card = json.loads((tmp_path / "model" / "card.json").read_text())
     honest = check(lab / "model", lab / "same.zarr", tmp_path / "honest")

@@ -1,4 +1,4 @@
-"""Check curves over spatial frequency for a known blur and white noise, and by Parseval's theorem."""
+"""Check curves over spatial frequency against a known blur, white noise, and Parseval's theorem."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Check effects on a plane, where each formula of the catalogue is simple arithmetic.
 
-The formulas are written anew from the docstrings. On a plane, the slope is known, smoothing does not change
-the height, and the heights at displaced positions are known.
+The formulas are implemented again here, following the docstrings. On a plane, the slope is known, smoothing
+does not change the height, and the heights at displaced positions are known.
 """
 
 from __future__ import annotations

@@ -22,7 +22,9 @@ PER_EFFECT = pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for eff
 
 
 def field(seed: int = 0) -> tuple[torch.Tensor, FieldContext]:
-    """Return a smooth random height in µm with flat parts, as float64 (1, 1, 36, 44), and its context."""
+    """Return a smooth random height map in µm with flat parts, and its context. The map is float64 with the
+    shape (1, 1, 36, 44).
+    """
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.randint(0, 13, (1, 1, 9, 11), generator=generator).double() * 0.1
     layout = torch.nn.functional.interpolate(coarse, size=(36, 44), mode="nearest")
@@ -301,7 +303,9 @@ def test_slope_thinning_and_tip_dilation_on_a_ramp() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0, 90.0])
 def test_equal_losses_along_both_axes_are_a_loss_by_the_size_of_the_slope(degrees: float) -> None:
-    """Check that a ramp of slope 0.5 loses c 0.5^p in any direction, and that a tiny negative loss is 0."""
+    """Check that a ramp of slope 0.5 loses a height of c 0.5^p in any direction, and that a tiny negative
+    loss counts as 0.
+    """
     y, x = torch.meshgrid(*(torch.arange(40, dtype=torch.float64) * PITCH_UM,) * 2, indexing="ij")
     ramp = 0.5 * (math.cos(math.radians(degrees)) * x + math.sin(math.radians(degrees)) * y)[None, None]
     context, inner = FieldContext(ramp, PITCH_UM, 1.2), (..., slice(1, -1), slice(1, -1))
@@ -346,7 +350,9 @@ def test_uneven_scanners_of_printer_and_microscope_are_one_formula_until_the_sca
 
 
 def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands() -> None:
-    """Check derivatives of a dilation of random heights, where small steps do not move the contact."""
+    """Check derivatives of a dilation of random heights, on which small steps do not move the point of
+    contact.
+    """
     draw = torch.Generator().manual_seed(4)
     surface = (0.3 * torch.rand(1, 1, 6, 12, generator=draw, dtype=torch.float64)).requires_grad_()
     radius_um = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
@@ -371,7 +377,7 @@ def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
 
 @pytest.mark.parametrize(("name", "sign"), [("trench-residue", 1.0), ("feature-collapse", -1.0)])
 def test_only_narrow_pits_are_filled_and_only_narrow_ridges_are_lost(name: str, sign: float) -> None:
-    """Check narrow and wide pits in a plateau, and ridges in the same surface upside down."""
+    """Check a plateau with a narrow and a wide pit. Turned upside down, the same surface has ridges."""
     pits = torch.ones(1, 1, 60, 60, dtype=torch.float64)
     pits[..., 10:50, 10:13] = 0
     pits[..., 10:50, 30:45] = 0
@@ -384,7 +390,9 @@ def test_only_narrow_pits_are_filled_and_only_narrow_ridges_are_lost(name: str, 
 
 @pytest.mark.parametrize(("width_um", "share"), [(0.6, 0.0), (0.65, 0.25), (0.7, 0.5), (0.8, 1.0)])
 def test_a_width_between_two_kernel_sizes_fills_a_pit_in_part(width_um: float, share: float) -> None:
-    """Check a pit of 7 px, which a kernel of 7 px leaves unfilled and one of 9 px (0.4 µm) fills."""
+    """Check a pit that is 7 px wide. A kernel of 7 px does not fill it, and a kernel of 9 px (0.4 µm)
+    does.
+    """
     pit = torch.ones(1, 1, 40, 40, dtype=torch.float64)
     pit[..., 16:23] = 0
     values = {"fraction": 1.0, "width_um": width_um}
@@ -394,7 +402,7 @@ def test_a_width_between_two_kernel_sizes_fills_a_pit_in_part(width_um: float, s
 
 
 def test_a_field_continues_beyond_its_edge_when_narrow_pits_are_filled() -> None:
-    """Check that a field is filled in the same way as the inner part of the continued field."""
+    """Check that a field is filled in the same way as the inner part of a larger field that continues it."""
     part = torch.rand(1, 1, 40, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     whole = torch.nn.functional.pad(part, (20,) * 4, mode="replicate")
     values = {"fraction": 1.0, "width_um": 0.9}

@@ -1,4 +1,6 @@
-"""Test ridge regressions on many features: closed form, no influence of scan terms or tiles."""
+"""Test ridge regressions on many features against the closed form. Scan terms and tiles must have no
+influence.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Test edges, areas and features of films against closed forms, and an electron-beam printer of parts."""
+"""Test edges, areas and features of films against closed forms. Also test an electron-beam printer made of
+parts.
+"""
 
 from __future__ import annotations
 

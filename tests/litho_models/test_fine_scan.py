@@ -1,4 +1,6 @@
-"""Check that with smaller scan pixels the blur and delay of the microscope shrink in fab, models and plan."""
+"""Check that smaller scan pixels reduce the blur and the delay of the microscope in the fab, the models and a
+plan.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ FINE = Way(pixel_size=0.5)
 
 @pytest.mark.parametrize("pixel_size", [1.0, 0.5])
 def test_in_the_fab_the_blur_of_a_scan_is_one_of_its_pixels(pixel_size: float) -> None:
-    """Check a blur of two pixels, which is 0.2 µm with pixels of 0.1 µm, and 0.1 µm with half that size."""
+    """Check a blur of two pixels. It is 0.2 µm for pixels of 0.1 µm, and 0.1 µm for pixels of half that
+    size.
+    """
     boards = KnobBoard([KnobSetting("resampling-blur", 0.2, 1)], 0), KnobBoard([], 0)
     job = Job("a", random_layout((48, 48), seed=1), pixel_size=pixel_size)
     blurred, plain = (
@@ -72,7 +76,7 @@ def test_effects_that_lag_shrink_with_the_pixels_of_the_scan(name: str) -> None:
 
 
 def test_smaller_pixels_tell_a_blur_of_the_resist_from_one_of_the_scan() -> None:
-    """Check two blurs with the same formula, which scans with plain pixels cannot tell apart."""
+    """Check two blurs with the same formula. Scans with pixels of the usual size cannot tell them apart."""
     blurs = {
         "diffusion-blur": {"variance_um2": 0.04},
         "resampling-blur": {"variance_um2": 0.04},

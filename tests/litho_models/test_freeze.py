@@ -1,4 +1,6 @@
-"""Check that frozen models reload unchanged, refuse other printers' layouts, and run no code when loaded."""
+"""Check that frozen models reload unchanged, refuse the layouts of other printers, and run no code when
+loaded.
+"""
 
 from __future__ import annotations
 

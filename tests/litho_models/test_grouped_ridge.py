@@ -23,7 +23,9 @@ CLOSE = {"rtol": 2e-5, "atol": 2e-6}
 
 
 def rows(seed: int = 0) -> np.ndarray:
-    """Return a residual and m columns as an array (scans, 1 + m, n). Some columns are correlated."""
+    """Return an array (scans, 1 + m, n) with a residual and m columns for each scan. Some columns are
+    correlated.
+    """
     rng = np.random.default_rng(seed)
     found = rng.normal(size=(SCANS, 1 + COLUMNS, PIXELS))
     found[:, 2] += 0.5 * found[:, 1]
@@ -36,7 +38,7 @@ def products(maps: np.ndarray) -> Products:
 
 
 def written_out(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> tuple[np.ndarray, list[tuple]]:
-    """Return a column (scans, n) for each strength of each label, with the names of the strengths."""
+    """Return a column (scans, n) for each strength of each label. Also return the names of the strengths."""
     found, names = [], []
     for number, block in enumerate(blocks):
         labels = np.array(GROUPS[block.by])
@@ -48,7 +50,7 @@ def written_out(maps: np.ndarray, blocks: list[Block], scans: np.ndarray) -> tup
 
 
 def solved(maps: np.ndarray, blocks: list[Block], scans: np.ndarray, target: int = 0) -> np.ndarray:
-    """Solve the least-squares problem with a penalty row for each strength."""
+    """Solve the least-squares problem, to which a penalty row is added for each strength."""
     columns, names = written_out(maps, blocks, scans)
     usual = np.mean(maps[scans] ** 2, axis=(0, 2))
     penalty = [blocks[number].shrinking * usual[column] for number, _, column in names]
@@ -99,7 +101,9 @@ def test_held_out_is_a_fit_without_the_fold(blocks: list[Block]) -> None:
 
 
 def test_a_scan_does_not_help_to_predict_itself() -> None:
-    """Check that a scan's residual does not change its strengths: its squared error is a parabola."""
+    """Check that the residual of a scan does not change its strengths. The squared error of the scan is then
+    a quadratic function of the residual.
+    """
     maps, blocks = rows(), BLOCKS["two groupings"]
     change = np.random.default_rng(5).normal(size=PIXELS)
     errors = []
@@ -127,7 +131,7 @@ def test_nothing_fitted_leaves_the_residual() -> None:
 
 @pytest.mark.parametrize("shrinking", [0.3, 1.0, 3.0])
 def test_shrinking_counts_in_scans(shrinking: float) -> None:
-    """Check that the fit finds k / (k + shrinking) of a strength that k scans share."""
+    """Check that the fit finds k / (k + shrinking) times a strength that k scans share."""
     column = np.random.default_rng(1).normal(size=PIXELS)
     maps = np.zeros((SCANS, 2, PIXELS))
     maps[:, 1] = column

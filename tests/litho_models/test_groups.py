@@ -29,7 +29,9 @@ def test_all_scans_are_one_group_and_it_comes_first() -> None:
 
 
 def test_every_label_is_that_of_the_scan_alone() -> None:
-    """Check that the same rule gives the group of a scan alone, so that it holds for new scans."""
+    """Check that the rule finds the same group for a scan on its own, so that it can be used for new
+    scans.
+    """
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32")
     found = groupings(scans)
     assert len(found) > 3
@@ -73,7 +75,9 @@ def test_a_change_may_come_where_a_print_begins() -> None:
 
 
 def test_a_scan_of_a_left_out_print_at_the_place_of_a_change_has_no_label() -> None:
-    """Check scans of a held-out print that lies between both sides of a change, so it has no label."""
+    """Check scans of a held-out print that lies between the two sides of a change. Such a print has no
+    label.
+    """
     scans = scans_of("F11", "F12", "F21", "F22", "F31", "F32", "F41", "F42")
     by, _ = (by for by in groupings([*scans[:2], *scans[4:]]) if by.startswith("order"))
     assert by == "order 1-4"

@@ -40,7 +40,7 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(store, tmp_path_factory):
-    """Return the training run of a network, and its folder with the checkpoint."""
+    """Return the training run of a network, and the folder that contains its checkpoint."""
     folder = tmp_path_factory.mktemp("run") / "pbl"
     return train(store, "pbl", folder, settings=QUICK), folder
 

@@ -50,7 +50,7 @@ def changed(
 
 
 def turned(axis: str, turn_deg: float, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the component along the axis x or y after rotating both axes from x towards y."""
+    """Return the component along an axis, x or y, after both axes are rotated from x towards y."""
     cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     return cosine * x + sine * y if axis == "x" else cosine * y - sine * x
 
@@ -67,7 +67,7 @@ def mean_within(h: np.ndarray, reach_um: float) -> np.ndarray:
 
 
 def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
-    """Return the running mean y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx), starting at one side."""
+    """Return the running mean that starts at one side: y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx)."""
     turned = {"left": h, "right": h[:, ::-1], "above": h.T, "below": h.T[:, ::-1]}[side]
     found = turned.copy()
     for i in range(1, turned.shape[1]):
@@ -79,7 +79,9 @@ AXES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y",
 
 
 def tail(h: np.ndarray, sides: tuple[str, ...], length_um: float, turn_deg: float) -> np.ndarray:
-    """Return the mean of the running means from the sides, by Fourier transform along a rotated axis."""
+    """Return the mean of the running means that start at these sides. Along a rotated axis, it is computed by
+    Fourier transform.
+    """
     if not turn_deg:
         return np.mean([beside(h, side, length_um) for side in sides], axis=0)
     edge = 6 * round(length_um / PITCH_UM)
@@ -106,7 +108,9 @@ def rim(length_um: float) -> np.ndarray:
 
 
 def jump(axis: str, at: float) -> np.ndarray:
-    """Return a step at a position from -1 to 1: 0 before it, 1 after it, and a fraction in its pixel."""
+    """Return a step at a position between -1 and 1. It is 0 before the position, 1 after it, and a fraction
+    in the pixel at the position.
+    """
     size = SHAPE["yx".index(axis)]
     return np.clip((PLACES[axis] - at) * (size - 1) / 2 + 0.5, 0, 1)
 
@@ -167,7 +171,9 @@ WAVES = ("height-wave", "dose-wave")
 
 
 def shapes_of(name: str) -> list[dict[str, float]]:
-    """Return the shapes that screening tries, plus one in which a length that it keeps fixed is doubled."""
+    """Return the shapes that screening tries. Add a shape in which any length that screening keeps fixed is
+    doubled.
+    """
     shapes = [{k: v for k, v in trial.items() if k != "strength"} for trial in LAWS[name].trials]
     untried = {k: 2 * one.typical for k, one in LAWS[name].parameters.items() if one.off and not one.tried}
     return list(map(dict, dict.fromkeys(tuple(one.items()) for one in (*shapes, {**shapes[0], **untried}))))
@@ -232,7 +238,9 @@ SCALED = [
 
 @pytest.mark.parametrize("name", SCALED)
 def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
-    """Check that in a unit half as large, where all lengths double, the change of the height doubles too."""
+    """Check a unit that is half as large, so that all lengths double. The change of the height must double as
+    well.
+    """
     unit = LAWS[name].parameters["strength"].unit
     height = HEIGHT[:60, :64].copy()
     one = changed(name, {"strength": 0.05}, height)
@@ -292,7 +300,9 @@ def test_slope_thinning_is_a_power_of_the_slope(power: float, axis: str) -> None
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_shortened_line_loses_its_delta_at_both_ends(axis: str) -> None:
-    """Check a line 0.8 µm high, whose area decreases by twice delta times its height only along the line."""
+    """Check a line 0.8 µm high. Shortening it along its length decreases the area of its profile by twice
+    delta times the height. Shortening it across its length changes nothing.
+    """
     line = np.zeros((30, 60))
     line[:, 15:45] = 0.8
     line = line if axis == "x" else line.T

@@ -1,4 +1,6 @@
-"""Check that the learner measures how much predictions lack, and finds nothing if they lack nothing."""
+"""Check that the learner measures how much the predictions lack, and that it finds nothing if they lack
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def scene() -> tuple[Study, list[np.ndarray], Learner]:
 
 @pytest.fixture(scope="module")
 def rest_without(scene) -> Callable[[Change | None], Rest]:
-    """Return a function that runs the learner on predictions that lack a change, or none."""
+    """Return a function that runs the learner on predictions. They lack the change that is passed; if it is
+    None, they lack nothing.
+    """
     study, predictions, learner = scene
 
     @functools.cache
@@ -47,17 +51,19 @@ def rest_without(scene) -> Callable[[Change | None], Rest]:
 
 
 def changed(study: Study, predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
-    """Return the predictions without a change that the scans contain."""
+    """Return the predictions after removing from them a change that the scans contain."""
     return [p - change(f, p).astype(np.float32) for f, p in zip(study.scans, predictions, strict=True)]
 
 
 def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return a bead of a few nanometres on slopes along x that is proportional to the height."""
+    """Return a bead of a few nanometres on slopes along x. The bead is proportional to the height."""
     return 0.02 * prediction * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=1))
 
 
 def later(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return a change proportional to slopes along y, in the second half of the scans only."""
+    """Return a change that is proportional to slopes along y and occurs only in the second half of the
+    scans.
+    """
     return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=0))
 
 
@@ -68,7 +74,9 @@ def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
 
 
 def displaced(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    """Return the change due to a displacement along y of 0.1 µm at the upper right, fading elsewhere."""
+    """Return the change due to a displacement along y. The displacement is 0.1 µm at the upper right, and
+    fades away from there.
+    """
     ny, nx = prediction.shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
     return 0.1 * np.exp(-2 * (y + 0.4) ** 2 - 2 * (x - 0.4) ** 2) * np.gradient(prediction, 0.1, axis=0)
@@ -100,7 +108,9 @@ def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene, rest_without) -
 
 
 def test_two_folds_are_enough(scene, rest_without) -> None:
-    """Check two folds, where the weight of the ridge is chosen on single scans of the other fold."""
+    """Check two folds. In this case, the weight of the ridge is chosen on individual scans of the other
+    fold.
+    """
     study, predictions, _ = scene
     halves = Learner(replace(study, fold_of=np.arange(10) % 2), predictions)
     lacking = changed(study, predictions, bead)

@@ -37,7 +37,9 @@ def test_damped_solution_is_exact_without_damping_and_indifferent_to_units() -> 
 
 
 def test_a_step_in_a_box_is_the_best_one_in_it() -> None:
-    """Check the Karush-Kuhn-Tucker conditions: zero slope inside the box, an outward slope at its bounds."""
+    """Check the Karush-Kuhn-Tucker conditions: the slope is zero inside the box and points outwards at its
+    bounds.
+    """
     rng = np.random.default_rng(6)
     a = rng.normal(size=(20, 4)) @ np.diag([1.0, 30.0, 0.03, 5.0])
     normal, right = a.T @ a, a.T @ rng.normal(size=20)

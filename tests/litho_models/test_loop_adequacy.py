@@ -1,4 +1,4 @@
-"""Check that the loop refuses the name of an effect that only resembles the true cause."""
+"""Check that the loop does not name an effect that merely resembles the true cause."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def values_of(name: str) -> dict[str, float]:
 
 
 def share(planted_name: str, fitted_name: str, beside: tuple[str, ...] = (), seed: int = 0) -> float:
-    """Return the further gain of the fitted effect in other shapes, divided by its own gain.
+    """Return the additional gain that other shapes of the fitted effect would bring, divided by its own gain.
 
     The effects ``beside`` act on the print but are not fitted.
     """
@@ -54,7 +54,7 @@ def test_another_missing_cause_does_not_refuse_a_name() -> None:
 
 
 def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() -> None:
-    """Check that the shapes do not depend on the pitch, except for slopes, which are per length."""
+    """Check that the shapes do not depend on the pitch, except for slopes, which are measured per length."""
     rng = np.random.default_rng(0)
     change, prediction, layout = rng.random((3, 48, 40))
 
@@ -68,7 +68,9 @@ def test_the_shapes_of_a_change_are_those_of_its_pixels_whatever_their_size() ->
 
 
 def squared(squares_nm2: float) -> dict[str, object]:
-    """Return residuals of one pixel, with this square, for each of ten scans."""
+    """Return residuals for ten scans. Each scan has one pixel, and the square of its residual is
+    ``squares_nm2``.
+    """
     return {
         "freed_um": [np.array([1e-3 * squares_nm2**0.5])] * 10,
         "freed_nm2": np.full(10, float(squares_nm2)),
@@ -76,7 +78,7 @@ def squared(squares_nm2: float) -> dict[str, object]:
 
 
 def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -> SimpleNamespace:
-    """Return a fitted model with these parameters at a limit of their range."""
+    """Return a fitted model in which these parameters lie at a limit of their range."""
     return SimpleNamespace(exhausts=lambda name: exhausts, outgrows=lambda name: outgrows, slots=())
 
 
@@ -118,12 +120,14 @@ STUDY = Study((), np.empty(0))
 
 
 def gaining(name: str, gain_nm2: float) -> Cause:
-    """Return a cause that reduces 100 nm² by this gain in each of ten scans."""
+    """Return a cause that reduces a squared error of 100 nm² by this gain in each of ten scans."""
     return Cause(name, ALL, (), judge(np.full(10, 100.0), np.full(10, 100.0 - gain_nm2), STUDY), 0.01, None)
 
 
 def leaving(squares_nm2: float, without_nm2: float = 100.0) -> SimpleNamespace:
-    """Return a model with this squared error in ten scans, or ``without_nm2`` without any of its effects."""
+    """Return a model with this squared error in ten scans. If any of its effects is removed, the squared
+    error is ``without_nm2``.
+    """
     return SimpleNamespace(
         **squared(squares_nm2),
         twin=twin_at_limits(),
@@ -158,7 +162,7 @@ def test_a_name_is_refused_if_a_table_gains_twice_as_much_without_it(
 
 
 def with_base(own: int, effects: int = 0, mse_nm2: float = 100.0) -> SimpleNamespace:
-    """Return a model whose base has ``own`` fitted numbers, plus ``effects`` numbers of its effects."""
+    """Return a model whose base has ``own`` fitted numbers. Its effects have ``effects`` more numbers."""
     return SimpleNamespace(twin=SimpleNamespace(own=own, vector=np.zeros(own + effects)), mse_nm2=mse_nm2)
 
 
@@ -173,7 +177,9 @@ def with_base(own: int, effects: int = 0, mse_nm2: float = 100.0) -> SimpleNames
 def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
     found_on: list[str], knowledge: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check that only a base with more numbers than the chosen one may do without the cause."""
+    """Check that the cause may be missing on another base only if that base has more numbers than the chosen
+    base.
+    """
     monkeypatch.setattr(results, "_strengths", lambda closed, name: {})
     cause = gaining("dose-exponent", 10)
     rivals = {
@@ -199,7 +205,9 @@ def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
 def test_of_equally_good_bases_the_one_whose_causes_others_share_is_chosen(
     better_nm2: float, own: str, chosen: str
 ) -> None:
-    """Check that a base whose causes other bases need too is preferred to one with causes of its own."""
+    """Check that a base whose causes are also needed by other bases is preferred to a base with causes of its
+    own.
+    """
     shared = gaining("slope-thinning", 10)
     found = {
         "affine-mtf": Found(with_base(7, 1), [replace(shared, name=own), shared]),
@@ -219,7 +227,9 @@ def test_of_equally_good_bases_the_one_whose_causes_others_share_is_chosen(
 def test_a_small_cause_that_a_large_one_explains_in_another_shape_only_corrects_it(
     small: str, values: dict[str, float], corrected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check a small cause that is a large one in another shape (times the height), and an unrelated tilt."""
+    """Check two small causes beside a large cause. One is the large cause in another shape (times the
+    height); the other is an unrelated tilt.
+    """
     loss = get_effect("slope-x-power").with_values({"strength": 0.06})
     strengths = {"slope-x-power": loss, small: get_effect(small).with_values(values)}
     study = study_of(planted([(name, ALL, {"": own}) for name, own in strengths.items()]))
@@ -243,7 +253,7 @@ def test_a_small_cause_that_a_large_one_explains_in_another_shape_only_corrects_
 
 
 def test_a_cause_does_not_correct_its_own_formula(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that a cause whose gain shrank to a tenth when others were added does not correct itself."""
+    """Check a cause whose gain shrank to a tenth when other causes were added. It does not correct itself."""
     monkeypatch.setattr(checking, "reshaped_gain", lambda without, state: 100.0)
     cause = gaining("slope-thinning", 60)
     assert not Check(leaving(95), [cause], [], [], 1000.0, None).of(cause).corrects

@@ -128,7 +128,9 @@ def test_moving_the_twin_does_not_move_its_base(twin: Twin, study) -> None:
 
 
 def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin, study) -> None:
-    """Check all derivatives, also of numbers of other groups and of effects for which the base is not run."""
+    """Check all derivatives, including those for numbers of other groups and for effects whose derivatives do
+    not need the base to be run.
+    """
     twin = twin.with_effect("long-range-proximity", ALL, {"": _typical("long-range-proximity")})
     steps = twin.steps()
     linear = TwinProblem(twin, study.windows).linearise(twin.vector)
@@ -201,7 +203,7 @@ def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> N
 
 @pytest.mark.parametrize("by", [ALL, "field", "print"])
 def test_a_scan_says_nothing_about_its_own_prediction(by: str) -> None:
-    """Check folds of whole prints, where the strength of a held-out print comes from the other prints."""
+    """Check folds of whole prints. The strength of a held-out print comes from the other prints."""
     law = "height-power-2"
     scans = planted()
     changed = [
@@ -232,7 +234,7 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
 
 
 def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
-    """Check that new scans get places in the known order, so that a drift continues."""
+    """Check that new scans get positions in the known printing order, so that a drift continues."""
     stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
     found = prepared_among(stored, study.scans)
     assert [one.context.order for one in found] == [
@@ -260,7 +262,9 @@ def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
 
 
 def test_of_two_blurs_only_the_sum_is_known(study) -> None:
-    """Check that of two successive blurs, by resist and microscope, only the sum is determined."""
+    """Check two successive blurs, one by the resist and one by the microscope. Only their sum is
+    determined.
+    """
     blurs = [(name, {"variance_um2": 0.02}) for name in ("diffusion-blur", "resampling-blur")]
     alike = study_of(planted([(name, ALL, {"": values}) for name, values in blurs]))
     twin = Twin.bare(base_model())
@@ -282,7 +286,9 @@ def test_without_fitted_numbers_nothing_is_confounded(study) -> None:
 
 @pytest.mark.parametrize("depth_um", [0.1, 0.25])
 def test_an_effect_that_the_base_partly_absorbed_can_be_fitted(depth_um: float) -> None:
-    """Check two starts. From one, a fit of only one base would end at 24 nm (fresh) or 8 nm (fitted)."""
+    """Check two starts. From one of them, a fit of a single base would end at an error of 24 nm (fresh base)
+    or 8 nm (fitted base).
+    """
     effect = get_effect("interface-offset")
     deep = effect.with_values({"depth_um": 0.6, "shrinkage": 0.4, "substrate_um": 0.05})
     made = build_model(

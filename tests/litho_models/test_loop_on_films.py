@@ -1,4 +1,4 @@
-"""Check that the loop finds, on micrographs of films, which edge effect a bare printer lacks."""
+"""Check that the loop finds the edge effect that a bare printer lacks. The scans are micrographs of films."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_electrons_come_back_where_something_is_written() -> None:
 
 
 def _prints(count: int, bias_px: float) -> list[PrintedScan]:
-    """Return random films made by a spot, a threshold and an edge bias, with noise."""
+    """Return noisy scans of random films, which are made by a spot, a threshold and an edge bias."""
     numbers = {"spot.sigma_um": 0.014, "etch.bias_px": bias_px}
     printer = build_model("e-beam", **(BARE | numbers), **GEOMETRY)
     scans = []

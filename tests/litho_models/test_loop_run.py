@@ -277,7 +277,9 @@ def test_error_rows_count_the_terms_of_each_scan() -> None:
 
 
 def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
-    """Compare the sandwich standard error, clustered by scan, with the scatter of fits to other noise."""
+    """Compare the sandwich standard error, clustered by scan, with the scatter of fits to data with other
+    noise.
+    """
     fitted, sds = [], []
     for seed in range(12):
         study = study_of(planted(seed=seed))
@@ -348,7 +350,7 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Save time: search no cause, law or table, and only few terms that scans share."""
+    """Save time: search for no causes, laws or tables, and for only a few terms that scans share."""
     for name in ("LAWS", "TABLES"):
         monkeypatch.setattr(closing, name, {})
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])

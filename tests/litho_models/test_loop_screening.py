@@ -1,4 +1,4 @@
-"""Check that screening predicts the gain of a later fit, with one strength or one strength per group."""
+"""Check that screening predicts the gain of a later fit with one strength, or with one strength per group."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_a_change_that_the_base_can_make_is_no_candidate(in_all) -> None:
 
 
 def test_a_tip_that_would_have_to_narrow_is_contradicted() -> None:
-    """Check a loss of height on slopes along both axes, where a blunt tip would add height."""
+    """Check a loss of height on slopes along both axes. A blunt tip would add height there."""
     name = "slope-thinning"
     thinned = get_effect(name).with_values({"along_x_um": 0.1, "along_y_um": 0.1})
     study = study_of(planted([(name, ALL, {"": thinned})]))

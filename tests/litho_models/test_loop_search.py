@@ -67,7 +67,9 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
 
 @pytest.mark.parametrize("needed", [True, False])
 def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
-    """Check a start from a cause that another base lacked, whether or not this base lacks it too."""
+    """Check a search that starts from a cause that another base lacked. The present base either lacks it too,
+    or does not.
+    """
     seed = found_in((THINNING, ALL, {"": thinning(0.2)}))
     assert added(seed) == {THINNING: ALL}
     lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
@@ -78,7 +80,9 @@ def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
 
 
 def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end() -> None:
-    """Check a grouping that shows only beside another cause, for a cause that was not added last."""
+    """Check a grouping that shows only if another cause is included. It belongs to a cause that was not added
+    last.
+    """
     values = {"1": thinning(0.1), "2": thinning(0.2)}
     study = study_of(planted([(THINNING, "field", values), (MEMORY, ALL, {"": memory(0.3)})]))
     twin = bare_state(study).twin.with_effect(THINNING, ALL, {"": thinning(0.15)})
@@ -165,7 +169,7 @@ def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
 def test_a_cause_that_another_resembles_is_found(
     name: str, values: dict[str, float], beside: list[str]
 ) -> None:
-    """Check causes on a Physics base, whose blur, gain and saturation are fitted together with the cause."""
+    """Check causes on a Physics base. Its blur, gain and saturation are fitted together with the cause."""
     base = build_model("physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4)
     effect = get_effect(name)
     scans = planted(
@@ -212,7 +216,9 @@ def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> Non
 
 
 def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -> None:
-    """Check a cause in all scans, of which three have 0.4 of the strength and get worse with the mean."""
+    """Check a cause in all scans. Its strength is 0.4 times as large in three of the scans, and the mean
+    strength makes these scans worse.
+    """
     strengths = np.where(np.arange(10) < 3, 0.4, 1.0)
     noise = np.random.default_rng(0).normal(size=(10, 50_000))
     change = np.random.default_rng(1).normal(size=50_000)

@@ -41,7 +41,9 @@ PRINTS = [relief(number) for number in range(COUNT)]
 def measured(
     seen: Callable[[int], np.ndarray], *, noise_um: float = NOISE_UM, seed: int = 0
 ) -> list[PrintedScan]:
-    """Return scans of the heights ``seen(number)`` (ny, nx) in µm, with a datum and white noise each."""
+    """Return scans of the heights ``seen(number)``, (ny, nx) in µm. Each scan has its own datum and white
+    noise.
+    """
     rng = np.random.default_rng(seed)
     noise = rng.normal(0, noise_um, (COUNT, SIZE_PX, SIZE_PX)) + rng.normal(0, 0.05, (COUNT, 1, 1))
     return with_heights(SCANS, [seen(number) + noise[number] for number in range(COUNT)])
@@ -58,14 +60,14 @@ def part_of(model: MeasurementModel, what: str, by: str) -> SharedPart:
 def left_nm(
     scans: Sequence[PrintedScan], model: MeasurementModel, prints: Sequence[np.ndarray] = PRINTS
 ) -> float:
-    """Return the rms of the residual in nm, after subtracting each scan's datum."""
+    """Return the rms of the residual in nm, after the datum of each scan is subtracted."""
     left = [scan.height_um - model.expected_um(scan, own) for scan, own in zip(scans, prints, strict=True)]
     # Exclude the edge, where a displaced print would have to be known beyond the field.
     return 1e3 * float(np.sqrt(np.mean([one[2:-2, 2:-2].var() for one in left])))
 
 
 def levelled(field_um: np.ndarray, levelling: str) -> np.ndarray:
-    """Subtract the best-fitting surface of a levelling, such as a plane, but keep the mean."""
+    """Subtract the surface that a levelling fits, such as a plane, but keep the mean."""
     powers = {1: X, 2: Y, 3: X**2, 4: X * Y, 5: Y**2}
     shapes = np.stack([np.ones_like(X), *(powers[k] for k in LEVELLED[levelling])]).reshape(  # type: ignore[index]
         1 + len(LEVELLED[levelling]),
@@ -91,7 +93,7 @@ def test_a_levelled_prediction_has_none_of_the_surface_and_keeps_its_mean() -> N
 
 
 def background(number: int) -> np.ndarray:
-    """Return the background in µm: a bow along x and a twist for field 2, zero for field 1."""
+    """Return the background in µm. In field 2, it is a bow along x plus a twist. In field 1, it is zero."""
     return (0.03 * legendre.legval(X, [0, 0, 1]) + 0.02 * X * Y) * in_field(number, "2")
 
 
@@ -130,7 +132,9 @@ def test_what_one_group_has_leaves_every_other_scan_untouched(learned: Measureme
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_displacement_in_one_field_is_found(axis: str) -> None:
-    """Check a shift of less than a pixel, S-shaped along x, by which a scan shows the print at x + shift."""
+    """Check scans that show the print at displaced positions, x + shift. The shift is S-shaped along x and
+    smaller than a pixel.
+    """
     size_um = 0.08
     shift = size_um * legendre.legval(X, [0, 0, 0, 1])
 
@@ -178,7 +182,9 @@ def test_next_to_nothing_is_learned_from_noise(seed: int) -> None:
 
 
 def test_scans_that_did_not_take_part_are_freed_too(with_background: list[PrintedScan]) -> None:
-    """Check that the background of a field that is learned on three prints predicts the fourth."""
+    """Check that the background of a field, learned on three prints, predicts the background of the fourth
+    print.
+    """
     scans, prints = with_background[6:], PRINTS[6:]
     learned = learn_measurement(with_background[:6], PRINTS[:6])
     assert left_nm(scans, learned, prints) < 0.6 * left_nm(scans, made(), prints)

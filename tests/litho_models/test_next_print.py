@@ -148,7 +148,9 @@ def first_layout(limits: Limits, size_px: int = 96) -> np.ndarray:
 
 @pytest.mark.parametrize("turned_deg", [90.0, 180.0, 270.0])
 def test_the_fab_and_the_models_agree_on_what_turning_does(turned_deg: float) -> None:
-    """Check that a scan without noise and warp is ``rot90`` of the print, as its transform says."""
+    """Check that a scan without noise and warp equals the print rotated by ``rot90``, as its transform
+    states.
+    """
     level = np.random.default_rng(1).integers(0, 13, (40, 40)).astype(np.uint8)
     fab = Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard([], 0), 0)
     plain, turned = (scan_job(fab, Job("a", level, turned_deg=deg)) for deg in (0.0, turned_deg))
@@ -183,7 +185,7 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
 
 
 def test_the_position_of_a_window_turns_with_the_scan() -> None:
-    """Check that the scan coordinates of a part of a field equal those in the whole rotated field."""
+    """Check that a part of a field has the same scan coordinates as in the whole rotated field."""
     y, x = torch.meshgrid(torch.arange(20.0), torch.arange(14.0), indexing="ij")
     part = FieldContext(torch.zeros(1, 1, 8, 6), 0.1, 1.2, scan_shape=(20, 14), origin_px=(5, 3))
     for turns in range(4):
@@ -222,7 +224,9 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
 
 @pytest.mark.parametrize("scans", [1, 2])
 def test_white_noise_is_as_large_along_any_difference(scans: int, rivalry: Rivalry, limits: Limits) -> None:
-    """Check that noise is larger along the sum of scans of one print, because they share its noise."""
+    """Check that the sum of several scans of one print has more noise, because these scans share the noise of
+    the print.
+    """
     prints = [PlannedPrint(as_tensor(first_layout(limits)), (Way(),) * scans)]
     plain = model({}).chain().requires_grad_(False)
     found = rivalry.contrasts(prints, [plain] * len(rivalry.pairs))[0]
@@ -249,7 +253,9 @@ def test_the_linearised_refit_comes_near_the_full_one(rivalry: Rivalry, limits: 
 
 
 def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rivalry, limits: Limits) -> None:
-    """Check that each scan's gain scales the refitted model; scaling the true print would explain all."""
+    """Check that the gain of each scan scales the refitted model. If it scaled the true print, it would
+    explain everything.
+    """
     prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
     twin = rivalry.twins[0]
     slot = [name for name, _ in twin.base.named_parameters()].index("weights")
@@ -264,7 +270,7 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
 
 
 def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: Limits) -> None:
-    """Check a question that rests on the small difference between the losses along both axes."""
+    """Check a question whose answer rests on the small difference between the losses along the two axes."""
     nearly_equal = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.18, "exponent": 2.0}}
     prints = [PlannedPrint(as_tensor(first_layout(limits)), TURNED)]
 
@@ -436,7 +442,7 @@ def second_round(
 
 
 def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Judge:
-    """Return a judge that knows four scans of the first round with these effects, and new scans."""
+    """Return a judge that knows the new scans and four scans of the first round, which have these effects."""
     first = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=4, size_px=64)
     return Judge(model(effects), study_of(first), prepare_scans(new))
 
@@ -464,7 +470,7 @@ def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_stores_become_a_result_a_model_and_a_plan(
     one_cause: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Check two rounds of a loop whose groups of scans are known to differ in strength."""
+    """Check two rounds of a loop. The strength of the effect is known to differ between groups of scans."""
     monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
     first = write_store(tmp_path / "first.zarr", by_order())
     second = write_store(tmp_path / "second.zarr", second_round(5, SLOPE, "microscope"))
@@ -499,7 +505,7 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(owner: Owner) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("owner", ["printer", "microscope"])
 def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(owner: Owner) -> None:
-    """Check an asymmetric tip, which in one orientation looks like a print with raised flanks."""
+    """Check an asymmetric tip. In one orientation, a scan with it looks like a print with raised flanks."""
     effects = {TIP: {"radius_um": 0.6, "along": 1.0, "across": 0.25}}
     assert _owners(TIP, effects[TIP]) == ["printer", "microscope"]
     assert _owners(TIP, {**effects[TIP], "across": 1.0}) == [None]
@@ -551,7 +557,9 @@ def test_repeats_say_whose_a_datum_is(owner: str) -> None:
 def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
     share: float, verdict: str
 ) -> None:
-    """Check rivals of which ``b`` has the errors of ``a``, enlarged. Undescribed errors may be as large."""
+    """Check two rivals. The errors of ``b`` are those of ``a``, but larger. Errors that no rival describes
+    may be equally large.
+    """
     scans = prepare_scans(blank_scans(4, 64)[::2])
     random = np.random.default_rng(3)
     errors = [random.normal(0, 10, scan.usable.shape) for scan in scans]
@@ -566,7 +574,7 @@ def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
 
 
 def judged(form_nm: float | None, difference_nm: float, error_nm: float) -> Decision:
-    """Return the decision if ``a`` is true except for an error of its form in the direction of ``b``."""
+    """Return the decision if ``a`` is true, but its form has an error in the direction of ``b``."""
     scans = prepare_scans(blank_scans(4, 128)[::2])
     random = np.random.default_rng(4)
     left: dict[str, list[np.ndarray]] = {"a": [], "b": [], NONE: []}
@@ -581,7 +589,9 @@ def judged(form_nm: float | None, difference_nm: float, error_nm: float) -> Deci
 
 
 def test_an_error_of_the_form_decides_nothing_below_its_bound() -> None:
-    """Check an error of the form that favours the wrong rival by (2 · 4.5 / 5 - 1) · 25 nm²."""
+    """Check an error in the form of the true rival. It favours the wrong rival by (2 · 4.5 / 5 - 1) · 25
+    nm².
+    """
     assert judged(None, 5.0, 4.5).left == ["b"]
     counted = judged(4.5, 5.0, 4.5)
     assert counted.verdict == "still open"
@@ -643,7 +653,9 @@ def test_a_question_below_the_models_own_error_is_declared_before_printing(
 
 
 def test_two_names_of_one_model_end_in_one_optimum() -> None:
-    """Check two fits of the same model, one of which has a start that alone would lead elsewhere."""
+    """Check two fits of the same model. One of them has a start that would lead it elsewhere if it were
+    fitted alone.
+    """
     base = build_model(
         "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
     )
@@ -775,7 +787,9 @@ def test_the_page_quotes_a_board_of_two_rounds() -> None:
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
-    """Check that new prints have the same knobs but other roughness, which scans of one print share."""
+    """Check that new prints have the same knobs but different roughness. Scans of one print share the
+    roughness.
+    """
     level = np.full((40, 40), 6, np.uint8)
     fab = Fab(
         Printer(), Microscope.aligned(), Noise(), KnobBoard([KnobSetting("tip-dilation", 0.5, 3)], 9), 9

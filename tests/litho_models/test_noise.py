@@ -1,4 +1,6 @@
-"""Check that planted noise is found, closed forms hold, and nothing is judged on its own fit data."""
+"""Check that planted noise is found, that closed forms hold, and that no fit is judged on the data that it
+used.
+"""
 
 from __future__ import annotations
 
@@ -231,7 +233,9 @@ def test_a_flat_surface_has_no_steps():
 
 
 def ladder(dose, sigma_um=0.006, seed=0):
-    """Return a ladder at a dose. Below 0.8 the low levels print nothing; above 1.2 the high ones saturate."""
+    """Return a ladder of levels at a dose. At doses below 0.8, the low levels print nothing. At doses above
+    1.2, the high levels saturate.
+    """
     scan = make_scans(1, size_px=60)[0]
     level = np.broadcast_to(np.repeat(np.arange(9), 40), (60, 360)).astype(np.uint8)
     nominal = level * 0.1
@@ -346,7 +350,9 @@ def heights_um(scans):
 
 
 def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
-    """Check that the floor excludes the error of a model with a wrong gain, which exceeds the noise."""
+    """Check that the floor does not include the error of a model with a wrong gain. This error is larger than
+    the noise.
+    """
     scans = make_scans(12, size_px=128, noise_um=0.020, datum_um=0.03, bow_um=0.02)
     wrong = [0.85 * height for height in heights_um(scans)]
     found = estimated_floor("made", scans, wrong)
@@ -366,7 +372,9 @@ def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
 
 
 def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
-    """Check rare rough places with smooth partners, for which half the squared difference is too small."""
+    """Check rare rough places whose partners are smooth. Half of the squared difference is too small for
+    them.
+    """
     scans = make_scans(4, size_px=96)
     rough_places = [scan.mask_level >= 9 for scan in scans]
     residuals = [
@@ -389,7 +397,9 @@ def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
 
 @pytest.mark.parametrize("draw", ["normal", "laplace", "uniform"])
 def test_the_mean_absolute_noise_needs_no_gaussian(draw, random):
-    """Check other noise than Gaussian, for which a factor √2 between differences and noise is 6 % wrong."""
+    """Check noise that is not Gaussian. A factor of √2 between differences and noise would be wrong by 6 %
+    for it.
+    """
     scans = make_scans(5, size_px=96, noise_um=0.0, datum_um=0.0)
     noise = [1e-3 * getattr(random, draw)(-10 if draw == "uniform" else 0, 10, scan.shape) for scan in scans]
     noisy = [
@@ -462,7 +472,7 @@ def test_a_planted_scale_is_found_by_maximum_likelihood(freedom, random):
 
 
 def planted_residuals(count=10, size_px=96, seed=0, freedom=np.inf):
-    """Return scans, residuals whose σ grows with slope and level, and these σ."""
+    """Return scans, residuals, and the σ of these residuals, which grows with slope and level."""
     scans = make_scans(count, size_px=size_px)
     beta = np.zeros(len(COVARIATES))
     knots = [number for number, name in enumerate(COVARIATES) if name.startswith("level")]

@@ -77,7 +77,9 @@ def test_the_kernels_give_the_sum_of_hopkins() -> None:
 
 
 def test_a_source_is_as_bright_as_its_area() -> None:
-    """Compare the image of a source on the coarse grid of the kernels with that of a thousand points."""
+    """Compare two images: that of a source on the coarse grid of the kernels, and that of a thousand
+    points.
+    """
     pitch_um, side = 0.06, 96
     lens = Optics(0.365, 0.5, 0.6, 0.0, 0.0, 400)
     mask = (fftconvolve(np.random.default_rng(0).random((side, side)), np.ones((9, 9)), "same") > 40).astype(
@@ -99,7 +101,9 @@ def test_a_source_is_as_bright_as_its_area() -> None:
 
 @pytest.mark.parametrize("waves", [1, 3])
 def test_a_point_source_images_the_amplitude_that_passes(waves: int) -> None:
-    """Check images of t = (1 + cos 2πfx) / 2: t² in focus, delayed if defocused, 1/4 beyond the pupil."""
+    """Check images of t = (1 + cos 2πfx) / 2. In focus, the image is t². Defocus delays the diffracted waves.
+    Beyond the pupil, the image is 1/4.
+    """
     lens = Optics(0.365, 0.6, 0.0, 0.0, 0.3, 400)
     x = np.arange(SIZE_PX) / SIZE_PX
     f = waves / (SIZE_PX * PITCH_UM)

@@ -1,4 +1,4 @@
-"""Test planting effects in copies of the data, which shows how small an effect would be found."""
+"""Test planting effects in copies of the data. This shows how small an effect may be and still be found."""
 
 from __future__ import annotations
 

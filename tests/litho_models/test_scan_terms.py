@@ -221,7 +221,9 @@ def test_what_a_bent_scan_does_not_show_is_in_its_first_or_last_line():
 
 
 def test_roughness_beside_the_scored_pixels_is_not_taken_for_an_offset_of_the_line():
-    """Check roughness correlated over 20 px along x, which looks like an offset only near scored pixels."""
+    """Check roughness that is correlated over 20 px along x. It looks like an offset only near scored
+    pixels.
+    """
     random = np.random.default_rng(6)
     shape = (128, 256)
     rough = gaussian_filter(random.normal(size=shape), (0, 15.0))

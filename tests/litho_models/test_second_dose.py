@@ -43,7 +43,7 @@ def test_in_the_fab_half_the_dose_prints_half_the_levels() -> None:
 
 
 def test_slices_pass_a_threshold_by_their_dose_and_not_by_their_number() -> None:
-    """Check that with slices exposed one by one, half the dose differs from half the levels."""
+    """Check that half the dose gives another print than half the levels if slices are exposed one by one."""
     knobs = KnobBoard([KnobSetting("layer-stacking", 0.8, 1)], 0)
     fab = Fab(Printer(), Microscope.aligned(), Noise.off(), knobs, 0)
     level = _even_levels().astype(np.uint8)

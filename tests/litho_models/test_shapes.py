@@ -1,4 +1,4 @@
-"""Check edge, similarity and phase errors against closed forms, also with unscored pixels."""
+"""Check edge, similarity and phase errors against closed forms, also if some pixels are not scored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Check that errors of single scans are recognised, and told from errors that all scans share."""
+"""Check that errors of individual scans are recognised, and that they are distinguished from errors that all
+scans share.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ def truths(scans: Sequence[PreparedScan]) -> list[np.ndarray]:
 def found_with(
     change: Change, size_px: int = SIZE_PX, *, turned: bool = False, shared_known: bool = False, seed: int = 0
 ) -> dict[str, ScanFinding]:
-    """Return the findings in ten scans with a datum each, to whose heights in µm ``change`` is added.
+    """Return the findings in ten scans. Each scan has its own datum, and ``change`` (in µm) is added to its
+    heights.
 
     If ``shared_known``, the predicted maps already contain what all scans share.
     """
@@ -141,7 +144,7 @@ def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans
 
 @pytest.mark.parametrize("of_prints", [True, False])
 def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints: bool) -> None:
-    """Check five prints of two scans each, whose gains either go with the print or are mixed."""
+    """Check five prints of two scans each. The gains of the scans either depend on the print or are mixed."""
     gains = 0.02 * np.repeat([-2, -1, 0, 1, 2], 2)
     gains = gains if of_prints else np.roll(gains, 1)
 
@@ -193,7 +196,7 @@ def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_t
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_lines_to_which_a_scan_is_compared_are_of_other_folds(axis: int) -> None:
-    """Check that the shared lines to which a scan is compared do not depend on the heights of its fold."""
+    """Check that the shared lines with which a scan is compared do not depend on the heights of its fold."""
     scans = planted(count=6)
     study = study_of(scans)
     maps = truths(study.scans)

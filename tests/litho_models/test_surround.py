@@ -1,4 +1,6 @@
-"""Check that an isolated field has no ring of errors, with a rim of level 0 or without its border."""
+"""Check that an isolated field has no ring of errors if it has a rim of level 0, or if its border is left
+out.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ sys.meta_path.insert(0, Watch())
     ],
 )
 def test_threads_sleep_while_they_wait_unless_told_otherwise(use, given):
-    """Check the setting, because spinning threads are ten times slower beside one busy process."""
+    """Check the setting, because spinning threads are ten times slower if another process is busy."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
     words = [sys.executable, "-c", _LOADED + use]

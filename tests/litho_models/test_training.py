@@ -1,4 +1,4 @@
-"""Check that fits recover known printers in spite of scan terms, and that a killed run can be continued."""
+"""Check that fits recover known printers despite scan terms, and that a killed run can be continued."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def quick_run(tmp_path_factory):
 
 
 def with_one_pixel(scan, **arrays):
-    """Return the scan with one pixel of some arrays changed."""
+    """Return a copy of the scan in which one pixel of each given array is changed."""
     changed = {name: getattr(scan, name).copy() for name in arrays}
     for name, value in arrays.items():
         changed[name][3, 5] = value

@@ -188,7 +188,9 @@ def test_listing_the_zoo_loads_no_torch():
 
 @pytest.fixture(scope="module")
 def made(store, tmp_path_factory):
-    """Return a table of two models, the folder in use, and the cards of the zoo made from the table."""
+    """Return a table of two models, the folder in use, and the cards of the zoo that is made from the
+    table.
+    """
     from litho_models.evaluation.benchmark import benchmark
 
     folder = tmp_path_factory.mktemp("made")
