@@ -22,9 +22,9 @@ def photographs(record: dict[str, Any]) -> list[str]:
     assert (np.abs(errors) > 0.3).sum() == 1
     return [
         f"Of {len(record['rows'])} photographs of simulated prints, {len(errors)} were scored",
-        f"off by −{-errors.min():.2f} to +{errors.max():.2f} dB (rms {np.sqrt((errors**2).mean()):.2f} dB)",
-        f"{len(record['rows']) - len(errors)} were refused, among them all {len(faulty)} with",
-        f"None of {len(unsaid)} mirrored or rotated ones",
+        f"were −{-errors.min():.2f} to +{errors.max():.2f} dB (rms {np.sqrt((errors**2).mean()):.2f} dB)",
+        f"{len(record['rows']) - len(errors)} were refused, including all {len(faulty)} with",
+        f"None of {len(unsaid)} mirrored or rotated photographs",
     ]
 
 
@@ -66,8 +66,8 @@ def tips(record: dict[str, Any]) -> list[str]:
     assert all(ratio >= 1 for ratio in bounds)
     lowest = min(share for case in reaching for share in case["untouched_uncertain"])
     return [
-        f"all {len(estimates)} estimates are within 10 %, and all {len(bounds)} bounds hold",
-        f"At least {100 * lowest:.0f} % of the untouched pixels",
+        f"all {len(estimates)} estimates are right to 10 %, and all {len(bounds)} bounds hold",
+        f"at least {100 * lowest:.0f} % of untouched pixels",
     ]
 
 

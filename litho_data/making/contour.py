@@ -21,6 +21,8 @@ _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
+# Largest shift of all edges that is looked for, px of the layout.
+_MOST_PX = 8
 # A part of the layout counts as lost if at most this share of it was printed.
 _LOST = 0.1
 
@@ -91,6 +93,34 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
     centre of the pixel to an edge.
     """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
+
+
+def edge_shift_px(level: Array, film_share: float) -> float:
+    """Return by how many pixels all edges of a layout must move outwards for its film to cover this share.
+
+    If the edges of small islands and gaps move, a registration takes the shift for a change of scale, so it
+    needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes 0.
+
+    Args:
+        level: (ny, nx) levels of the layout.
+        film_share: fraction of the same field that the printed film covers.
+    """
+    distance, shifts = _distance_px(level), range(-_MOST_PX, _MOST_PX + 1)
+    shift = float(np.interp(film_share, [np.mean(distance > -one) for one in shifts], shifts))
+    return round(shift, 3) if abs(shift) >= 1 else 0.0
+
+
+def with_moved_edges(level: Array, outwards_px: float) -> Array:
+    """Return the layout, float (ny, nx), with its edges moved; pixels at an edge have levels in between."""
+    return level.max() * coverage(_distance_px(level) + outwards_px, 1.0)
+
+
+def _distance_px(level: Array) -> Array:
+    """Return the distance of each pixel from the nearest edge of a layout, positive on the film."""
+    from scipy.ndimage import distance_transform_edt
+
+    film = level > level.max() / 2
+    return np.where(film, distance_transform_edt(film) - 0.5, 0.5 - distance_transform_edt(~film))
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:

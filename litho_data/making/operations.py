@@ -198,7 +198,12 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("register", "mask_level levelled_height_um", "register")
 def _register(params: Params, _: Files, arrays: Inputs) -> Made:
-    found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
+    from litho_data.making.contour import with_moved_edges
+
+    layout = arrays["mask_level"]
+    if "edge_shift_px" in params:
+        layout = with_moved_edges(layout, params["edge_shift_px"])
+    found = _registration(arrays["levelled_height_um"], layout, params)
     _require_found(found, params)
     arrays_found, figures = {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
     if found.bend_um is not None:

@@ -16,7 +16,7 @@ from litho_data import build_dataset, open_store
 from litho_data.cards.card import check_card
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
-from litho_data.making.contour import coverage, find_edges, foreign
+from litho_data.making.contour import coverage, edge_shift_px, find_edges, foreign, with_moved_edges
 from litho_data.provenance.verify import verify
 
 RADIUS_PX = 60.0
@@ -84,6 +84,16 @@ def test_film_far_from_the_layout_is_dirt_and_a_lost_island_belongs_to_the_print
     assert dirt[45:61, 17].all()
     assert not dirt[44, 17]
     assert not dirt[:44].any()
+
+
+def test_the_area_of_a_film_tells_how_far_its_edges_have_moved() -> None:
+    y, x = np.mgrid[-50:50, -60:60]
+    disc = (17 * (np.hypot(y, x) < 30)).astype(np.uint8)
+    # Whole pixels make the radius of the disc uncertain by some tenths of a pixel.
+    grown = np.pi * 33.5**2 / disc.size
+    assert edge_shift_px(disc, grown) == pytest.approx(3.5, abs=0.2)
+    assert with_moved_edges(disc, 3.5).mean() / 17 == pytest.approx(grown, rel=0.02)
+    assert edge_shift_px(disc, np.pi * 29.3**2 / disc.size) == 0
 
 
 def test_small_specks_are_ignored() -> None:

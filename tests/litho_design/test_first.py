@@ -72,11 +72,11 @@ def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path,
     design = design_hologram(square, "none", tmp_path / "far", settings=far)
     # The finest detail is 0.6328 µm x 40 µm / 6.4 µm = 3.955 µm, but the square is 1.2 µm wide.
     said = capsys.readouterr().err.splitlines()[0]
-    assert "about 1.2 µm wide, but the finest detail" in said
+    assert "about 1.2 µm wide, but an element of 6.4 µm at 40 µm" in said
     assert "λz/D = 4 µm" in said
     assert "--distance-um 12 or less" in said
     assert said == design.notes[0]
-    assert "the finest detail" in (tmp_path / "far" / "report.html").read_text("utf-8")
+    assert "resolves no detail finer than" in (tmp_path / "far" / "report.html").read_text("utf-8")
 
 
 def test_holograms_start_from_gerchberg_saxton_except_as_published():

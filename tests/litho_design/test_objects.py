@@ -122,7 +122,7 @@ def test_transparent_pixels_are_dark(tmp_path):
 def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, settings, make_printer):
     printer = make_printer(settings.layout)
     design = design_lens(printer, tmp_path / "d", settings=settings, objects=[folder], announce=False)
-    assert "d.png, e.png are held out" in design.notes[-1]
+    assert "the held-out objects are d.png, e.png" in design.notes[-1]
     told = design.settings["imaging"]
     assert [item["name"] for item in told["objects"]] == ["a.png", "b.png", "c.png"]
     assert [item["sha256"] for item in told["test_objects"]] == [
