@@ -117,8 +117,8 @@ def noise_table(noise: dict[str, Any]) -> str:
             )
             for row in budget["floor"]["by_policy"]
         ],
-        f"All scored pixels of {noise['run']['n_scans']} unlocked scans of the measured prints, from "
-        f"residuals of `{budget['model']}`, with 95 % intervals over prints.",
+        f"The noise is computed from the residuals of `{budget['model']}` at all scored pixels of "
+        f"{noise['run']['n_scans']} unlocked scans of the measured prints, with 95 % intervals over prints.",
     )
     by_level = markdown_table(
         ("level", "pixels", "σ where flat", "MAE where flat"),

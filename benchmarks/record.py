@@ -1,4 +1,4 @@
-"""Functions shared by the benchmarks: facts of the run, result files, and generated text in the docs."""
+"""Functions that all benchmarks use to record a run, write result files, and insert text into the docs."""
 
 from __future__ import annotations
 

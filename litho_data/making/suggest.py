@@ -81,7 +81,7 @@ def suggest_recipe(
 ) -> Suggestion:
     """Compare recipes on three scans of a card; write the best recipe, a card that uses it, and a page.
 
-    The levelled heights are fitted by a free function of the blurred layout, in half of the blocks of 16 px.
+    In half of the 16 px blocks, a free function of the blurred layout is fitted to the levelled heights.
     The recipes are compared by the residual in the other half, because this residual contains both the tilt
     that a recipe fails to remove and the part of the print that it wrongly removes. A recipe is not suggested
     if it shifts lines that already agree with their neighbours in many pixels.

@@ -95,7 +95,7 @@ def write_samples(
     write_strings(root, "scan", [scan["id"] for scan in scans], "scan")
     write_strings(root, "print", [scan["print"] for scan in scans], "scan")
     orders = np.array([scan["order"] for scan in scans], dtype=np.int64)
-    write_numbers(root, "order", orders, "scan", attributes={"long_name": "place in the order of writing"})
+    write_numbers(root, "order", orders, "scan", attributes={"long_name": "position in the writing order"})
     for name in OPTIONAL_COLUMNS:
         if any(name in scan["columns"] for scan in scans):
             values = [scan["columns"].get(name, np.nan) for scan in scans]

@@ -72,8 +72,8 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     """Estimate the tip that made one or more scans, such as those of one day.
 
     The radius comes from the sharpest peaks, because no peak in an image is more sharply curved than the end
-    of the tip. The result is an estimate only if many peaks have the same largest curvature and the valleys
-    are more sharply curved. Otherwise, the tip may be sharper than anything that it scanned.
+    of the tip. If many peaks share the same maximum curvature and the valleys are more sharply curved, the
+    result is an estimate. Otherwise, the tip may be sharper than anything that it scanned.
 
     Args:
         scans: scans that all have the same pitch. Levelling has little influence.

@@ -215,7 +215,7 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
     """Print and scan a plan in the fab of an earlier run; return the path of the new card.
 
-    The machine is the same: printer, microscope, noise, and knobs with their seeds. Everything that varies
+    The machine is the same: printer, microscope, noise, knobs, and the seeds of the knobs. All that varies
     from print to print or from scan to scan is drawn anew.
 
     Args:

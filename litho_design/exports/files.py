@@ -116,7 +116,7 @@ def export(
     found: Marks | None = None
     if marks:
         if source.design is None:
-            wanted = "a design, whose model gives the printer's reach"
+            wanted = "the folder of a design, whose model states how far the printer reaches"
             raise InputError("marks", got="levels without a design", wanted=wanted)
         guard_um, heights = source.design.printer.guard_um, source.design.stroke.printed_height_um
         levels, found = with_marks(levels, layout, guard_um, heights)

@@ -88,7 +88,7 @@ def train(
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("also train on the locked scans, so that none is left for a last test", "--use-lock-box"),
+        option("also train on the locked scans; this leaves none for a final test", "--use-lock-box"),
     ] = False,
 ) -> None:
     """Train a model on all scans except the locked ones; resumable.

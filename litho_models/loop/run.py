@@ -185,7 +185,7 @@ def _nested(
 
     def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
         for number, out in enumerate(progress(parts, "repeating all choices"), 1):
-            study.report(f"repeating all choices without {', '.join(out)} ({number} of {len(parts)})")
+            study.report(f"leaving out {', '.join(out)} and repeating all choices ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
             often.update(closed.final.twin.names)
             yield HeldOut(closed), [scan for scan in scans if scan.id in out]

@@ -40,7 +40,7 @@ def write_report(
     page = Page(
         f"What to print next: {plan.dataset.name}",
         f"{plan.prints} print{'s' * (plan.prints > 1)} of {plan.field_um:g} µm in {len(plan.scans)} scans, "
-        "four of them references.",
+        "including four reference scans.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
         words=Path(__file__).with_name("words.toml"),

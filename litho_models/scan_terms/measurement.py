@@ -142,7 +142,7 @@ class MeasurementModel(Record):
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted print by these parts, (ny, nx) µm."""
+    """Displace a predicted print by these displacement parts; all maps have shape (ny, nx) and are in µm."""
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
     if not moves:

@@ -202,7 +202,7 @@ def test_a_resumed_search_goes_on_with_its_rate(schedule, tmp_path):
 
 
 def test_photon_noise_grows_with_the_signal_and_leaves_the_gradient_alone():
-    """Check images by a point PSF that contains half of the light. The variance of an image is b² + a ·
+    """Check images made by a point PSF with half of the light. The variance of an image is b² + a ·
     image.
     """
     grey = torch.tensor([0.25, 1.0])[:, None, None].expand(2, 400, 400).clone().requires_grad_()
