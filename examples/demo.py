@@ -10,18 +10,20 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from examples.demo_story import CORRECTED, FAB, tell
+from litho_data.cli.app import main as data
 from litho_data.reports.page import Page
+from litho_design.cli import main as design
+from litho_models.cli import main as models
 from litho_models.loop.record import CloseLoop
 from litho_models.loop.report import said
 
-BIN = Path(sys.executable).parent
+PROGRAMS = {"litho-data": data, "litho-models": models, "litho-design": design}
 CARDS = Path(__file__).parents[1] / "datasets"
 WORKERS = ("--workers", 2)
 # Seeds of the random draws of the paper's split.
@@ -227,11 +229,26 @@ def run(step: Step, number: str) -> float:
         print("  already done")
         return 0.0
     started = time.monotonic()
-    code = subprocess.run([str(BIN / step.command[0]), *step.command[1:]]).returncode
+    code = call(step.command)
     if code:
         print(f"the demo stops here: the command above ended with exit code {code}", file=sys.stderr)
         raise SystemExit(code)
     return time.monotonic() - started
+
+
+def call(words: tuple[str, ...]) -> int:
+    """Run a command of the project in this process and return its exit code.
+
+    A process of its own would import the packages again, which takes some seconds.
+    """
+    given, sys.argv = sys.argv, list(words)
+    try:
+        PROGRAMS[words[0]]()
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else 1
+    finally:
+        sys.argv = given
+    return 0
 
 
 def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
