@@ -99,12 +99,15 @@ def edge_shift_px(level: Array, film_share: float) -> float:
     """Return by how many pixels all edges of a layout must move outwards for its film to cover this share.
 
     If the edges of small islands and gaps move, a registration takes the shift for a change of scale, so it
-    needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes 0.
+    needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes 0, and
+    a layout without edges has none to move.
 
     Args:
         level: (ny, nx) levels of the layout.
         film_share: fraction of the same field that the printed film covers.
     """
+    if level.min() == level.max():
+        return 0.0
     distance, shifts = _distance_px(level), range(-_MOST_PX, _MOST_PX + 1)
     shift = float(np.interp(film_share, [np.mean(distance > -one) for one in shifts], shifts))
     return round(shift, 3) if abs(shift) >= 1 else 0.0

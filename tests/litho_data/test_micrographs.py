@@ -94,6 +94,7 @@ def test_the_area_of_a_film_tells_how_far_its_edges_have_moved() -> None:
     assert edge_shift_px(disc, grown) == pytest.approx(3.5, abs=0.2)
     assert with_moved_edges(disc, 3.5).mean() / 17 == pytest.approx(grown, rel=0.02)
     assert edge_shift_px(disc, np.pi * 29.3**2 / disc.size) == 0
+    assert edge_shift_px(np.full_like(disc, 17), 0.5) == 0
 
 
 def test_small_specks_are_ignored() -> None:
