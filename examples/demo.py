@@ -34,7 +34,7 @@ BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random
 
 @dataclass(frozen=True)
 class Effort:
-    """How much the demo trains and designs: enough to try every step, or as much as the docs' numbers need.
+    """How much the demo trains and designs: enough for the main steps, or as much as the docs' numbers need.
 
     If ``training_steps`` is None, each model uses its default.
     """
@@ -54,7 +54,7 @@ class Effort:
 QUICK = Effort(
     models="identity,affine,blur-table,physics",
     arms=("physics",),
-    training_steps=60,
+    training_steps=None,
     folds=2,
     element_px=256,
     distance_um=25,
@@ -117,6 +117,8 @@ def plan(out: Path, dataset: str) -> list[Step]:
         )
         # Physics contains the process of the fab, and a single base model keeps the demo below five minutes.
         anew = ["--base", "physics"]
+    # A network trains in all threads; two processes would leave one to each.
+    workers = () if dataset else WORKERS
     training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
         source,
@@ -130,14 +132,14 @@ def plan(out: Path, dataset: str) -> list[Step]:
             "Compare the models on held-out scans",
             _models(
                 "benchmark", store, "--models", effort.models,
-                "--folds", effort.folds, *training, *WORKERS, "--out", out / "benchmark",
+                "--folds", effort.folds, *training, *workers, "--out", out / "benchmark",
             ),
             out / "benchmark" / "benchmark.json",
             out / "benchmark" / "report.html",
         ),
         Step(
             "Close the loop: what does the model lack?",
-            _models("close-loop", store, *anew, *WORKERS, "--out", loop),
+            _models("close-loop", store, *anew, *workers, "--out", loop),
             loop / "close_loop.json",
             loop / "report.html",
         ),
@@ -211,7 +213,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 *element,
                 "--seeds",
                 effort.seeds,
-                *WORKERS,
+                *workers,
                 "--out",
                 out / "compare",
             ),
@@ -245,7 +247,7 @@ def call(words: tuple[str, ...]) -> int:
     try:
         PROGRAMS[words[0]]()
     except SystemExit as ended:
-        return ended.code if isinstance(ended.code, int) else 1
+        return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     finally:
         sys.argv = given
     return 0

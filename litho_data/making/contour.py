@@ -21,8 +21,6 @@ _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# Largest shift of all edges that is looked for, px of the layout.
-_MOST_PX = 8
 # A part of the layout counts as lost if at most this share of it was printed.
 _LOST = 0.1
 
@@ -95,21 +93,22 @@ def coverage(distance_um: Array, pitch_um: float) -> Array:
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 
 
-def edge_shift_px(level: Array, film_share: float) -> float:
-    """Return by how many pixels all edges of a layout must move outwards for its film to cover this share.
+def edge_shift_px(level: Array, distance_px: Array) -> float:
+    """Return how far outwards the edges of a film lie from those of its layout: the median over the film's
+    edges.
 
-    If the edges of small islands and gaps move, a registration takes the shift for a change of scale, so it
-    needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes 0, and
-    a layout without edges has none to move.
+    If the edges of small islands and gaps move, a registration takes part of the shift for a change of scale,
+    so it needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes
+    0, and so does that of a film or layout without edges.
 
     Args:
         level: (ny, nx) levels of the layout.
-        film_share: fraction of the same field that the printed film covers.
+        distance_px: distance from the edge of the film at each pixel of the layout, NaN where not seen.
     """
-    if level.min() == level.max():
+    from_layout, at_edge = _distance_px(level), np.abs(distance_px) < 0.5
+    if not at_edge.any() or not np.isfinite(from_layout).all():
         return 0.0
-    distance, shifts = _distance_px(level), range(-_MOST_PX, _MOST_PX + 1)
-    shift = float(np.interp(film_share, [np.mean(distance > -one) for one in shifts], shifts))
+    shift = -float(np.median(from_layout[at_edge]))
     return round(shift, 3) if abs(shift) >= 1 else 0.0
 
 
@@ -119,10 +118,14 @@ def with_moved_edges(level: Array, outwards_px: float) -> Array:
 
 
 def _distance_px(level: Array) -> Array:
-    """Return the distance of each pixel from the nearest edge of a layout, positive on the film."""
+    """Return the distance of each pixel from the nearest edge of a layout, positive on the film; infinite if
+    there is no edge.
+    """
     from scipy.ndimage import distance_transform_edt
 
     film = level > level.max() / 2
+    if film.all() or not film.any():
+        return np.full(level.shape, np.inf)
     return np.where(film, distance_transform_edt(film) - 0.5, 0.5 - distance_transform_edt(~film))
 
 

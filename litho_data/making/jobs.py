@@ -25,8 +25,6 @@ _BARE_PX = 2
 # Film in a gap of the layout is dirt if it is farther than this (px) from the layout's edges. Bare ground
 # that far inside the layout's film is a pit.
 _DIRT_PX = 5
-# A micrograph shows the field of its layout if both have the same size, up to this relative difference.
-_SAME_FIELD = 0.02
 
 
 class Job(Protocol):
@@ -151,25 +149,9 @@ class FieldJob:
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
         edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film})
-        shift = {"edge_shift_px": px} if (px := self._edge_shift_px(chain)) else {}
-        chain.run("register", {**self.register_params(chain), **shift})
+        chain.run("register", self.register_params(chain))
         sigma = {"edge_sigma_um": edges["edge_sigma_nm"] / 1e3, "full_level": full_level}
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
-
-    def _edge_shift_px(self, chain: Chain) -> float:
-        """Return how far the edges of the film have moved; 0 if the micrograph shows another field than that
-        of the layout.
-        """
-        from litho_data.making.contour import edge_shift_px
-
-        level, distance = chain.arrays["mask_level"], chain.arrays["edge_distance_um"]
-        seen_um, written_um = (
-            np.multiply(one.shape, pitch)
-            for one, pitch in ((distance, chain.pitch_um), (level, self.card.layout.pitch_um))
-        )
-        if np.abs(seen_um / written_um - 1).max() > _SAME_FIELD:
-            return 0.0
-        return edge_shift_px(level, float(np.mean(distance > 0)))
 
     def _level(self, chain: Chain) -> None:
         """Run the rest of the chain for heights: level the scan, and register and resample it if it belongs

@@ -196,22 +196,40 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     } if notes else {}
 
 
-@_operation("register", "mask_level levelled_height_um", "register")
+@_operation("register", "mask_level levelled_height_um edge_distance_um", "register", "making/contour.py")
 def _register(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.making.contour import with_moved_edges
+    from litho_data.making.contour import edge_shift_px, with_moved_edges
 
-    layout = arrays["mask_level"]
-    if "edge_shift_px" in params:
-        layout = with_moved_edges(layout, params["edge_shift_px"])
-    found = _registration(arrays["levelled_height_um"], layout, params)
+    height, level = arrays["levelled_height_um"], arrays["mask_level"]
+    found = _registration(height, level, params)
     _require_found(found, params)
-    arrays_found, figures = {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
+    arrays_found, figures = _as_arrays(found), asdict(found.quality)
+    if "edge_distance_um" in arrays:
+        grid = {**params, "layout_shape": level.shape}
+        distance_um, seen = _on_layout(arrays["edge_distance_um"], grid, arrays_found)
+        distance_px = np.where(seen, distance_um / params["layout_pitch_um"], np.nan)
+        if shift_px := edge_shift_px(level, distance_px):
+            moved = _registration(height, with_moved_edges(level, shift_px), params)
+            if moved.quality.passed:
+                found, arrays_found, figures = moved, _as_arrays(moved), asdict(moved.quality)
+                side = "outside" if shift_px > 0 else "inside"
+                said = (
+                    f"the edges lie {abs(shift_px):.1f} px {side} those of the layout, which were moved there"
+                )
+                figures["warning"] = "; ".join(filter(None, (figures["warning"], said)))
     if found.bend_um is not None:
-        arrays_found["bend_um"] = found.bend_um.amount
         figures |= found.bend_um.figures
-    if found.defects is not None:
-        arrays_found["defect"] = found.defects
     return arrays_found, figures
+
+
+def _as_arrays(found: Registration) -> dict[str, Array]:
+    """Return the arrays that place a scan on its layout."""
+    made = {"scan_to_layout": found.scan_to_layout}
+    if found.bend_um is not None:
+        made["bend_um"] = found.bend_um.amount
+    if found.defects is not None:
+        made["defect"] = found.defects
+    return made
 
 
 def _require_found(found: Registration, params: Params, when: str = "") -> None:
