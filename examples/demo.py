@@ -15,13 +15,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.cli.app import main as data
-from litho_data.reports.page import Page
 from litho_design.cli import main as design
 from litho_models.cli import main as models
-from litho_models.loop.record import CloseLoop
-from litho_models.loop.report import said
 
 PROGRAMS = {"litho-data": data, "litho-models": models, "litho-design": design}
 CARDS = Path(__file__).parents[1] / "datasets"
@@ -34,14 +30,10 @@ BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random
 
 @dataclass(frozen=True)
 class Effort:
-    """How much the demo trains and designs: enough for the main steps, or as much as the docs' numbers need.
-
-    If ``training_steps`` is None, each model uses its default.
-    """
+    """How much the demo trains and designs: enough for the main steps, or as much as the docs need."""
 
     models: str
     arms: tuple[str, ...]
-    training_steps: int | None
     folds: int
     element_px: int
     distance_um: int
@@ -54,7 +46,6 @@ class Effort:
 QUICK = Effort(
     models="identity,affine,blur-table,physics",
     arms=("physics",),
-    training_steps=None,
     folds=2,
     element_px=256,
     distance_um=25,
@@ -65,7 +56,6 @@ QUICK = Effort(
 MEASURED = Effort(
     models=f"{BY_PRINT},pbl,fno",
     arms=("affine", "physics", "pbl"),
-    training_steps=None,
     folds=5,
     element_px=256,
     distance_um=75,
@@ -102,6 +92,9 @@ def main() -> None:
 
 def plan(out: Path, dataset: str) -> list[Step]:
     """Return the steps in order. Later steps read the results of earlier ones."""
+    # Worker processes import this module, so it imports torch only where the demo itself needs it.
+    from examples.demo_story import CORRECTED, FAB
+
     effort = MEASURED if dataset else QUICK
     store, loop = out / "store.zarr", out / "close-loop"
     if dataset:
@@ -119,7 +112,6 @@ def plan(out: Path, dataset: str) -> list[Step]:
         anew = ["--base", "physics"]
     # A network trains in all threads; two processes would leave one to each.
     workers = () if dataset else WORKERS
-    training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
         source,
         Step(
@@ -132,7 +124,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
             "Compare the models on held-out scans",
             _models(
                 "benchmark", store, "--models", effort.models,
-                "--folds", effort.folds, *training, *workers, "--out", out / "benchmark",
+                "--folds", effort.folds, *workers, "--out", out / "benchmark",
             ),
             out / "benchmark" / "benchmark.json",
             out / "benchmark" / "report.html",
@@ -172,7 +164,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         steps += [
             Step(
                 f"Train {model}",
-                _models("train", store, "--model", model, *training, "--out", trained),
+                _models("train", store, "--model", model, "--out", trained),
                 frozen,
             ),
             Step(f"Freeze {model}", _models("freeze", trained, "--out", frozen), frozen),
@@ -206,21 +198,13 @@ def plan(out: Path, dataset: str) -> list[Step]:
         Step(
             "Compare designs made with one model and judged with another",
             _design(
-                "compare",
-                "--models",
-                models,
-                *judge,
-                *element,
-                "--seeds",
-                effort.seeds,
-                *workers,
-                "--out",
-                out / "compare",
+                "compare", "--models", models, *judge, *element,
+                "--seeds", effort.seeds, *workers, "--out", out / "compare",
             ),
             out / "compare" / "gap.json",
             out / "compare" / "report.html",
         )
-    )
+    )  # fmt: skip
     return steps
 
 
@@ -256,6 +240,11 @@ def call(words: tuple[str, ...]) -> int:
 def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
     """Write a page with the demo's answer and links to all reports; return the answer and the page's path."""
     import pandas as pd
+
+    from examples.demo_story import tell
+    from litho_data.reports.page import Page
+    from litho_models.loop.record import CloseLoop
+    from litho_models.loop.report import said
 
     page = Page(
         f"litholoop: {name}", "From raw scans to a design that was optimised through the learned printer."
