@@ -45,7 +45,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 def conclude(
     record: Mapping[str, Any], text: str, out: Path, page: Path, name: str, *, published: bool
 ) -> None:
-    """Finish a benchmark: write its record to ``out``, print its text, and publish the text if asked to.
+    """Write the record of a benchmark and print its text. If ``published``, also insert the text into a page.
 
     Raises:
         InputError: see ``publish``.

@@ -185,7 +185,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
     """Read a text file and parse it as TOML or JSON.
 
     Raises:
-        InputError: the file does not exist or does not parse; the message begins with ``what``.
+        InputError: the file does not exist or cannot be parsed. The message starts with ``what``.
     """
     try:
         return parse(read_text(file))

@@ -193,14 +193,14 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     """
     study = start.study
     # Tables describe heights, not films.
-    families = [*(FILM_LAWS if study.of_films else LAWS).values()]
+    all_laws = [*(FILM_LAWS if study.of_films else LAWS).values()]
     tables = [] if study.of_films else [*TABLES.values()]
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
         # A law with the same formula as a named cause would only rename the cause.
         formulas = {get_effect(name).apply for name in named.names}
-        laws = [law for law in families if law.apply not in formulas]
+        laws = [law for law in all_laws if law.apply not in formulas]
         lawful = search(named.state, laws, 4, secants)
         study.report("searching for tables that describe the residual")
         described = describe(lawful.state, tables, 2, secants)

@@ -52,7 +52,7 @@ def write_campaign(folder: Path, count: int = 3, shape: tuple[int, int] = (112, 
 def card_text(
     size_um: str = "[12.8, 12.8]", *, unit: str = '"m"', pitch_um: str = "0.1", more: str = ""
 ) -> str:
-    """Return the text of a card. The arguments are TOML values; the text ``more`` is appended to the card."""
+    """Return the text of a card. The arguments are values in TOML; ``more`` is text to append to the card."""
     return f"""
 name = "test-prints"
 [layout]

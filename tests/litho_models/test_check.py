@@ -197,7 +197,7 @@ def test_a_steady_drift_reaches_the_tolerance_when_it_must():
     reference = np.arange(12) < 9
     found = forecast(values, np.ones(12), reference, tolerance=0.2)
     assert found.per_print == pytest.approx(0.01)
-    # The middle of the reference is print 4, which was 7 prints ago. The drift reaches 0.2 20 prints later.
+    # At 0.01 per print, the drift reaches 0.2 at 20 prints after print 4, the centre of the reference.
     assert found.prints_left in (12, 13)  # rounding may exclude the thirteenth
     noisy = values + np.random.default_rng(0).normal(0, 0.02, 12)
     assert forecast(noisy, np.ones(12), reference, tolerance=0.2).prints_left < 12

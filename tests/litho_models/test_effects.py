@@ -402,7 +402,7 @@ def test_a_width_between_two_kernel_sizes_fills_a_pit_in_part(width_um: float, s
 
 
 def test_a_field_continues_beyond_its_edge_when_narrow_pits_are_filled() -> None:
-    """Check that a field is filled in the same way as the inner part of a larger field that continues it."""
+    """Check that pits are filled as if the field continued beyond its edges with its outermost values."""
     part = torch.rand(1, 1, 40, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     whole = torch.nn.functional.pad(part, (20,) * 4, mode="replicate")
     values = {"fraction": 1.0, "width_um": 0.9}
