@@ -124,7 +124,7 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     """Compute the height map of the film on the layout's grid: the height of the film times the fraction of
     each pixel that it covers. Pixels with dirt are invalid.
     """
-    from litho_data.making.contour import coverage, foreign
+    from litho_data.making.contour import coverage, edge_shift_px, foreign, with_moved_edges
     from litho_data.register.refine import interior_of
 
     distance, valid = _on_layout(arrays["edge_distance_um"], params, arrays)
@@ -134,6 +134,10 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
         valid &= ~arrays["defect"]
     covered = coverage(np.where(valid, distance, np.nan), pitch_um)
     dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
+    if shift_px := edge_shift_px(level, np.where(valid, distance / pitch_um, np.nan)):
+        # The edges may have moved further than `dirt_px`.
+        moved = with_moved_edges(level, shift_px) / params["full_level"]
+        dirt &= foreign(covered, moved, params["dirt_px"])
     valid &= ~dirt
     sigma_um = params["edge_sigma_um"]
     above, below = (coverage(distance + shift, pitch_um) for shift in (sigma_um, -sigma_um))

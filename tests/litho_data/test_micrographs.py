@@ -17,6 +17,7 @@ from litho_data.cards.card import check_card
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.making.contour import coverage, edge_shift_px, find_edges, foreign, with_moved_edges
+from litho_data.making.operations import OPERATIONS
 from litho_data.provenance.verify import verify
 
 RADIUS_PX = 60.0
@@ -97,6 +98,30 @@ def test_the_edges_of_a_film_tell_how_far_they_have_moved() -> None:
     lost = np.minimum(30 - radius, 15 - y)
     assert edge_shift_px(disc, lost) == edge_shift_px(disc, 29.5 - radius) == 0
     assert edge_shift_px(np.full_like(disc, 17), 30 - radius) == 0
+
+
+def test_edges_that_have_moved_far_are_not_dirt() -> None:
+    y, x = np.mgrid[-50:50, -60:60]
+    radius = np.hypot(y, x)
+    disc = (17 * (radius < 30)).astype(np.uint8)
+    moved = np.maximum(38 - radius, 3 - np.hypot(y + 40, x + 50))
+    params = {
+        "scan_pitch_um": [1.0, 1.0],
+        "layout_pitch_um": 1.0,
+        "layout_shape": disc.shape,
+        "edge_px": 0,
+        "film_um": 2.0,
+        "full_level": 17,
+        "edge_sigma_um": 0.1,
+        "dirt_px": 5,
+    }
+    arrays = {"mask_level": disc, "edge_distance_um": moved, "scan_to_layout": np.eye(3)}
+    made, facts = OPERATIONS["cover"].function(params, [], arrays)
+    assert made["valid"][np.abs(radius - 34) < 8].all()
+    # Only the spot far outside the disc, widened by 5 px, is dirt.
+    spot = np.hypot(y + 40, x + 50)
+    assert not made["valid"][spot < 3].any()
+    assert facts["dirt_share"] < (spot < 12).mean()
 
 
 def test_small_specks_are_ignored() -> None:
