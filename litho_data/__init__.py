@@ -1,8 +1,9 @@
 """Turn raw AFM files and layouts into a dataset with provenance.
 
 For one scan, call ``read_scan`` → ``level_scan`` → ``register_scan`` → ``resample_to_layout``. For a whole
-dataset, call ``build_dataset`` with a card, then ``open_store``. ``fetch`` gets the files of a known dataset,
-and ``simulate`` makes those of a virtual one.
+dataset, call ``build_dataset`` with a dataset card (the TOML file that describes the raw files), then
+``open_store``. ``fetch`` downloads the files of a known dataset. ``simulate`` makes the files that a virtual
+printer and microscope would deliver.
 """
 
 from typing import TYPE_CHECKING

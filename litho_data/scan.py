@@ -1,4 +1,4 @@
-"""One height map as an instrument recorded it, with all that its file says about it."""
+"""One height map as an instrument recorded it, with everything that its file states about it."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -16,22 +16,23 @@ class Scan:
     """A height map in the scan's own frame.
 
     Args:
-        height_um: heights (ny, nx) as float64 in µm, with row 0 at the top; NaN where nothing was measured.
-        pitch_um: distance of the pixels (along y, along x) in µm; None if neither the file nor the caller
-            states it.
+        height_um: heights in µm, a float64 array of shape (ny, nx) with row 0 at the top. Pixels that were
+            not measured are NaN.
+        pitch_um: distance between neighbouring pixels along y and along x, in µm; None if neither the file
+            nor the caller states the pitch.
         name: name of the scan, by default the stem of its file name.
         channel: name of the channel that was read.
         unit: unit of the heights in the file, before conversion to µm.
         fast_axis: the axis along which the tip moved fast; None if unknown.
-        mask: (ny, nx) bool, the mask in the file; None if there is none.
-        header: everything else that the file says, as strings.
+        mask: mask that the file contains, a bool array of shape (ny, nx); None if the file has no mask.
+        header: all other entries of the file's header, as strings.
         source: path of the file.
         format: name of the reader that read it.
         notes: warnings for whoever uses the heights.
 
     Raises:
-        InputError: the heights are not a map of at least 2 x 2 pixels or contain no finite value, the mask
-            has another shape, or the pitch is not positive.
+        InputError: the heights are not a map of at least 2 x 2 pixels or contain no finite value, the shape
+            of the mask differs from that of the heights, or the pitch is out of range.
     """
 
     height_um: Array
@@ -87,7 +88,7 @@ class Scan:
         return self.height_um.shape[0], self.height_um.shape[1]
 
     def require_pitch(self) -> YX:
-        """Return the pitch (y, x) in µm, which every operation with lateral lengths needs.
+        """Return the pitch along y and along x in µm. Every operation that uses lateral lengths needs it.
 
         Raises:
             InputError: the pitch is unknown.
@@ -102,5 +103,5 @@ class Scan:
 
     @property
     def grid(self) -> PixelGrid:
-        """Return the sampling geometry, or raise InputError if the pitch is unknown."""
+        """Return the scan's pixel grid (shape and pitch), or raise InputError if the pitch is unknown."""
         return PixelGrid(self.shape, self.require_pitch())

@@ -35,7 +35,7 @@ def load_card(path: str | Path) -> Card:
 
 
 def check_card(content: dict[str, Any], what: str) -> Card:
-    """Check a card that is already a dict."""
+    """Check the content of a card, given as a dict, and return the card. Messages call the card ``what``."""
     try:
         return Card.model_validate(content)
     except ValidationError as error:
@@ -43,11 +43,11 @@ def check_card(content: dict[str, Any], what: str) -> Card:
 
 
 def with_tip(card: Card, tip: float | str) -> Card:
-    """Return a copy of the card with this ``process.tip``.
+    """Return a copy of the card in which ``process.tip`` has the given value.
 
     Raises:
-        InputError: the tip is neither a positive number nor ``blind``, or the card is of micrographs, which
-            have no tip.
+        InputError: the tip is neither a positive number nor ``blind``, or the card describes micrographs,
+            which are taken without a tip.
     """
     if card.scan.instrument == "sem":
         raise InputError("tip", got="micrographs", wanted="scans of an atomic force microscope")
@@ -89,7 +89,9 @@ def _file_patterns(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def _inside(value: str) -> str:
-    """Check that a path is relative and stays in the data folder; both kinds of separator are accepted."""
+    """Check that a path is relative and stays in the data folder. Slashes and backslashes are accepted as
+    separators.
+    """
     parts = PurePosixPath(value.replace("\\", "/")).parts
     leaves = not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value)
     if leaves or not value.isprintable():
@@ -116,7 +118,7 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 
 
 class LayoutFiles(Record):
-    """The layout files.
+    """The ``[layout]`` table: the layout files, and what their values mean.
 
     If the layouts are saved as pictures, ``grey_per_level`` is the difference in grey value between
     neighbouring levels, such as 255 / (levels - 1) if white is the highest level. If ``average_px`` is set,
@@ -142,13 +144,14 @@ class LayoutFiles(Record):
 
 
 class ScanFiles(Record):
-    """The scan files. ``size_um`` is the size (y, x), for formats that do not state it.
+    """The ``[scan]`` table: the scan files, and how to read them. ``size_um`` is the size of the field along
+    y and x, for file formats that do not state it.
 
     ``instrument``: the kind of microscope. A ``confocal`` microscope has no tip. The files of a scanning
     electron microscope (``sem``) are pictures of a film that has the layout's full height; the build measures
     the edges of this film.
 
-    ``levelled`` says that the build uses the heights in the files without levelling them. ``missing``
+    If ``levelled`` is true, the build uses the heights in the files without levelling them. ``missing``
     contains numbers and words that mark pixels without a measurement; an empty list says that there are no
     such marks.
     """
@@ -177,8 +180,9 @@ class ScanFiles(Record):
 class Process(Record):
     """How raw scans are processed: the file of a levelling recipe, the registration model and the tip.
 
-    Without ``level``, the layout-aware plane is subtracted from scans that are not level yet. ``tip`` is the
-    radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans.
+    Without ``level``, a plane that is fitted together with the layout is subtracted from each scan, unless
+    the card says that the scans are levelled. ``tip`` is the radius of the microscope's tip in µm, or
+    ``blind`` to estimate it from the scans.
     """
 
     level: InsidePath | None = None
@@ -187,7 +191,10 @@ class Process(Record):
 
 
 class Ids(Record):
-    """What the ids mean: a regular expression for the whole id, and a CSV table with further facts."""
+    """What the ids of the scans mean. ``print`` is a regular expression that matches a whole id, and its
+    group named ``print`` gives the print of the scan. ``table`` is a CSV file with further facts about each
+    scan.
+    """
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None
     table: InsidePath | None = None
@@ -213,7 +220,7 @@ class Grating(Standard):
 
 
 class Step(Standard):
-    """A step, ridge or groove; its edges are perpendicular to ``axis``."""
+    """A step, ridge or groove of known height, whose edges are perpendicular to ``axis``."""
 
     height_um: Length
     axis: Literal["x", "y"] = "x"
@@ -234,7 +241,8 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """How a field was written; missing facts are assumed, and labelled as assumptions.
+    """How the printer wrote a field. Facts that are missing here are assumed, and the listing names these
+    assumptions.
 
     ``surround`` says what lies around a printed field: the bare substrate or more of the print.
     """
@@ -286,7 +294,7 @@ class Card(Record):
         heights = (self.process.level, self.process.tip, self.calibration, self.grating)
         if self.scan.instrument == "sem" and any(one is not None for one in heights):
             raise ValueError(
-                "wanted no levelling, tip, calibration or grating, because micrographs have none"
+                "wanted no levelling, tip, calibration or grating, because they do not apply to micrographs"
             )
         if self.scan.instrument == "confocal" and self.process.tip is not None:
             raise ValueError("wanted no tip, because a confocal microscope has none")

@@ -31,8 +31,8 @@ def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
         into: folder to fill; by default the user cache.
 
     Raises:
-        InputError: the name is unknown, the card has no source, a file cannot be downloaded, or a hash is
-            wrong.
+        InputError: the name is unknown, the card does not say where its files can be downloaded, a file
+            cannot be downloaded, or the hash of a downloaded file is wrong.
     """
     card_path = find_card(dataset)
     name, registry = _registry(card_path)
@@ -63,7 +63,8 @@ def cache_folder(name: str) -> Path:
 
 
 def find_card(dataset: str | Path) -> Path:
-    """Return the path of a card, given this path (a ``.toml`` file) or the name of a card of the project.
+    """Return the path of a dataset card. ``dataset`` is the name of one of the project's cards, or the path
+    of a ``.toml`` file, which is returned unchanged.
 
     Raises:
         InputError: the project has no card with this name.

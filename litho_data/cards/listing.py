@@ -1,4 +1,6 @@
-"""List the printed fields of a card: find its files, pair them by id, and read the card's table."""
+"""List the printed fields of a card: find the card's files, pair layouts with scans by id, and read the
+card's table.
+"""
 
 import glob
 import json
@@ -16,7 +18,7 @@ from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, rea
 from litho_data.foundation import Facts, InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
-# A separate process matches a card's regular expression against file names; it is stopped after this time.
+# A separate process matches a card's regular expression against ids; it is stopped after this time.
 _LONGEST_S = 10.0
 _MATCH = """
 import json, re, sys
@@ -29,10 +31,10 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 class PrintedField:
     """One field to build: its files and what the card says about it.
 
-    ``columns`` contains the optional numbers (µm, dose) and words of the table. ``read`` contains the reading
-    options in the table, which replace those of the card. If the scan is an image, ``full_scale_um`` is the
-    height that its largest integer value stands for. ``layout`` may be None only for a reference scan (whose
-    ``use`` is not dataset).
+    ``columns`` contains the optional numbers and words that the card's table states for this field, such as
+    its dose. ``read`` contains the reading options in the table, which replace those of the card. If the scan
+    is an integer image, ``full_scale_um`` is the height that the largest possible pixel value stands for.
+    ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
     """
 
     id: str
@@ -50,7 +52,8 @@ class PrintedField:
 class Listing:
     """A card with the folder of its files, the fields to build, and the files of every id.
 
-    Each id that is not a field is in ``unpaired`` (it has only one file) or in ``refused``, with the reason.
+    Each id that is not built is a key of ``unpaired`` (its layout or its scan is missing) or of ``refused``
+    (it cannot be used). The value is the reason.
     """
 
     card: Card
@@ -68,10 +71,10 @@ class Listing:
 
 
 def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Listing:
-    """Find and pair the files of a card.
+    """Find the layout and scan files of a card, and pair them by id.
 
     Args:
-        card_path: the card.
+        card_path: path of the card.
         data_dir: folder where the card's file patterns start. By default, it is the first folder that has
             files: the card's own folder, ``$LITHO_DATA_DIR/<name>``, or the user cache.
 
@@ -156,18 +159,22 @@ def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Pa
 
 
 def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the patterns in a card's entry, which may contain one or several."""
+    """Return the file patterns of a card's entry ``files``, which is either one pattern or a sequence of
+    patterns.
+    """
     return (files,) if isinstance(files, str) else tuple(files)
 
 
 def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
-    """Find the files of each id with one pattern or several; ``*`` stands for any part of a name."""
+    """Find the files that match one pattern or several, and return them by id. In a pattern, ``{id}`` stands
+    for the id, and ``*`` for any part of a name.
+    """
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):
         before, *rest = (
             "[^/]*".join(re.escape(piece) for piece in part.split("*")) for part in pattern.split("{id}")
         )
-        # The first position captures the id, and the others must repeat it.
+        # The first {id} of a pattern captures the id, and every other {id} must match the same text.
         match = re.compile(before + "(?P<id>[^/]+)" + "(?P=id)".join(rest))
         parts = pattern.replace("{id}", "*").split("*")
         for name in sorted(glob.glob("*".join(glob.escape(part) for part in parts), root_dir=folder)):
@@ -208,7 +215,9 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
-    """Return the assumptions that replace facts that some effects need but the card does not state."""
+    """Some effects need facts that the card may not state. Return the assumptions that replace the missing
+    facts.
+    """
     assumed = []
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")
@@ -222,14 +231,15 @@ def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
 
 
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
-    """Return, for each id, the text of the group ``print``; None if the expression does not match the whole
-    id.
+    """Return the print of each id, which is the text that the group ``print`` of a regular expression
+    captures. It is None if the expression does not match the whole id.
 
-    Without an expression, every id counts as a print of its own. Matching nested repetitions can take forever
-    and cannot be interrupted, so an expression with any repetition runs in a separate process.
+    Without an expression, every id counts as a separate print. Matching an expression with nested repetitions
+    can take forever and cannot be interrupted, so an expression with any repetition is matched in a separate
+    process.
 
     Raises:
-        InputError: there is no result after 10 s.
+        InputError: the separate process has no result after 10 s.
     """
     if pattern is None:
         return list(ids)

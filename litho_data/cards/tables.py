@@ -1,4 +1,6 @@
-"""Read the two files to which a card may refer: the table of the ids, and the full scales of images."""
+"""Read the two files to which a card may refer: the table with facts about each id, and the file with the
+full-scale heights of integer images.
+"""
 
 import csv
 import json
@@ -16,7 +18,9 @@ from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
 READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
-"""What the table may say about single scans; these entries replace those in the card's ``[scan]``."""
+"""Columns of the table that say how to read a single scan. They replace the entries with the same names in
+the card's ``[scan]`` table.
+"""
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
 _NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")
 _TOO_MANY = "(too many cells)"
@@ -24,10 +28,11 @@ _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, Any]]:
-    """Read and check a card's CSV table; return the values of all cells that are not empty, keyed by id.
+    """Read and check a card's CSV table. Return a dict that maps each id to the values in its row, by column
+    and without empty cells.
 
-    The reader accepts what spreadsheets write in any language: cells separated by commas, semicolons or tabs,
-    text that may be UTF-16, and decimal commas if cells are not separated by commas.
+    The reader accepts the variants that spreadsheets write in different languages: cells separated by commas,
+    semicolons or tabs, text that may be UTF-16, and decimal commas if cells are not separated by commas.
 
     Raises:
         InputError: the file is unreadable, a column is unknown, an id is not a plain name, or a cell is of
@@ -100,7 +105,8 @@ def _value(name: str, text: str) -> Any:
 
 
 def read_full_scales(path: Path) -> dict[str, float]:
-    """Return the heights of the largest grey value in µm, by file name or id; the JSON file states them in m.
+    """Read a JSON file that states, for each image, the height in metres of the largest possible grey value.
+    Return these heights in µm, by file name or id.
 
     Raises:
         InputError: the file does not exist or is not a JSON object, or a value is not a positive number.

@@ -13,7 +13,8 @@ from litho_data.cli.tip import tip
 from litho_data.commands.app import DaskOption, WorkersOption, argument, new_app, option, run_app
 
 app = new_app(
-    "Turn raw AFM scans and layouts into a dataset with provenance. Lengths in µm unless stated otherwise."
+    "Turn raw AFM scans and layouts into a dataset with provenance. Lengths are in µm unless stated "
+    "otherwise."
 )
 app.command()(masks)
 app.command()(simulate)
@@ -24,10 +25,14 @@ app.command()(tip)
 StorePath = Annotated[Path, argument("dataset store, a .zarr folder or .zarr.zip file")]
 DataDir = Annotated[
     Path | None,
-    option("folder of the raw files; by default the card's folder, $LITHO_DATA_DIR/<name> or the user cache"),
+    option(
+        "folder of the raw files; by default searched for beside the card, in $LITHO_DATA_DIR/<name> and "
+        "in the user cache"
+    ),
 ]
 Strict = Annotated[
-    bool, option("do not build if a scan is skipped, or if a scan or layout has no partner", "--strict")
+    bool,
+    option("do not build if a scan is skipped, a scan has no layout, or a layout has no scan", "--strict"),
 ]
 
 
@@ -42,9 +47,9 @@ class Format(StrEnum):
 @app.command()
 def fetch(
     name: Annotated[
-        str, argument("a dataset of this project, e.g. neural-lithography, or the path of a card")
+        str, argument("name of a dataset of this project, e.g. neural-lithography, or path of a dataset card")
     ],
-    into: Annotated[Path | None, option("folder to fill; by default the user cache")] = None,
+    into: Annotated[Path | None, option("folder for the downloaded files; by default the user cache")] = None,
 ) -> None:
     """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache. The SHA-256 of every file is
     checked.
@@ -64,7 +69,7 @@ def build(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     strict: Strict = False,
-    seed: Annotated[int, option("seed of the robust registration", min=0)] = 0,
+    seed: Annotated[int, option("seed of the random draws of the robust registration", min=0)] = 0,
     suggest: Annotated[
         bool, option("compare levelling recipes on three scans; build nothing", "--suggest")
     ] = False,
@@ -72,12 +77,13 @@ def build(
         str | None,
         typer.Option(
             metavar="UM|blind",
-            help="radius of the tip, or blind to estimate it from the scans; pixels that the tip may not "
-            "have touched become invalid",
+            help="radius of the tip in µm, or blind to estimate it from the scans; pixels that the tip "
+            "may not have touched become invalid",
         ),
     ] = None,
 ) -> None:
-    """Read, level, register and store all scans of a card; write the store and a report beside it.
+    """Read, level and register all scans of a dataset card. Write them to a store, and a report beside the
+    store.
 
     With --suggest, nothing is built: levelling recipes are compared on three scans. The best recipe is
     written beside the card, together with a card that uses it.
@@ -121,7 +127,8 @@ def calibrate(
     card: Annotated[Path, argument("dataset card (TOML) with a `calibration` table")],
     data_dir: DataDir = None,
 ) -> None:
-    """Measure the card's gratings and step, and show the scales that a build would apply.
+    """Measure the gratings and the step that a card names as standards. Show the scale factors that a build
+    would apply to the lengths and heights.
 
     Example: litho-data calibrate prints/card.toml
     """
@@ -137,7 +144,8 @@ def calibrate(
 
 @app.command()
 def verify(store: StorePath, data_dir: DataDir = None) -> None:
-    """Hash a store and its raw files again and name everything that has changed since the build.
+    """Recompute the hashes of a store and of its raw files, and list everything that has changed since the
+    build.
 
     Example: litho-data verify prints.zarr
     """
@@ -156,7 +164,7 @@ def verify(store: StorePath, data_dir: DataDir = None) -> None:
 @app.command()
 def history(
     store: StorePath,
-    scan: Annotated[str | None, argument("id of a scan; without it, one line per scan")] = None,
+    scan: Annotated[str | None, argument("id of a scan; without an id, one line per scan is printed")] = None,
 ) -> None:
     """Print how the arrays of a scan were made: the files, operations, parameters and hashes.
 
@@ -171,7 +179,9 @@ def history(
 def replay(
     store: StorePath,
     scan: Annotated[list[str] | None, argument("ids of scans; by default all")] = None,
-    array: Annotated[list[str] | None, option("name of an array, e.g. height_um; repeatable")] = None,
+    array: Annotated[
+        list[str] | None, option("name of an array to compare, e.g. height_um; repeatable; by default all")
+    ] = None,
     data_dir: DataDir = None,
 ) -> None:
     """Recompute arrays from the raw files and report the largest difference from those in the store.
@@ -190,11 +200,14 @@ def export(
     store: StorePath,
     format: Annotated[
         Format,
-        option("zip: one file; pairs: 8-bit files in the authors' format; ro-crate: a folder with metadata"),
+        option(
+            "zip: one file; pairs: 8-bit files as published with the paper; ro-crate: a folder with metadata"
+        ),
     ],
     out: Annotated[Path | None, option("file (zip) or folder to write; by default beside the store")] = None,
 ) -> None:
-    """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder.
+    """Write a store as one .zarr.zip file, as pairs of 8-bit layout and height files, or as an RO-Crate
+    folder.
 
     Example: litho-data export prints.zarr --format zip
     """
@@ -228,7 +241,8 @@ def import_pairs(
     dask: DaskOption = None,
     strict: Strict = False,
 ) -> None:
-    """Build a store from the authors' 8-bit pair format; four quadrants with the same name become one field.
+    """Build a store from pairs of 8-bit layout and height files, as the paper's authors published them. Four
+    quadrants with the same name become one field.
 
     Example: litho-data import-pairs pairs --out pairs.zarr
     """

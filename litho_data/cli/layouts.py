@@ -30,19 +30,32 @@ def _list_knobs(wanted: bool) -> None:
 
 def masks(
     out: Annotated[Path, option("folder to write; an older set with the same settings is replaced")],
-    pattern: Annotated[str, option("random, or a calibration pattern: see --list-patterns")] = "random",
-    count: Annotated[int, option("number of random layouts", min=1)] = 12,
-    size_px: Annotated[int, option("side of a layout, pixels", min=8)] = 512,
+    pattern: Annotated[
+        str, option("random, or the name of a calibration pattern (see --list-patterns)")
+    ] = "random",
+    count: Annotated[
+        int, option("number of random layouts, or of doses for the pattern dose-matrix", min=1)
+    ] = 12,
+    size_px: Annotated[int, option("side length of a layout, pixels", min=8)] = 512,
     levels: Annotated[
         int, option("number of levels; a layout contains the levels 0 to levels − 1", min=2, max=65536)
     ] = 13,
-    cutoff_per_um: Annotated[float, option("low-pass cut-off, cycles/µm")] = 0.25,
-    passband: Annotated[str, option("square (as for the measured layouts) or round")] = "square",
+    cutoff_per_um: Annotated[
+        float, option("cut-off frequency of the low-pass filter that makes random layouts, cycles/µm")
+    ] = 0.25,
+    passband: Annotated[
+        str, option("pass band of the filter: square (as in the published layouts) or round")
+    ] = "square",
     quantiser: Annotated[
-        str, option("round (as in the paper's equation) or floor (as in the published layouts)")
+        str,
+        option(
+            "rounding to whole levels: round (as in the paper's equation) or floor (as in the published "
+            "layouts)"
+        ),
     ] = "round",
     field_px: Annotated[
-        int | None, option("side of a larger field from which random layouts are cut, pixels")
+        int | None,
+        option("side length of a larger field from whose middle each random layout is cut, pixels"),
     ] = None,
     pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,
@@ -54,7 +67,8 @@ def masks(
         ),
     ] = False,
 ) -> None:
-    """Write layouts (8-bit TIFFs of level numbers), their statistics, and a card to which scans can be added.
+    """Write layouts (TIFF files of level numbers), their statistics, and a dataset card. The scans of the
+    prints can be added to the dataset later.
 
     Example: litho-data masks --count 24 --levels 13 --out prints
     """
@@ -80,41 +94,51 @@ def masks(
 def simulate(
     out: Annotated[
         Path,
-        option("folder to write (raw/ and truth/); an older run with the same settings is replaced"),
+        option(
+            "folder to write, with raw/ and truth/ in it; an older run with the same settings is replaced"
+        ),
     ],
     preset: Annotated[
-        str, option("plain, demo, measured-like or second-printer; e-beam or projection for films")
+        str, option("plain, demo, measured-like or second-printer; for printed films: e-beam or projection")
     ] = "plain",
-    layouts: Annotated[Path | None, option("print the layouts of this card instead of random ones")] = None,
+    layouts: Annotated[
+        Path | None, option("dataset card whose layouts are printed instead of random ones")
+    ] = None,
     plan: Annotated[
         Path | None,
-        option("print and scan the plan that litho-models next-print wrote to this folder; needs --fab"),
+        option("folder of a plan that litho-models next-print wrote, to print and scan it; needs --fab"),
     ] = None,
     fab: Annotated[
         Path | None,
         option(
-            "folder (raw/ and truth/) of an earlier run whose machine prints the plan; needs a new --seed"
+            "output folder of an earlier run, whose printer and microscope carry out the plan; needs a new "
+            "--seed"
         ),
     ] = None,
     count: Annotated[int | None, option("number of scans; by default that of the preset", min=1)] = None,
     size_px: Annotated[
-        int | None, option("side of a layout, pixels; by default that of the preset", min=32)
+        int | None, option("side length of a layout, pixels; by default that of the preset", min=32)
     ] = None,
     seed: Annotated[int, option("seed of every random draw", min=0)] = 0,
     knob: Annotated[
         list[str] | None,
-        option("an effect, as name=strength or name=strength@seed; repeatable; see --list-knobs"),
+        option("an effect to simulate, as name=strength or name=strength@seed; repeatable; see --list-knobs"),
     ] = None,
-    noise: Annotated[str, option("default or off")] = "default",
-    microscope: Annotated[str, option("default (scans slightly warped) or aligned (no warp)")] = "default",
+    noise: Annotated[str, option("noise of printer and microscope: default or off")] = "default",
+    microscope: Annotated[
+        str, option("default (scans are slightly warped) or aligned (scans are not warped)")
+    ] = "default",
     write_field_um: Annotated[
-        float | None, option("side of a write field that all fields of a print share, µm")
+        float | None, option("side length of one write field that all fields of a print share, µm")
     ] = None,
     stitch_field_um: Annotated[
-        float | None, option("side of the fields that the effect stitching displaces, µm")
+        float | None, option("side length of the fields that the effect named stitching displaces, µm")
     ] = None,
     references: Annotated[
-        bool, option("add scans of a bare substrate, a flat and a 5-step print", "--references")
+        bool,
+        option(
+            "add scans of a bare substrate, of a flat print and of a print with five steps", "--references"
+        ),
     ] = False,
     list_knobs: Annotated[
         bool,
@@ -140,7 +164,7 @@ def simulate(
         raise InputError(
             "--plan and --fab",
             got="only one of the two",
-            wanted="both: the plan to print and the fab that prints it",
+            wanted="both: the plan to print, and the earlier run whose printer prints it",
         )
     shaped = any(value is not None for value in (count, size_px, write_field_um))
     if plan is not None and fab is not None:
@@ -164,7 +188,7 @@ def simulate(
     printer = settings["printer"]
     if stitch_field_um is not None:
         if not printer.pitch_um <= stitch_field_um <= LENGTH_UM.high:
-            wanted = f"a length from the pitch, {printer.pitch_um:g} µm, to {LENGTH_UM.high:g} µm"
+            wanted = f"a length from {printer.pitch_um:g} µm (the pitch) to {LENGTH_UM.high:g} µm"
             raise InputError("--stitch-field-um", got=stitch_field_um, wanted=wanted)
         printer = settings["printer"] = replace(printer, stitch_field_um=stitch_field_um)
     card = simulate(

@@ -22,15 +22,22 @@ if TYPE_CHECKING:
 
 ScanPath = Annotated[Path, argument("a scan in any supported format")]
 _READING: dict[str, Any] = {
-    "format": Annotated[str, option(f"auto (recognised by the content of the file), {', '.join(formats())}")],
-    "unit": Annotated[str | None, option("unit of the heights if the file states none, e.g. m, nm")],
+    "format": Annotated[
+        str, option(f"format: auto (recognised by the file's content), {', '.join(formats())}")
+    ],
+    "unit": Annotated[str | None, option("unit of the heights if the file states none, e.g. m or nm")],
     "size_um": Annotated[
         YX | None,
-        typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
+        typer.Option(
+            "--size-um", metavar="Y X", help="size of the field along y and x in µm if the file states none"
+        ),
     ],
     "channel": Annotated[str | None, option("name of the height channel, if there are several")],
     "full_scale_um": Annotated[
-        float | None, option("height in µm of the largest value of an integer image", "--full-scale-um")
+        float | None,
+        option(
+            "height in µm that the largest possible value of an integer image stands for", "--full-scale-um"
+        ),
     ],
     "missing": Annotated[
         list[str] | None,
@@ -40,8 +47,8 @@ _READING: dict[str, Any] = {
 
 
 def reads_scans(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options for reading a scan; the command receives them as ``how`` and passes them to
-    ``read_scan``.
+    """Add the options for reading a scan to a command. The command receives these options as its argument
+    ``how``, and passes them to ``read_scan``.
     """
 
     @functools.wraps(command)
@@ -62,7 +69,8 @@ def level(
     out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
     how: Facts,
 ) -> None:
-    """Level one scan; write the levelled heights, the removed surface and a record beside them.
+    """Level one scan. Write the levelled heights, and beside them the surface that levelling removed and a
+    record of the levelling.
 
     Example: litho-data level P11.gwy --recipe recipe.toml --out P11.gsf
     """
@@ -84,7 +92,7 @@ def level(
 def inspect(
     file: ScanPath,
     how: Facts,
-    picture: Annotated[Path | None, option("PNG to write")] = None,
+    picture: Annotated[Path | None, option("PNG file to write, with a picture of the heights")] = None,
     header: Annotated[bool, option("print the full header of the file", "--header")] = False,
 ) -> None:
     """List the channels of a file with their sizes, units and pitches, and print the range of the heights.
@@ -105,7 +113,7 @@ def inspect(
     try:
         scan = read_scan(file, **how)
     except InputError as error:
-        # If no picture was asked for, the list of channels is enough.
+        # Without a picture or reading options, the user wants only the list of channels.
         if picture is not None or any(value for name, value in how.items() if name != "format"):
             raise
         typer.echo(f"heights not shown: {error}")

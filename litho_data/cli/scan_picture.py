@@ -1,4 +1,4 @@
-"""Draw a scan as a PNG with axes and scale."""
+"""Draw the heights of a scan as a PNG picture with axes and a colour scale."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _COLOURS = "viridis"
 
 
 def write_picture(scan: Scan, path: str | Path) -> Path:
-    """Write a PNG of the heights in nm, with row 0 at the top. The axes are in µm, or in px if the pitch is
-    unknown.
+    """Write a PNG picture of the heights in nm, with row 0 at the top and the outline of the scan's mask in
+    red. The axes are in µm, or in px if the pitch is unknown.
     """
     ny, nx = scan.shape
     unit, pitch = ("µm", scan.pitch_um) if scan.pitch_um is not None else ("px", (1.0, 1.0))

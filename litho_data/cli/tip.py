@@ -22,13 +22,16 @@ def tip(
     json: Annotated[bool, option("print the whole result as JSON", "--json")] = False,
     maps: Annotated[
         Path | None,
-        option("folder for NAME.certain.npy (true where the tip certainly touched) and NAME.surface.gsf"),
+        option(
+            "folder for NAME.certain.npy (true where the tip certainly touched the surface) and "
+            "NAME.surface.gsf"
+        ),
     ] = None,
 ) -> None:
-    """Estimate the radius of the tip, or an upper limit on it, and find the pixels that the tip may not have
-    touched.
+    """Estimate the radius of the microscope's tip, or an upper limit on the radius. Find the pixels of each
+    scan that the tip may not have touched.
 
-    The surface in --maps is the highest surface that explains the image.
+    The surface in --maps is the highest surface from which this tip would produce the scan.
 
     Example: litho-data tip P11.gwy P12.gwy --maps maps
     """
@@ -41,7 +44,11 @@ def tip(
     if maps is None:
         return
     if found.radius_um is None:
-        raise InputError("maps of the tip", got=found.reason, wanted="scans that give an estimate or a bound")
+        raise InputError(
+            "maps of the tip",
+            got=found.reason,
+            wanted="scans from which the radius, or an upper limit on it, can be estimated",
+        )
     import numpy as np
 
     from litho_data.foundation.files import atomic_file
@@ -79,9 +86,12 @@ def _text(found: TipEstimate) -> str:
         f"{found.line_noise_nm:.2g} nm per line",
     ]
     for scan in found.scans:
-        limit = f"details below {scan.resolution_um:.3g} µm" if scan.resolution_um else "no details"
+        limit = (
+            f"details below {scan.resolution_um:.3g} µm may come from the tip"
+            if scan.resolution_um
+            else "the tip does not limit the details"
+        )
         lines.append(
-            f"{scan.name}: {scan.certain_fraction:.1%} of the pixels were certainly touched; {limit} may "
-            "come from the tip"
+            f"{scan.name}: {scan.certain_fraction:.1%} of the pixels were certainly touched; {limit}"
         )
     return "\n".join(lines)

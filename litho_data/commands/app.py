@@ -22,8 +22,8 @@ UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """Make an option of a command. ``names`` are needed only if they differ from the default; ``more`` is
-    passed to typer.
+    """Make an option of a command. ``names`` are needed only if the option is not named after its parameter.
+    The keyword arguments ``more`` are passed to typer.
     """
     return typer.Option(*names, help=help, **more)
 
@@ -41,7 +41,7 @@ WorkersOption = Annotated[
 DaskOption = Annotated[
     str | None,
     option(
-        "address of a Dask scheduler, such as tcp://host:8786; its workers are used instead of local ones",
+        "address of a Dask scheduler, such as tcp://host:8786; its workers replace the local processes",
         "--dask",
     ),
 ]
@@ -76,7 +76,7 @@ HelpAll = Annotated[
 
 
 def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
-    """Replace the signature of a function that takes ``**values`` by the one that typer should see."""
+    """Give a function that takes ``**values`` the signature that typer should see, made of ``parameters``."""
     # Typer reads the signature and the annotations.
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -94,7 +94,9 @@ def takes_more(
     more: Sequence[inspect.Parameter],
     without: str = "",
 ) -> Callable[..., None]:
-    """Set the parameters of the wrapper ``run``: those of ``command`` except ``without``, then ``more``."""
+    """Give the wrapper ``run`` all parameters of ``command`` except the one named ``without``, followed by
+    the parameters in ``more``.
+    """
     own = inspect.signature(command, eval_str=True).parameters.values()
     kept = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own if one.name != without]
     return takes(run, [*kept, *more])
@@ -144,13 +146,13 @@ def new_app(help_text: str) -> typer.Typer:
         callback=options,
         invoke_without_command=True,
         pretty_exceptions_enable=False,
-        # Boxes would leave only a third of an 80-character line for the help of an option.
+        # Rich's boxes would leave only a third of an 80-character line for the help text of an option.
         rich_markup_mode=None,
     )
 
 
 def run_app(app: typer.Typer, name: str) -> None:
-    """Run a typer application. For an error of the input or of the system, print one line and exit with code
+    """Run a typer application. If the input or the system causes an error, print one line and exit with code
     2.
 
     Any other exception is a defect of this project and shows its traceback.
@@ -165,8 +167,8 @@ def run_app(app: typer.Typer, name: str) -> None:
             load_plugins(files)
             code = app(words, prog_name=name, standalone_mode=False)
     except BrokenPipeError:
-        # The reader of the output, such as `head`, has closed it; without this, Python would complain at
-        # exit.
+        # The program that reads the output, such as `head`, has closed the pipe. Unless stdout is redirected,
+        # Python prints an error at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except UsageError as error:
@@ -183,8 +185,8 @@ def run_app(app: typer.Typer, name: str) -> None:
 
 
 def _not_allowed(error: Exception) -> InputError | None:
-    """Return the error to print if the system or the input caused it; return None for a defect of this
-    project.
+    """Return the InputError to print if the system or the input caused the exception. Return None if the
+    exception is a defect of this project.
     """
     # PyTorch and safetensors raise their own errors for a full disk.
     text = str(error)
@@ -197,7 +199,7 @@ def _not_allowed(error: Exception) -> InputError | None:
         code = errno.ENOSPC if text.endswith(" written") else error.errno or 0
         return InputError(what, got=error, hint=_WAYS_OUT.get(code, _AGAIN))
     if "Symlink loop" in text:
-        return InputError("a link that leads to itself", got=text.partition("'")[2].rstrip("'"))
+        return InputError("a symbolic link that leads to itself", got=text.partition("'")[2].rstrip("'"))
     if isinstance(error, RecursionError):
         return InputError(
             "input", got="parts nested too deeply", wanted="a file with fewer levels of nesting"

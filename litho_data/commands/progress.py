@@ -1,4 +1,4 @@
-"""Record the command line for results, and show a progress bar on stderr."""
+"""Determine the command line that results record, and show the progress of a command on stderr."""
 
 import shlex
 import sys
@@ -12,9 +12,11 @@ from typing import TypeVar
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-# Shortest elapsed time that allows an estimate, and shortest remaining time that is reported.
+# Shortest elapsed time from which the remaining time is estimated, and shortest remaining time that is
+# reported, in seconds.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-# Together with the time that a command takes to start, this is five seconds.
+# A command that has printed nothing for this time says that it is at work. Together with the time that a
+# command takes to start, this is five seconds.
 _SILENT_S = 3.0
 _silent = threading.Event()
 
@@ -31,7 +33,9 @@ def given_words() -> list[str]:
 
 
 def command_line(program: str | None = None) -> str:
-    """Return the command that started this process; by default, ``program`` is the script or module."""
+    """Return the command line that started this process. It begins with ``program``, or by default with the
+    name of the script or module.
+    """
     if program is None:
         module = sys.modules["__main__"].__spec__
         started = (
@@ -50,14 +54,14 @@ def progress(
     estimate_of: int | None = None,
     at_once: int = 1,
 ) -> Iterator[T]:
-    """Iterate with a progress bar on stderr, or without one if stderr is not a terminal.
+    """Iterate over items, and show a progress bar on stderr if stderr is a terminal.
 
     If the remaining items will take more than a minute, one line states the remaining time as soon as it can
     be estimated. The time of the first items includes start-up, so it does not count towards the estimate
     unless it exceeds a minute.
 
     Args:
-        items: the items to iterate over; ``what``: a text that says what is done with them.
+        items: the items to iterate over.
         total: number of items, if ``len`` does not give it.
         estimate_of: number of items that the estimate covers; by default all. 0 means no estimate.
         at_once: number of items that are processed at the same time.
@@ -81,7 +85,7 @@ def progress(
 
 
 def say(what: str) -> None:
-    """Print one line on stderr before the work that it names, so that users know what they are waiting
+    """Print one line on stderr that names the work about to begin, so that users know what they are waiting
     for.
     """
     _silent.clear()
@@ -107,13 +111,13 @@ def never_silent(name: str) -> Iterator[None]:
 
 
 def say_estimate(what: str, seconds: float) -> None:
-    """Print one line on stderr with the expected time if it is more than a minute."""
+    """If some work will take more than a minute, print one line on stderr with the expected time."""
     if told := estimate(what, seconds):
         say(told)
 
 
 def estimate(what: str, seconds: float) -> str:
-    """Return the line of ``say_estimate``, or an empty text for less than a minute."""
+    """Return the line that ``say_estimate`` prints, or an empty string if the work takes at most a minute."""
     if seconds <= _MINUTE_S:
         return ""
     span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"

@@ -1,6 +1,8 @@
-"""Define each setting in one place: a field of a record, with default, limits, unit, help and option.
+"""Define each setting in one place: as a field of a settings record that states its default, limits, unit,
+help text and option.
 
-The command lines make their options from these fields, and every field can be changed by its dotted path.
+The command lines make their options from these fields, and every field can be changed by its dotted path,
+such as ``layout.pitch_um``.
 """
 
 import json
@@ -45,14 +47,15 @@ def setting(
 
 @dataclass(frozen=True)
 class Leaf:
-    """One setting of a record or of one of its parts, as ``leaves`` finds it.
+    """One setting of a settings record or of a record nested in it, as ``leaves`` finds it.
 
     Attributes:
-        path: dotted, as in ``layout.pitch_um``.
-        kind: annotation of the field, without limits.
-        value: the value in the record.
+        path: dotted path of the setting, as in ``layout.pitch_um``.
+        kind: type annotation of the field, without limits.
+        value: value that the record has.
         options: names on the command line.
-        group: description of the part that the setting belongs to; empty at the root.
+        group: description of the nested record that contains the setting; empty for a setting of the
+            outermost record.
     """
 
     path: str
@@ -65,7 +68,7 @@ class Leaf:
 
 
 def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[Leaf]:
-    """Yield every setting of a record and of its parts."""
+    """Yield every setting of a record and of the records nested in it."""
     for name, field in type(settings).model_fields.items():
         value, path = getattr(settings, name), f"{prefix}{name}"
         if isinstance(value, BaseModel):
@@ -75,7 +78,7 @@ def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[L
 
 
 def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> Leaf:
-    """Return the setting that a field defines, with this path and value."""
+    """Return the setting that a field of a record defines, with the given path and value."""
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     return Leaf(
         path=path,
@@ -89,11 +92,12 @@ def leaf_of(field: FieldInfo, path: str, value: Any = None, group: str = "") -> 
 
 
 def flattened(settings: BaseModel, content: Facts, what: str = "setting") -> dict[str, Any]:
-    """Flatten nested or dotted keys; return the values by dotted path.
+    """Convert content with nested or dotted keys to a flat dict that maps dotted paths to values.
 
     Args:
         settings: a record, which must have a field for every key.
-        content: nested keys, as read from a file, or dotted ones, as in ``{"layout.pitch_um": 0.2}``.
+        content: a mapping with nested keys, as read from a file, or with dotted keys, as in
+            ``{"layout.pitch_um": 0.2}``.
         what: the word for a setting in messages.
 
     Raises:
@@ -136,7 +140,8 @@ def _names(part: BaseModel, above: str) -> list[str]:
 
 
 def changed(settings: M, changes: Facts) -> M:
-    """Return a copy of ``settings`` with values changed by dotted path; the whole copy is validated.
+    """Return a copy of ``settings`` in which the values at the given dotted paths are changed. The whole copy
+    is validated.
 
     Raises:
         InputError: a name is unknown, or the record does not accept a value.
@@ -168,8 +173,8 @@ def refused(error: ValidationError) -> InputError:
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
-    """Parse words of the form ``path=value``; return the values by dotted path. A value that is not JSON is
-    taken as a string.
+    """Parse words of the form ``path=value``, and return a dict from dotted path to value. A value that is
+    not valid JSON is taken as a string.
 
     Raises:
         InputError: a word has no ``=``, or a path is repeated.
@@ -189,7 +194,7 @@ def assigned(words: Iterable[str]) -> dict[str, Any]:
 
 
 def read_settings(path: str | Path) -> dict[str, Any]:
-    """Read a settings file as TOML or JSON, as its suffix says.
+    """Read a settings file. Its suffix says whether it is TOML or JSON.
 
     Raises:
         InputError: the file does not exist, has another suffix, or is not valid TOML or JSON.
@@ -200,5 +205,7 @@ def read_settings(path: str | Path) -> dict[str, Any]:
         raise InputError("settings file", got=str(file), wanted="a .toml or .json file")
     content = parsed(file, read, f"settings file {file}", file.suffix[1:].upper())
     if not isinstance(content, dict):
-        raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")
+        raise InputError(
+            f"settings file {file}", got=type(content).__name__, wanted="a table of settings by name"
+        )
     return content

@@ -1,1 +1,1 @@
-"""Move data into and out of a store: releases, and the authors' pair format."""
+"""Move data into and out of a store: release files, and the pair format of the paper's authors."""

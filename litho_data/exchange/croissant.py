@@ -18,7 +18,7 @@ def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any
     """Return the Croissant description of a release as JSON-LD.
 
     Args:
-        root: the entry for the dataset in the RO-Crate; ``files``: the entries for the files.
+        root: the entry for the dataset in the RO-Crate. ``files`` are the entries for its files.
         table: CSV file with one row per scan; the description lists its columns.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}

@@ -1,7 +1,9 @@
-"""Import and export the authors' pair format; ``litho_data.readers.pairs`` describes its limits.
+"""Import and export pairs of 8-bit layout and height files, the format in which the paper's authors published
+their data. ``litho_data.readers.pairs`` describes the limits of this format.
 
 ``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` contains heights, and ``src_max_dict.txt`` contains
-the full scales in metres. The quadrant q is 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
+the full scale of each height file (the height of grey value 255) in metres. The quadrant q is 1 (top left), 2
+(top right), 3 (bottom left) or 4 (bottom right).
 """
 
 import json
@@ -46,22 +48,24 @@ def import_pairs(
     dask: str | None = None,
     strict: bool = False,
 ) -> BuildResult:
-    """Build a store from a folder in the pair format; the four quadrants of a name become one field.
+    """Build a store from a folder in the pair format. Four files whose names differ only in the quadrant
+    become one field.
 
-    A height is value / 255 · full scale. In the authors' own files, heights were rounded down to a grey
-    value, so they are too low by half a grey value (about 2 nm) on average.
+    The height of a pixel is grey value / 255 · full scale. In the authors' own files, heights were rounded
+    down to a grey value, so they are too low by half a grey value (about 2 nm) on average.
 
     Args:
         folder: folder with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
         out: path of the store.
-        pitch_um, level_height_um, levels: values that the files do not state; the defaults are those of the
-            paper.
+        pitch_um, level_height_um, levels: pixel pitch and nominal height of a level, in µm, and number of
+            levels. The files do not state these values; the defaults are those of the paper.
         name: name of the dataset; by default that of the folder.
         workers, dask: as for ``build_dataset``.
-        strict: whether to refuse the build if a field must be skipped.
+        strict: whether to build nothing if a field must be skipped.
 
     Raises:
-        InputError: the folder has no scales or no complete pair, or pitch or heights are not positive.
+        InputError: the folder has no file of full scales or no complete pair, or the pitch or the level
+            height is not positive.
     """
     root = Path(folder).resolve()
     scales = read_full_scales(root / SCALES_FILE)
@@ -96,7 +100,8 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """The job that stitches one field; ``quadrants`` maps each quadrant to the name of its files.
+    """A job that joins the quadrants of one field. ``quadrants`` maps the number of each quadrant to the name
+    that its layout file and its height file share.
 
     A field that is not divided has only the quadrant 0.
     """
@@ -123,7 +128,7 @@ class PairsJob:
         return record_sha256([plan, {name: file_sha256(path) for name, path in self.files.items()}])
 
     def run(self) -> Piece:
-        """Return the stitched field as a piece of a store."""
+        """Return the field, joined from its quadrants, as a piece of a store."""
         chain = Chain()
         chain.run("stitch-pairs", self._params, self.files)
         return chain.piece(
@@ -147,7 +152,7 @@ class PairsJob:
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Return the file names by field and quadrant, and the unpaired files, each with the reason."""
+    """Return the file names by field and quadrant, and the unusable files, each with the reason."""
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
     unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
@@ -181,7 +186,8 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; return a note on each scan that loses negative heights or gaps.
+    """Write a store in the pair format. Return a note on each scan whose negative heights or unmeasured
+    pixels the format cannot represent.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 

@@ -11,7 +11,7 @@ from litho_data.foundation import InputError, atomic_file, file_sha256
 from litho_data.foundation.begun import whole_folder
 from litho_data.store.read import Store, open_store
 
-# Zip needs a time for every file. With a fixed time, the same store always gives the same archive.
+# A zip archive states a time for every file. With a fixed time, the same store always gives the same archive.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"

@@ -1,4 +1,4 @@
-"""Rules for commands that write a folder: how they declare, begin, continue and finish the result.
+"""Rules for commands that write a folder: how they declare, begin, continue and finish the result in it.
 
 A command first declares its result: the name of its record file, which is written last, and the fields of
 this record that determine the result. The folder is then in one of four states:
@@ -8,11 +8,11 @@ state      content of the folder                    what the command does
 =========  =======================================  ==========================================================
 free       missing or empty                         begins the result
 begun      ``begun.json``, written before all else  continues it, if record and fields are the same
-finished   the record                               makes it again or continues it, if both are the same
+finished   the record                               repeats or continues it, if record and fields are the same
 other      anything else                            refuses, and changes nothing
 =========  =======================================  ==========================================================
 
-A command that is stopped after any of its writes and then run again ends with the same result.
+A command may be stopped after any of its writes. If it is then run again, it ends with the same result.
 """
 
 import json
@@ -47,14 +47,15 @@ class Begun:
 def growing_folder(
     out: str | Path, record: str, facts: Facts | None = None, *, holds: str = ""
 ) -> Iterator[Begun]:
-    """Yield a folder whose files appear as they are finished, so that a stopped run can resume.
+    """Yield a folder to which the files of a result are added one by one, so that a stopped run can resume.
 
     Other files in a folder that contains this result are left alone. Only one process at a time writes the
     folder.
 
     Args:
         out: the folder; it is created if it is missing.
-        record: name of the record file of a finished result, such as ``run.json``. The block writes it last.
+        record: name of the record file of a finished result, such as ``run.json``. The ``with`` block writes
+            this file last.
         facts: fields of the record that determine the result; a folder whose record has other values is
             refused.
         holds: names of files that the folder may contain before the result is begun, such as designs that
@@ -62,7 +63,8 @@ def growing_folder(
 
     Raises:
         InputError: ``out`` is a file, contains something else, contains a result with other facts, is being
-            written by another process, or cannot be written. It is raised before the block begins.
+            written by another process, or cannot be written. The error is raised before the ``with`` block
+            begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)

@@ -1,4 +1,4 @@
-"""The one exception whose message is written for users."""
+"""InputError, the one exception whose message is written for users, and helpers that raise it."""
 
 import difflib
 from collections.abc import Iterable, Iterator
@@ -39,11 +39,12 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Guard a block that reads a file written by a program, because somebody may have edited the file.
+    """Report any error that the content of a file causes in this block as damage of the file. Use it for
+    files that a program wrote, because somebody may have edited them.
 
     Raises:
-        InputError: it replaces any error that the content causes, such as a missing key, text instead of a
-            number, or invalid JSON.
+        InputError: the content of the file causes an error, such as a missing key, text instead of a number,
+            or invalid JSON.
     """
     try:
         yield
@@ -79,7 +80,7 @@ def unknown_name(
 
     Args:
         what: what the name stands for.
-        got: the unknown name; ``known``: all known names.
+        got: the unknown name. ``known`` are all known names.
         hint: what to suggest if no known name is similar.
         also: what else could have been given instead of a name, such as "an image file".
     """

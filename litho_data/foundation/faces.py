@@ -13,7 +13,8 @@ from typing import Any
 _DISTRIBUTION = "litholoop"
 # litho_data does not need torch; if torch is missing, the extras `models` and `design` are missing too.
 _OF_EXTRAS = "torch"
-# The first is for GNU's OpenMP, the second for Intel's.
+# With these environment variables, waiting threads sleep. The first is for GNU's OpenMP, the second for
+# Intel's.
 _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 
 
@@ -21,8 +22,8 @@ def let_waiting_threads_sleep() -> None:
     """Let waiting threads of torch sleep; call this before torch is loaded. Otherwise threads spin while they
     wait for one another.
 
-    Next to one busy process, two spinning threads take ten times as long. Environment variables that are
-    already set are not changed.
+    If another process keeps a processor busy, a computation with two spinning threads takes ten times as
+    long. Environment variables that are already set are not changed.
     """
     for variable, value in _SLEEP.items():
         os.environ.setdefault(variable, value)
@@ -31,8 +32,8 @@ def let_waiting_threads_sleep() -> None:
 def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
-    Use it in a package's ``__init__``. Type checkers follow the imports of the file, while Python reads only
-    their names::
+    Use it in a package's ``__init__``. Type checkers follow the imports in this file. At run time the imports
+    are not executed; only their names are read::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan
@@ -40,8 +41,8 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)
 
     Args:
-        package: ``__name__`` of the package. No public name may equal the name of one of its subpackages or
-            modules, because importing a subpackage or module binds that name.
+        package: ``__name__`` of the package. No public name may equal the name of a subpackage or module of
+            the package, because importing the subpackage or module would bind that name to it.
         file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
     ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.

@@ -17,8 +17,8 @@ from litho_data.foundation.errors import InputError
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with its suffix; the file replaces ``path`` only if the block
-    succeeds.
+    """Yield a temporary path beside ``path``, with the same suffix. The file that the block writes there
+    replaces ``path`` only if the block succeeds.
 
     Raises:
         InputError: ``path`` is a folder, or cannot be written.
@@ -45,7 +45,8 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
-    """Yield an empty folder that replaces ``path`` if the block succeeds; an older folder stays until then.
+    """Yield an empty folder that replaces ``path`` if the block succeeds. An older folder at ``path`` stays
+    until then.
 
     For a path that a user chose, use ``litho_data.foundation.begun.whole_folder`` instead.
 
@@ -86,7 +87,7 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
             try:
                 work.mkdir(parents=True, exist_ok=True)
             except FileExistsError:
-                # The last holder of the lock may have removed the folder between these two checks.
+                # The last holder of the lock may have removed the folder since ``mkdir`` found it.
                 if work.exists() and not work.is_dir():
                     raise
                 continue
@@ -194,7 +195,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
 
 
 def table_beside(module: str, name: str) -> dict[str, Any]:
-    """Read the TOML table beside a module."""
+    """Read the TOML file ``name`` that lies beside a module."""
     return tomllib.loads(Path(module).with_name(name).read_text(encoding="utf-8"))
 
 

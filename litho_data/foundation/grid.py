@@ -1,4 +1,4 @@
-"""The sampling geometry that belongs to every array: one type for all three packages."""
+"""The pixel grid of an array (shape, pitch and origin), as all three packages use it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class PixelGrid:
     """A rectangular grid of square or rectangular pixels, with row 0 at the top.
 
     Args:
-        shape: numbers of pixels, (ny, nx).
+        shape: number of rows and number of columns, (ny, nx).
         pitch_um: distances between pixel centres along y and along x, µm.
-        origin_um: position (y, x) of the top-left *corner* of pixel (0, 0), µm; a pixel centre therefore lies
-            at ``origin + (i + 0.5) * pitch``.
+        origin_um: position (y, x) of the top-left *corner* of pixel (0, 0), µm; the centre of row or column i
+            therefore lies at ``origin + (i + 0.5) * pitch``.
 
     Raises:
-        InputError: the grid is smaller than one pixel, or the pitch is impossible.
+        InputError: the grid is smaller than one pixel, or the pitch is out of range.
     """
 
     shape: tuple[int, int]
@@ -36,20 +36,20 @@ class PixelGrid:
 
     @classmethod
     def square(cls, shape: tuple[int, int], pitch_um: float) -> PixelGrid:
-        """Make a grid of square pixels with its corner at the origin."""
+        """Make a grid of square pixels whose top-left corner lies at the origin."""
         return cls((int(shape[0]), int(shape[1])), (float(pitch_um), float(pitch_um)))
 
     @property
     def size_um(self) -> YX:
-        """Return the (y, x) extent from edge to edge, µm."""
+        """Return the extent of the grid along y and along x, from edge to edge, in µm."""
         return self.shape[0] * self.pitch_um[0], self.shape[1] * self.pitch_um[1]
 
     @property
     def y_um(self) -> Array:
-        """Return the row centres, shape (ny,), µm."""
+        """Return the y coordinates of the row centres in µm, shape (ny,)."""
         return self.origin_um[0] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um[0]
 
     @property
     def x_um(self) -> Array:
-        """Return the column centres, shape (nx,), µm."""
+        """Return the x coordinates of the column centres in µm, shape (nx,)."""
         return self.origin_um[1] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um[1]

@@ -23,8 +23,8 @@ def file_sha256(path: str | Path) -> str:
 
 
 def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
-    """Return the hash of a decoded array: its type, shape, values, unit and dimension names, but not its
-    chunks.
+    """Return the hash of an array as it is after decoding. The hash covers the type, shape, values, unit and
+    dimension names, but not the division into chunks.
 
     Args:
         array: any numeric or boolean array; every NaN counts as the same NaN.

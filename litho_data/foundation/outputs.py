@@ -45,7 +45,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose record (of a finished or a begun result) has other facts than these."""
+    """Refuse a folder whose record, of a finished or a begun result, states other facts than ``facts``."""
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
@@ -74,8 +74,8 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     """Accept a free path, an empty folder, or a folder with the same kind of result, whose record file is
     ``record``.
 
-    A file counts as the record of a result if its name matches the kind of its schema: ``close_loop.json``
-    matches the schema ``litho-models/close-loop/1``.
+    A file counts as the record of a result if its name matches the kind of result in its schema:
+    ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
 
     Args:
         path: where the result will be; other files in a folder that holds this result are left alone.
@@ -83,7 +83,7 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
         begun: names, or patterns of names, of files that an interrupted run of the same kind leaves.
 
     Raises:
-        InputError: the path is a file, or the folder contains another result or anything else.
+        InputError: the path is a file, or the folder contains the result of another command or anything else.
     """
     folder = Path(path)
     _refuse_a_file(folder)

@@ -34,7 +34,7 @@ class Range:
         """Refuse values that are not numbers or are out of range.
 
         Raises:
-            InputError: some value is refused; the message shows the first one.
+            InputError: a value is not a number or is out of range. The message shows the first such value.
         """
         wrong = [one for one in np.ravel(np.asarray(values, dtype=object)) if not self.holds(one)]
         if wrong:

@@ -11,15 +11,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, parsed
 
-# An unexpected value may have any size and be nested to any depth.
+# Messages show unexpected values in short form, because they may have any size and be nested to any depth.
 _SHORT = reprlib.Repr()
 _LONGEST = 40
 _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """A frozen part of a result. Unknown keys are errors, except for the keys in ``FORMER``, which occur only
-    in older files.
+    """An immutable part of a result. Unknown keys are errors, except for the keys in ``FORMER``, which occur
+    only in older files and are ignored.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()

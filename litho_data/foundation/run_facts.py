@@ -26,7 +26,7 @@ class RunFacts(Record):
     """The command line and the code that made a result.
 
     ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
-    commit. ``dirty`` is None without a checkout, and in older result files.
+    commit. It is None if the code did not run from a Git checkout, and in older result files.
     """
 
     command: str = ""
@@ -67,8 +67,8 @@ def running_command(command: str) -> Iterator[None]:
 
 
 def software_record() -> dict[str, Any]:
-    """Return which software runs: ``versions`` of packages, BLAS and plug-ins, and the ``commit`` and
-    ``dirty`` state.
+    """Return the software of this process: the ``versions`` of packages, BLAS library and plug-ins, and the
+    ``commit`` and ``dirty`` state of the checkout.
     """
     software = _software()
     return {**software, "versions": {**software["versions"], **plugin_versions()}}
@@ -91,7 +91,7 @@ def checkout_state(folder: Path) -> dict[str, Any]:
     """Return the ``commit`` of a checkout and whether it is ``dirty``, that is, whether any file of the
     packages is changed or untracked.
 
-    Both values are None without a checkout, as for an installed wheel.
+    Both values are None if the folder is not a Git checkout, as for an installed wheel.
     """
     if not (folder / ".git").exists():
         return {"commit": None, "dirty": None}

@@ -1,4 +1,4 @@
-"""Convert the known units of length that files use, and refuse all others."""
+"""Convert the units of length that files use to µm, and refuse unknown units."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Make random layouts (by the paper's equation) and calibration patterns; compute statistics of sets."""
+"""Make random layouts (by the paper's equation) and calibration patterns; compute statistics of layouts."""
 
 from litho_data.layouts.layout_set import PATTERNS, write_layout_set
 from litho_data.layouts.patterns import (

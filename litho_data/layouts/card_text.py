@@ -32,11 +32,12 @@ def write_card(
 
     Args:
         folder: folder in which the card is written.
-        name: name of the dataset; ``title``: a title of one line.
-        pitch_um: pitch of the layouts, µm; ``level_height_um``: nominal height of a level, µm; ``levels``:
-            number of levels.
-        scan_size_um: (y, x) extent of a scan, µm; ``scan_format``: format of the microscope's files.
-        levelled: whether a build uses the heights of the files without levelling them.
+        name: name of the dataset. ``title`` is its title, on one line.
+        pitch_um: pixel pitch of the layouts, µm. ``level_height_um`` is the nominal height of a level, µm,
+            and ``levels`` is the number of levels.
+        scan_size_um: extent of a scan along y and x, µm. ``scan_format`` is the format of the microscope's
+            files.
+        levelled: whether a build uses the heights in the scan files without levelling them.
         tables: further tables of the card, such as ``ids`` and ``write``; values that are None are omitted.
 
     Raises:
@@ -90,7 +91,7 @@ def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
 
 
 def write_table(folder: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
-    """Write the table of the card."""
+    """Write the CSV table to which the card refers."""
     path = folder / TABLE_NAME
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

@@ -1,4 +1,6 @@
-"""Make sets of random layouts or calibration patterns for the printer, with card, table and report."""
+"""Make sets of random layouts or calibration patterns for a printer, with a dataset card, a table and a
+report.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -25,14 +27,14 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# With this width, an even strip of 1 µm remains between two edges, because the printer blurs each edge over
-# 1 µm.
+# Width of a step of a framed ladder. The printer blurs each edge over 1 µm, so a flat strip of 1 µm remains
+# between two edges.
 _TREAD_UM = 3.0
 
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, its relative dose, and the purpose of its scan."""
+    """One layout with its id, its relative dose, and the use of its scan (see the card's table)."""
 
     id: str
     level: Array
@@ -75,7 +77,7 @@ def write_layout_set(
     quantiser: str = "round",
     field_px: int | None = None,
 ) -> Path:
-    """Write a set of layouts into ``out``; return the path of its card.
+    """Write a set of layouts into the folder ``out``, and return the path of the set's dataset card.
 
     The folder contains `card.toml`, `scans.csv`, ``layouts/*.tif``, `layouts.json` and a report with the
     set's statistics. The card names the folder ``scans/`` in which the measured scans are expected.
@@ -83,15 +85,15 @@ def write_layout_set(
     Args:
         pattern: a key of `PATTERNS`.
         count: number of random layouts, or number of doses of a dose matrix.
-        size_px: side of a layout in pixels, or (ny, nx).
+        size_px: side length of a square layout in pixels, or its shape (ny, nx).
         levels: number of levels.
-        cutoff_per_um: cut-off of random layouts, cycles/µm.
-        passband: ``square`` or ``round``.
+        cutoff_per_um: cut-off frequency of the low-pass filter that makes random layouts, cycles/µm.
+        passband: pass band of this filter, ``square`` or ``round``.
         pitch_um: pixel pitch, µm.
         level_height_um: nominal height of a level, µm.
         seed: seed of every random draw.
-        quantiser: ``round`` or ``floor``; ``field_px``: side of a larger field from which random layouts are
-            cut; for both, see ``random_layout``.
+        quantiser: rounding to whole levels, ``round`` or ``floor``. ``field_px`` is the side length of a
+            larger field from which random layouts are cut. For both, see ``random_layout``.
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
@@ -183,7 +185,8 @@ def _features(settings: SetSettings, feature: int, ground: int) -> Array:
 
 
 def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
-    # The cut-off is twice that of the settings, because a finer frame determines the scale better.
+    # The frame has twice the cut-off frequency of the settings, because finer structure determines the
+    # lateral scale better.
     frame = random_layout(
         settings.shape,
         levels=settings.levels,

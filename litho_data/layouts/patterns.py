@@ -1,6 +1,7 @@
 """Draw calibration patterns, whose prints measure one property at a time.
 
-All pattern functions return levels (ny, nx) in the smallest unsigned type; lengths are in whole pixels.
+All pattern functions return an array of levels, shape (ny, nx), in the smallest unsigned type. Lengths are in
+whole pixels.
 """
 
 from collections.abc import Sequence
@@ -11,12 +12,14 @@ from litho_data.foundation import Array, InputError, Shape, require_known
 
 
 def flat(shape: Shape, *, level: int) -> Array:
-    """Draw the same level everywhere, to measure roughness, vignetting and flatness."""
+    """Draw a layout with the same level everywhere, to measure roughness, vignetting and flatness."""
     return np.full(shape, level, np.min_scalar_type(level))
 
 
 def step_ladder(shape: Shape, *, highest: int) -> Array:
-    """Draw stairs of equal width along x, from level 0 to ``highest``, to measure height against level."""
+    """Draw stairs along x, with one step for each level from 0 to ``highest``, to measure how the height
+    depends on the level. All steps have about the same width.
+    """
     _positive(highest, "highest level of a step ladder")
     steps = highest + 1
     if shape[1] < steps:
@@ -26,15 +29,16 @@ def step_ladder(shape: Shape, *, highest: int) -> Array:
 
 
 def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0) -> Array:
-    """Draw stairs along x inside a registration frame, to measure height and roughness against level.
+    """Draw stairs along x inside a registration frame, to measure how height and roughness depend on the
+    level.
 
     A ladder alone looks the same after a shift along its edges, so a scan of it cannot be registered. The
     frame, whose width is a fifth of the side, makes registration possible. The stairs rise evenly from
-    ``lowest`` to ``highest``, with a step for every level if there is room.
+    ``lowest`` to ``highest``, with one step for each level if the width allows it.
 
     Args:
-        frame: layout (ny, nx) without a periodic pattern.
-        highest: level of the last step; ``lowest``: level of the first one.
+        frame: layout of shape (ny, nx) that has no periodic pattern. The stairs replace its middle.
+        highest: level of the last step. ``lowest`` is the level of the first step.
         tread_px: smallest width of a step; at least 3 steps must fit.
     """
     inset_y, inset_x = (size // 5 for size in frame.shape)
@@ -53,7 +57,8 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
 
 
 def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Array:
-    """Draw squares of ``cell_px`` pixels, to measure lateral scale, shear and corners.
+    """Draw a checkerboard of squares whose sides are ``cell_px`` pixels long, to measure lateral scale, shear
+    and the rounding of corners.
 
     The square at the top left has the level ``high``.
     """
@@ -65,13 +70,15 @@ def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Arra
 def line_space_sweep(
     shape: Shape, *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
 ) -> Array:
-    """Draw lines, each followed by a space of the same width, to measure resolution against line width.
+    """Draw lines, each followed by a space of the same width, to measure how the print's resolution depends
+    on the line width.
 
     Each line is one pixel wider than the line before.
 
     Args:
         narrowest_px: width of the first line.
-        along: axis to which the lines are parallel: ``y`` (they follow each other along x) or ``x``.
+        along: axis to which the lines are parallel, ``y`` or ``x``. Lines parallel to y follow each other
+            along x.
     """
     _positive(narrowest_px, "narrowest_px of a line/space sweep")
     require_known("direction of the lines", along, ("x", "y"))
@@ -85,23 +92,26 @@ def line_space_sweep(
 
 
 def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
-    """Draw a Siemens star of ``spokes`` wedges around the centre, to measure resolution against direction.
+    """Draw a Siemens star of ``spokes`` wedges around the centre, to measure how the resolution depends on
+    the direction.
 
     The wedges are as wide as the gaps between them.
     """
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
-    # After a rotation by half a wedge, no edge of a wedge lies on an axis of the grid.
+    # The star is turned by half a wedge, so that no edge of a wedge lies on an axis of the grid.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
     return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.min_scalar_type(high))
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
-    """Draw isolated squares of these widths, to measure the spot, shrinkage and collapse of single features.
+    """Draw isolated squares of the given widths, to measure the size of the printer's spot, and the shrinkage
+    and collapse of single features.
 
-    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. Each cell of a square array
-    contains one square, in reading order. The space between two squares is at least twice the larger width.
+    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. The layout is divided into a
+    square array of cells. In reading order, each cell contains one square in its middle. The space between
+    two squares is at least twice the larger width.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)

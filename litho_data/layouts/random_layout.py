@@ -23,33 +23,36 @@ def random_layout(
     quantiser: str = "round",
     field_px: int | None = None,
 ) -> Array:
-    """Make one random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
+    """Make one random layout ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` by low-pass filtering noise ``R ~ U(0, 1)``.
 
-    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds to the nearest of ``levels``
-    values (halves are rounded up). The result is periodic in both directions. The paper does not define the
-    low-pass filter. The measured layouts show a sharp square pass band of ±0.25 cycles/µm (prints 1–4) or
-    ±0.5 cycles/µm (prints 6 and 7). These layouts were cut from a larger field, and their levels were rounded
-    down; ``quantiser="floor", field_px=540`` makes similar layouts.
+    ``F`` is the Fourier transform, and ``LPF`` is a low-pass filter. ``norm`` maps the smallest value to 0
+    and the largest to 1, and ``Q`` rounds to the nearest of ``levels`` values (halves are rounded up). The
+    result is periodic in both directions.
+
+    The paper does not define the low-pass filter. The measured layouts show a sharp square pass band of ±0.25
+    cycles/µm (prints 1–4) or ±0.5 cycles/µm (prints 6 and 7). These layouts were cut from a larger field, and
+    their levels were rounded down; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
         shape: (ny, nx), pixels.
         levels: number of levels L; the result contains integers 0…L−1.
         cutoff_per_um: highest spatial frequency that the filter passes, cycles/µm.
         pitch_um: pixel pitch, µm.
-        seed: anything that `numpy.random.default_rng` accepts.
-        passband: ``square`` limits the frequency along each axis; ``round`` limits the length of the
-            frequency vector.
+        seed: seed of the noise, as `numpy.random.default_rng` accepts it.
+        passband: ``square`` limits the frequency along each axis separately. ``round`` limits the length of
+            the frequency vector.
         quantiser: ``round`` rounds as in the paper's equation; ``floor`` rounds down, so only the largest
             value gets the highest level.
-        field_px: side, in pixels, of a larger field from whose middle the layout is cut. Such a layout is not
-            periodic and may lack the lowest or the highest level. If None, the layout is the whole field.
+        field_px: side length, in pixels, of a larger field from whose middle the layout is cut. Such a layout
+            is not periodic and may lack the lowest or the highest level. If None, the layout is the whole
+            field.
 
     Returns:
-        uint8 (beyond 256 levels uint16), shape (ny, nx).
+        The level of each pixel, shape (ny, nx), as uint8, or as uint16 if there are more than 256 levels.
 
     Raises:
-        InputError: there are fewer than 2 or more than 65536 levels, the cut-off is too high for the pitch or
-            passes only the mean, or the field is smaller than the layout.
+        InputError: there are fewer than 2 or more than 65536 levels, the cut-off frequency is too high for
+            the pitch or so low that only the mean passes, or the field is smaller than the layout.
     """
     LEVELS.require("levels of a layout", levels)
     whole = shape if field_px is None else (field_px, field_px)
@@ -98,7 +101,9 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
 
 
 def quantise(unit_field: Array, levels: int, quantiser: str = "round") -> Array:
-    """Map values in [0, 1] to ``levels`` integers, rounded to the nearest (halves up) or down (``floor``)."""
+    """Map values from 0 to 1 to the integers 0 to ``levels - 1``. The quantiser ``round`` rounds to the
+    nearest integer (halves up), and ``floor`` rounds down.
+    """
     require_known("quantiser", quantiser, QUANTISERS)
     whole = np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round"))
     return whole.astype(np.min_scalar_type(levels - 1))

@@ -19,10 +19,12 @@ class LayoutStatistics(Result):
     """Pooled statistics of a set of layouts.
 
     Args:
-        level_share: share of the pixels at each level; the shares sum to 1.
-        jump_share: share of neighbouring pixel pairs (along x and y) that differ by 0, 1, 2 … levels.
+        level_share: share of the pixels that have each level; the shares sum to 1.
+        jump_share: share of the pairs of neighbouring pixels (along x and y) whose levels differ by 0, 1, 2
+            …; the shares sum to 1.
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
-        power_share: share of the power (without the mean level) in each bin; the shares sum to 1.
+        power_share: share of the spectral power (without that of the mean level) in each bin; the shares sum
+            to 1.
         settings: settings of the set if ``write_layout_set`` made it, otherwise None.
     """
 
@@ -43,7 +45,7 @@ def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um:
     """Compute the pooled statistics of layouts, reading one layout at a time.
 
     Args:
-        layouts: levels (ny, nx), or paths of layout files.
+        layouts: arrays of levels, each of shape (ny, nx), or paths of layout files.
         levels: number of levels L.
         pitch_um: pixel pitch, µm.
 
@@ -89,7 +91,7 @@ def _checked(layout: Array | Path, levels: int) -> Array:
 
 
 def _radial_power(level: Array, pitch_um: float) -> Array:
-    """Return the power about the mean in radial frequency bins, normalised for each layout.
+    """Return the spectral power of a layout about its mean in radial frequency bins. The values sum to 1.
 
     The bins extend to the Nyquist frequency of the axes; the last bin includes all higher frequencies.
     """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 4
-# Lower limit of the logarithmic axes. Smaller shares are only rounding errors.
+# Lower limit of the logarithmic axes. Shares below this limit are only rounding errors.
 _LEAST_SHARE = 1e-6
 
 
@@ -42,19 +42,29 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     of_jumps.set(xlabel="jump between neighbours, levels", ylabel="share of pairs", **shares)
     of_power.step(statistics.frequency_per_um, statistics.power_share, where="mid")
     of_power.set(xlabel="spatial frequency, cycles/µm", ylabel="share of power", **shares)
-    page.figure(graphs, "Statistics of all layouts together.")
+    page.figure(
+        graphs,
+        "All layouts together: shares of the levels, jumps between neighbouring pixels, and power spectrum.",
+    )
     page.heading("In numbers", folded=True)
     numbers = {
         "level or jump": levels,
         "share of pixels": statistics.level_share,
         "share of pairs": statistics.jump_share,
     }
-    page.table(numbers, "Shares of levels and of jumps.", "levels.csv", digits=4)
+    page.table(
+        numbers,
+        "Share of pixels at each level, and share of neighbouring pairs with each jump between levels.",
+        "levels.csv",
+        digits=4,
+    )
     return page
 
 
 def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
-    """Draw layouts (ny, nx) side by side, with titles from the keys and one colour scale for all levels."""
+    """Draw layouts side by side, each an array of shape (ny, nx). The keys of ``levels`` are the titles, and
+    all layouts have the same colour scale.
+    """
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):
         axes = figure.add_subplot(1, len(levels), place)

@@ -1,4 +1,4 @@
-"""Level scans; every levelling operation returns the levelled map and the surface that it removed."""
+"""Level scans. Every levelling operation returns the levelled map and the surface that it removed."""
 
 from litho_data.level.features import mark_features, mask_and_relevel
 from litho_data.level.layout_aware import layout_in_scan_frame, level_layout_aware

@@ -1,4 +1,4 @@
-"""Mark features that levelling must not follow, and alternate between levelling and marking."""
+"""Mark features that levelling must not follow, such as particles or structures, and level without them."""
 
 from typing import Annotated, Literal
 
@@ -22,7 +22,7 @@ Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
 Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
-# If less than this share of the pixels remains, the background is unreliable.
+# If less than this share of the selected pixels is background, the fitted background is unreliable.
 _LEAST_BACKGROUND = 0.02
 
 
@@ -38,15 +38,17 @@ def mark_features(
     """Mark the pixels whose distance from the main surface exceeds ``threshold`` times the noise sigma.
 
     The main surface is the median of the selected pixels, and the noise sigma is 1.4826 · MAD, so features
-    must be a minority. Measured pixels that were not selected are marked too, so the result contains all
-    pixels that later steps should exclude.
+    must be a minority. Measured pixels that were not selected are marked too, so the mask contains all pixels
+    that later steps should exclude.
 
     Args:
-        z: (ny, nx), any unit, already levelled.
-        grow_px: the marked area is widened by this many pixels, to cover blurred edges.
+        z: heights in any unit, already levelled, shape (ny, nx).
+        threshold: distance above which a pixel is marked, in units of the noise sigma.
+        side: whether to mark pixels above the main surface, below it, or on both sides.
+        grow_px: number of pixels by which the marked areas are widened, to cover blurred edges.
 
     Returns:
-        bool (ny, nx).
+        A bool array of shape (ny, nx).
 
     Raises:
         InputError: the threshold is not positive, the side is unknown, or ``grow_px`` is negative.
@@ -70,16 +72,17 @@ def mask_and_relevel(
 ) -> MaskedLevelling:
     """Level, mark the features, and level again without them, until the marks no longer change.
 
-    The first background is a robust fit (Tukey); the later ones are least-squares fits to the unmarked
-    pixels. The background is subtracted with its constant, so that the main surface lies at zero. The
-    returned mask marks the same pixels as ``mark_features``.
+    The first background is a robust polynomial fit (Tukey's biweight). The later backgrounds are
+    least-squares fits to the unmarked pixels. The background is subtracted with its constant term, so that
+    the main surface lies at zero. The returned mask marks the same pixels as ``mark_features``.
 
     Raises:
         InputError: a parameter is outside its range, or the features leave too few background pixels.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     surface = robust_surface(z, chosen, terms)
-    # The noise is estimated only once. Estimated over the unmarked pixels, it would shrink in every round.
+    # The noise is estimated only once. If it were estimated over the unmarked pixels, it would shrink in
+    # every round.
     limit = threshold * noise_sigma((z - surface)[chosen])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):

@@ -18,8 +18,8 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# If the ratio of the smallest to the largest eigenvalue is below this, noise and rounding in double precision
-# prevent the separation of background and structure.
+# If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this limit, noise and
+# rounding in double precision prevent the separation of background and structure.
 _SINGULAR = 1e-9
 _ROWS_AT_ONCE = 64
 _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
@@ -39,23 +39,23 @@ def level_layout_aware(
 ) -> Levelled:
     """Fit the background and the printed structure together, and subtract only the background.
 
-    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
-    response with one knot per level. A plain fit would count the structure's own slope as background. The
-    datum is part of g, so the subtracted polynomial has no free constant: its mean over the fitted pixels is
-    zero.
+    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a piecewise linear
+    function, fitted freely, with one knot per level. A polynomial fit without g would count the slope of the
+    printed structure as background. The datum (the unknown zero height of the scan) is part of g. The
+    subtracted polynomial therefore has no free constant term, and its mean over the fitted pixels is zero.
 
     Args:
-        z: (ny, nx), any unit.
-        layout_level: (ny, nx) level of each pixel in the scan's frame, NaN outside the layout; see
-            ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing; by default, a few values are tried
-            and the best one is used. Pixels within two sigma of the layout's edge are not fitted, because
-            their height depends on what surrounds the layout.
+        z: heights in any unit, shape (ny, nx).
+        layout_level: level of the layout under each pixel of the scan, shape (ny, nx), NaN outside the
+            layout; see ``layout_in_scan_frame``.
+        blur_px: sigma, in pixels, of the Gaussian that blurs the layout as printing does. By default, a few
+            values are tried and the best one is used. Pixels within two sigma of the layout's edge are not
+            fitted, because their height depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
-        InputError: the layout has another shape, does not overlap with the scan, or cannot be separated from
-            the background because it looks like one, as a ramp does.
+        InputError: the layout has another shape than the scan, does not overlap with it, or cannot be
+            separated from the background because it looks like a background, as a ramp does.
     """
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
@@ -78,7 +78,9 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the known pixels except a border beside unknown ones; if few remain, select all known pixels."""
+    """Select the known pixels except those within ``border_px`` of unknown pixels. If this leaves too few,
+    select all known pixels.
+    """
     if known.all():
         return known
     inner = ndimage.distance_transform_edt(known) > border_px
@@ -93,16 +95,16 @@ def layout_in_scan_frame(
     layout_pitch_um: float,
     bend_um: Bend | None = None,
 ) -> Array:
-    """Return the level of the layout pixel under each scan pixel; NaN outside the layout.
+    """Return the level of the layout pixel under each pixel of a scan; NaN outside the layout.
 
     Args:
-        layout_level: (ny, nx) levels.
+        layout_level: levels of the layout, shape (ny, nx).
         scan_to_layout: 3 x 3 matrix that maps (x_um, y_um, 1) from the scan's frame to the layout's.
         bend_um: bend of the scan, which is removed before ``scan_to_layout`` is applied.
 
     Returns:
-        float64 of ``scan_shape``, from the nearest layout pixel, because levels are labels and must not be
-            interpolated.
+        A float64 array of shape ``scan_shape``. Each value is that of the nearest layout pixel, because
+        levels are labels and must not be interpolated.
     """
     points_um = lattice(
         *((np.arange(n) + 0.5) * pitch for n, pitch in zip(scan_shape, scan_pitch_um, strict=True))
@@ -117,7 +119,9 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Return the background's Legendre coefficients, and the negative of the explained sum of squares."""
+    """Fit background and structure together. Return the background's Legendre coefficients, and the negative
+    of the sum of squares that the fit explains.
+    """
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]
@@ -137,7 +141,9 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
 
 
 def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, Array]:
-    """Sum the normal equations over strips of rows, so that the whole design matrix is never in memory."""
+    """Sum the normal equations of the joint fit over strips of rows, so that the whole design matrix is never
+    in memory.
+    """
     x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))
     basis_y = np.polynomial.legendre.legvander(y, max(q for _, q in terms))

@@ -1,4 +1,6 @@
-"""Define the operations of recipes: functions whose signatures state the parameters, defaults and limits."""
+"""Define the operations of levelling recipes: functions whose signatures state their parameters, defaults and
+limits.
+"""
 
 import inspect
 from collections.abc import Callable
@@ -15,13 +17,16 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The steps that a recipe can contain, by the name of the operation."""
-# Arguments that come with the scan and are therefore not settings, with their names in messages.
+# Arguments whose values come with the scan and are therefore not settings of a step, and how messages name
+# them.
 _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state between steps: heights (µm), the current mask, and pitch and layout if known."""
+    """The state between two steps of a recipe: the heights (µm), the current mask, and the pitch and the
+    layout if they are known.
+    """
 
     height_um: Array
     mask: Array | None
@@ -32,21 +37,21 @@ class State:
 class Step(BaseModel):
     """Base class of all steps; the fields of a step are the arguments of its operation.
 
-    ``masking`` says how the current mask is used. The current mask is the scan's mask until a step marks
-    pixels; then it is the mask of the last step that marked pixels.
+    ``masking`` says how the current mask is used. The current mask is the one that the last step made that
+    marked pixels. Before any such step, it is the scan's mask.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # The arguments that come with the scan, and whether each is optional.
+    # The arguments whose values come with the scan, and whether each is optional.
     of_scan: ClassVar[dict[str, bool]]
 
     op: str
     masking: Masking = "exclude"
 
     def run(self, state: State) -> State:
-        """Return the state after the step, with the levelled map, the new mask, or both."""
+        """Return the state after the step, in which the heights, the mask, or both have changed."""
         arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
         for name, optional in self.of_scan.items():
             arguments[name] = getattr(state, name)
@@ -60,11 +65,13 @@ class Step(BaseModel):
 
 
 def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Return a decorator that registers a function of heights and usable pixels as the operation ``op``.
+    """Return a decorator that registers a function of heights and usable pixels as the recipe operation
+    ``op``.
 
-    The function receives heights, float64 (ny, nx), and usable pixels, bool (ny, nx). Callers pass a map of
-    any type, a ``mask`` and ``masking``; see ``select``. Keyword arguments of the function become fields of
-    the step and are checked at every call, except for those that come with the scan. The function returns a
+    The function receives two arrays of shape (ny, nx): the heights (float64), and which pixels are usable
+    (bool). Callers of the decorated function pass a height map of any type, a ``mask`` and ``masking``, from
+    which ``select`` determines the usable pixels. Keyword arguments of the function become fields of the step
+    and are checked at every call, except for those that come with the scan. The function returns a
     ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
     """
 

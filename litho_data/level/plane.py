@@ -1,4 +1,6 @@
-"""Remove tilt, by a plane fit or by the prevailing facet, and set the zero, as Gwyddion does."""
+"""Remove the tilt of a scan, given by a fitted plane or by the prevailing facet, and set the zero height, as
+Gwyddion does.
+"""
 
 from collections.abc import Callable
 
@@ -14,10 +16,12 @@ _FEWEST_CELLS = 4
 
 @operation("plane")
 def level_plane(z: Array, chosen: Array) -> Levelled:
-    """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) does not change.
+    """Subtract the tilt of the least-squares plane. The height at the pivot (column nx/2, row ny/2) does not
+    change.
 
-    As in Gwyddion, the fitted constant is replaced by -(bx nx + by ny) / 2, where the slopes bx and by are in
-    height per pixel. The mean therefore changes by (bx + by) / 2.
+    As in Gwyddion, the fitted constant of the plane is replaced by -(bx nx + by ny) / 2, where bx and by are
+    the slopes of the plane in height per pixel. The mean height of the scan therefore changes by (bx + by) /
+    2.
 
     Raises:
         InputError: the selected pixels do not determine a plane. (Gwyddion removes nothing in this case.)
@@ -30,15 +34,18 @@ def level_plane(z: Array, chosen: Array) -> Levelled:
 
 @operation("facet")
 def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
-    """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) does not change.
+    """Subtract the tilt of the prevailing facet. The height at the pivot (column nx/2, row ny/2) does not
+    change.
 
-    ``prevailing_slope`` is applied to the slopes of all 2 x 2 cells whose four pixels are selected, with s² =
-    mean |v|² / 20. The iteration ends when the change is below sqrt(1e-9), the limit of Gwyddion 2.62. (With
-    the limit of version 2.45, 1e-8, the result differs by 2e-3 of the range.)
+    ``prevailing_slope`` finds the tilt from the slopes v of all 2 x 2 cells whose four pixels are selected,
+    with the weights exp(-|v|² / s²) and s² = mean |v|² / 20. The iteration ends when the change of the slope
+    is below sqrt(1e-9), the limit of Gwyddion 2.62. (Version 2.45 has the limit sqrt(1e-8), which changes the
+    result by 2e-3 of the height range.)
 
     Args:
-        z: (ny, nx), µm; the slopes are physical, so height and pitch must share a unit.
-        pitch_um: (y, x) sampling, µm.
+        z: heights in µm, shape (ny, nx). The slopes are physical, so heights and pitch must have the same
+            unit.
+        pitch_um: pixel pitch along y and x, µm.
 
     Raises:
         InputError: fewer than 4 cells are usable. (Gwyddion removes nothing in this case.)
@@ -55,10 +62,12 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
 
 
 def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: float) -> Array:
-    """Return the slope (d,) of the prevailing facet, given slopes v (d, n).
+    """Return the slope of the prevailing facet, given the slopes v of n cells in d directions. ``slopes`` has
+    shape (d, n), and the result has shape (d,).
 
-    The mean of v with the weights exp(-|v|² / s²), s² = sharpness · mean |v|², is subtracted from v until the
-    square of this mean is below ``settled2``, but at most ``passes`` times.
+    In each pass, the mean of v with the weights exp(-|v|² / s²) is subtracted from v, where s² = sharpness ·
+    mean |v|². The passes end when the squared length of this mean is below ``settled2``, or after ``passes``
+    passes. The result is the sum of the subtracted means.
     """
     total = np.zeros(len(slopes))
     for _ in range(passes):
@@ -83,7 +92,7 @@ def _without_tilt(z: Array, slope_x: float, slope_y: float) -> Levelled:
 
 @operation("fix-zero")
 def fix_zero(z: Array, chosen: Array) -> Levelled:
-    """Shift the heights so that the lowest selected pixel is zero.
+    """Shift the heights so that the lowest selected pixel has the height zero.
 
     The zero is then the height of a single pixel, not a physical datum.
     """
@@ -98,7 +107,7 @@ def zero_mean(z: Array, chosen: Array) -> Levelled:
 
 @operation("zero-max")
 def zero_max(z: Array, chosen: Array) -> Levelled:
-    """Shift the heights so that the highest selected pixel is zero."""
+    """Shift the heights so that the highest selected pixel has the height zero."""
     return _shift(z, np.max, chosen)
 
 

@@ -14,16 +14,16 @@ from litho_data.level.selection import Levelled, subtract
 Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
-# If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this, the smallest
-# eigenvalue is only rounding error.
+# If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this limit, the
+# smallest eigenvalue is only rounding error.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
-# Widths in units of the noise. With these widths, the fits have 95 % of the efficiency of least squares under
-# Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
+# Widths of the weight functions in units of the noise. With these widths, the fits have 95 % of the
+# efficiency of least squares under Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
 _HUBER, _TUKEY = 1.345, 4.685
 _MAD_TO_SIGMA = 1.4826
 _MAX_ROUNDS = 200
-# A change of the surface below this, in units of the noise, is too small to matter.
+# A change of the surface below this limit, in units of the noise, is too small to matter.
 _SETTLED = 1e-7
 
 
@@ -36,14 +36,14 @@ def level_polynomial(
     y_degree: Degree = 3,
     total_degree: Degree | None = None,
 ) -> Levelled:
-    """Subtract the least-squares polynomial, including its constant.
+    """Subtract the least-squares polynomial, including its constant term.
 
     The mean of the fitted pixels becomes zero. Without ``total_degree``, the terms are x^p y^q with p <=
     x_degree and q <= y_degree (Gwyddion's independent degrees). With ``total_degree``, the terms are those
     with p + q <= total_degree (Gwyddion's limited total degree), and the other two degrees are ignored.
 
     Args:
-        z: (ny, nx), any unit.
+        z: heights in any unit, shape (ny, nx).
 
     Raises:
         InputError: a degree is outside 0..11, or the selected pixels do not determine all terms.
@@ -61,14 +61,15 @@ def level_robust(
     y_degree: Degree = 1,
     total_degree: Degree | None = 1,
 ) -> Levelled:
-    """Subtract a robustly fitted polynomial, including its constant, so that the main surface lies at zero.
+    """Subtract a robustly fitted polynomial, including its constant term, so that the main surface lies at
+    zero.
 
-    The fit is iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives
-    features far from the surface no weight. The iteration starts from the Huber fit, whose loss has a single
-    minimum.
+    The fit is iteratively reweighted least squares; its scale is 1.4826 · MAD of the residuals. Tukey's
+    biweight gives features far from the surface no weight. The iteration starts from the Huber fit, whose
+    loss has a single minimum.
 
     Args:
-        z: (ny, nx), any unit.
+        z: heights in any unit, shape (ny, nx).
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
@@ -78,7 +79,7 @@ def level_robust(
 
 
 def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
-    """Fit a polynomial robustly to the chosen pixels and return its values on all pixels."""
+    """Fit a polynomial robustly to the chosen pixels, and return the polynomial's values at all pixels."""
     surface = evaluate(fit_terms(z, chosen, terms), z.shape)
     for weights_of in (_huber, _tukey):
         for _ in range(_MAX_ROUNDS):
@@ -94,7 +95,9 @@ def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
 
 
 def noise_sigma(residual: Array) -> float:
-    """Return 1.4826 times the median absolute value: the sigma of Gaussian noise, even with rare outliers."""
+    """Return 1.4826 times the median absolute residual. This is the sigma of Gaussian noise, even if there
+    are a few outliers.
+    """
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
@@ -107,7 +110,7 @@ def _tukey(scaled: Array) -> Array:
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
-    """Return the exponents (p, q) of x^p y^q."""
+    """Return the exponents (p, q) of all polynomial terms x^p y^q up to the given degrees."""
     degrees = (x_degree, y_degree) if total_degree is None else (total_degree, total_degree)
     return tuple(
         (p, q)
@@ -118,15 +121,17 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
 
 
 def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
-    """Return weighted least-squares coefficients c[q, p] of the Legendre products P_q(y) P_p(x).
+    """Fit the heights by weighted least squares, and return the coefficients c[q, p] of the products P_q(y)
+    P_p(x) of Legendre polynomials.
 
-    x = 2 j / (nx - 1) - 1, and likewise for y. If a set of terms contains all lower terms, Legendre products
-    span the same polynomials as powers, but are far better conditioned. The moments are separable, so the fit
-    costs only a few thin matrix products.
+    Column j has the coordinate x = 2 j / (nx - 1) - 1, from -1 to 1, and likewise for y. If a set of terms
+    contains all lower terms, Legendre products span the same polynomials as powers, but are far better
+    conditioned. The moments are separable, so the fit costs only a few thin matrix products.
 
     Args:
-        z: (ny, nx); NaN only where the weight is zero.
-        weights: (ny, nx); non-negative numbers, or bool, where True has the weight 1.
+        z: heights, shape (ny, nx); NaN only where the weight is zero.
+        weights: weight of each pixel, shape (ny, nx); non-negative numbers, or booleans, where True is the
+            weight 1.
 
     Raises:
         InputError: the weighted pixels do not determine all terms.
@@ -156,7 +161,7 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
 
 
 def evaluate(coefficients: Array, shape: Shape) -> Array:
-    """Return the surface (ny, nx) that belongs to coefficients from ``fit_terms``."""
+    """Return the surface of the given shape that has the coefficients returned by ``fit_terms``."""
     basis_y, basis_x = (_basis(n, k - 1) for n, k in zip(shape, coefficients.shape, strict=True))
     return basis_y @ coefficients @ basis_x.T
 

@@ -57,7 +57,9 @@ class Recipe(BaseModel):
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:
-        """Make a recipe from plain tables, as in TOML or from ``canonical()``; refuse invalid tables."""
+        """Make a recipe from plain data, as read from TOML or returned by ``canonical()``. Raise InputError
+        if the data are invalid.
+        """
         tables = dict(content)
         if tables.pop("schema", cls.SCHEMA) != cls.SCHEMA:
             raise InputError(f"recipe {source}: schema", got=repr(content["schema"]), wanted=repr(cls.SCHEMA))
@@ -67,7 +69,9 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Return tables for ``from_dict`` with all that determines the result, including all defaults."""
+        """Return plain data, as ``from_dict`` takes them, with everything that determines the result of the
+        recipe, including all defaults.
+        """
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
     def apply(
@@ -78,17 +82,18 @@ class Recipe(BaseModel):
         mask: Array | None = None,
         layout_level: Array | None = None,
     ) -> Levelled:
-        """Level a scan, so that ``height + removed`` is the input; both are NaN where nothing was measured.
+        """Level a scan. In the result, ``height + removed`` is the input, and both are NaN where nothing was
+        measured.
 
         Args:
-            scan: a ``Scan``, whose pitch and mask are used, or heights (ny, nx) in µm.
-            pitch_um: (y, x) pitch, used only if ``scan`` is an array of heights.
-            mask: bool (ny, nx), used instead of the scan's mask.
-            layout_level: (ny, nx) levels in the scan's frame, NaN outside the layout; needed only by
-                ``layout-aware`` steps.
+            scan: a ``Scan``, whose pitch and mask are used, or an array of heights in µm, shape (ny, nx).
+            pitch_um: pixel pitch along y and x, used only if ``scan`` is an array of heights.
+            mask: bool array of shape (ny, nx) that replaces the scan's mask.
+            layout_level: level of the layout under each pixel of the scan, shape (ny, nx), NaN outside the
+                layout. Only ``layout-aware`` steps need it.
 
         Raises:
-            InputError: a step lacks something that it needs, or cannot be applied to the data.
+            InputError: a step needs a pitch or layout that is not given, or cannot be applied to the data.
         """
         if isinstance(scan, Scan):
             heights, mask, pitch_um = scan.height_um, scan.mask if mask is None else mask, scan.pitch_um
@@ -102,7 +107,7 @@ class Recipe(BaseModel):
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
-        """Return the result of ``apply``, and the warnings of its steps as a list of texts."""
+        """Return the result of ``apply``, and the texts of the warnings that its steps issued."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)
             levelled = self.apply(scan, **arguments)

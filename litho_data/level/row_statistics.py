@@ -1,4 +1,4 @@
-"""Compute the trimmed mean or the modus of the selected values of each row."""
+"""Compute the trimmed mean, or the modus (estimated most frequent value), of selected values in each row."""
 
 import numpy as np
 
@@ -6,15 +6,16 @@ from litho_data.foundation import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Heights in metres are rounded to this many significant digits. Files state fewer, and the rounding errors of
-# unit conversions affect only later ones.
+# Heights in metres are rounded to this many significant digits. Files state fewer digits, and the rounding
+# errors of unit conversions affect only later digits.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to this exponent are exact in double precision.
 _LARGEST_EXACT_POWER = 22
 
 
 def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
-    """Return the mean of sorted[t : n - t], with t = floor(trim n + 0.5), for each row.
+    """Return the trimmed mean of each row. It is the mean of sorted[t : n - t], where ``sorted`` are the n
+    selected values of the row in ascending order and t = floor(trim n + 0.5).
 
     If this range is empty, the result is the upper median sorted[n // 2], which for even n differs from the
     mean of the two middle values. A row without selected values gives 0.
@@ -31,11 +32,14 @@ def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
 
 
 def row_modus(values: Array, chosen: Array) -> Array:
-    """Return the modus of each row: the mean of the middle third of the row's shortest window.
+    """Return the modus of each row: the mean of the middle third of the shortest window of the row's values.
 
-    A window contains round(sqrt n) sorted values. With fewer than 9 values, the result is the upper median;
-    without selected values, it is 0. If heights have few digits, windows often have equal lengths. Gwyddion
-    chooses the window that is shortest in metres. Values (µm) are therefore compared in metres, rounded to 12
+    A window contains round(sqrt n) consecutive ones of the n selected values in ascending order, and its
+    length is the difference between the last and the first value. With fewer than 9 values, the result is the
+    upper median; without selected values, it is 0.
+
+    If heights have few digits, several windows often have the same length. Gwyddion chooses the window that
+    is shortest in metres. The lengths are therefore compared in metres, after rounding the values to 12
     digits, so that the unit of the file does not affect the choice.
     """
     return np.array([_modus(np.sort(row[use])) for row, use in zip(values, chosen, strict=True)])

@@ -1,4 +1,4 @@
-"""Align the rows of a scan by the methods of Gwyddion's Align Rows."""
+"""Align the rows of a scan by the methods of Gwyddion's function Align Rows."""
 
 import warnings
 from typing import Annotated, Literal
@@ -43,20 +43,24 @@ def align_rows(
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Align the rows of a scan, and warn if the print seems to have caused some of the shifts.
+    """Align the rows of a scan. Warn if the print, instead of an offset between rows, seems to have caused
+    some of the shifts.
 
     Args:
-        z: (ny, nx), µm. ``"matching"`` and ``"modus"`` require this unit, because both convert to metres as
-            Gwyddion does. The unit matters because the weights of ``"matching"`` compare a squared height
-            with a height, and because ``"modus"`` chooses between windows of equal length.
-        method: ``median``, ``trimmed-mean`` and ``modus`` make this statistic equal for all rows. The two
-            ``-of-differences`` methods and ``matching`` add up the steps between neighbouring rows, which
-            preserves large features. ``polynomial`` fits each row separately. ``facet-tilt`` removes the
-            prevailing slope of each row, found in up to 30 passes.
-        direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
+        z: heights in µm, shape (ny, nx). ``"matching"`` and ``"modus"`` require this unit, because both
+            convert heights to metres as Gwyddion does. The unit matters because the weights of ``"matching"``
+            compare a squared height with a height, and because ``"modus"`` chooses between windows of equal
+            length.
+        method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that this statistic is the same
+            for all rows. The two ``-of-differences`` methods and ``matching`` add up the steps between
+            neighbouring rows, which preserves large features. ``polynomial`` subtracts a polynomial that is
+            fitted to each row separately. ``facet-tilt`` removes the prevailing slope of each row, found in
+            up to 30 passes.
+        direction: lines to align; ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
         degree: degree of the polynomial, 0 to 5.
-        trim: fraction that the trimmed means cut at each end, 0 to 0.5; 0.5 is the median.
-        pitch_um: (y, x) pitch, needed only by ``facet-tilt``.
+        trim: fraction of the values that the trimmed means leave out at each end, 0 to 0.5; 0.5 gives the
+            median.
+        pitch_um: pixel pitch along y and x, needed only by ``facet-tilt``.
 
     Raises:
         InputError: the method or direction is unknown, the degree or trim is outside its range, or the pitch
@@ -91,15 +95,15 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """Return a warning if an alignment shifted lines that seem to have no offset, else an empty text.
+    """Return a warning if an alignment shifted lines that seem to have no offset, otherwise an empty string.
 
     A real offset shifts all pixels of a line. The alignment is suspect if it shifted a line relative to its
     neighbour by far more than the noise, although many pixels of the two lines had about the same height. The
-    difference in the other pixels is then part of a structure.
+    height difference in the other pixels is then part of a printed structure.
 
     Args:
-        z: (ny, nx) before alignment; its rows are the lines.
-        removed: (ny, nx) surface that the alignment subtracted.
+        z: heights before the alignment, shape (ny, nx). The rows of the array are the lines.
+        removed: surface that the alignment subtracted, shape (ny, nx).
     """
     steps, shifts = np.diff(z, axis=0), np.diff(removed, axis=0)
     noise = _SIGMA_PER_MAD * float(np.nanmedian(np.abs(steps - np.nanmedian(steps, axis=1, keepdims=True))))
@@ -114,7 +118,9 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """Return the shifts of the rows, with mean zero; a row with too few pixels gets the median of the map."""
+    """Return the shifts of the rows, with mean zero. A row with fewer than ``fewest`` selected pixels gets
+    the upper median of all selected heights.
+    """
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
     return shifts - shifts.mean()
@@ -124,16 +130,19 @@ def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
     both = chosen[1:] & chosen[:-1]
     steps = np.where(both.sum(axis=1) < _fewest(z), 0.0, row_trimmed_mean(np.diff(z, axis=0), both, trim))
     shifts = np.concatenate([[0.0], np.cumsum(steps)])
-    # Steps alone cannot separate drift from slope, so the linear part is kept in the data.
+    # The steps between rows cannot separate drift of the microscope from a slope of the sample, so the linear
+    # part stays in the data.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
 def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
-    """Return the shifts of the rows, summed from weighted mean steps between neighbouring rows.
+    """Return the shifts of the rows. They are cumulative sums of the weighted mean steps between neighbouring
+    rows.
 
     Args:
-        last_column_counts: use the last column regardless of the mask, as in Gwyddion's include mode.
+        last_column_counts: whether the last column is used regardless of the mask, as in Gwyddion's mode that
+            includes the mask.
     """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
     usable = chosen[1:] & chosen[:-1]
@@ -163,7 +172,9 @@ def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
 
 
 def _facet_tilts(z: Array, chosen: Array, pitch_um: float) -> Array:
-    """Return the prevailing slope of each row, per pixel, from pairs of neighbouring selected pixels."""
+    """Return the prevailing slope of each row, in height per pixel, found from pairs of neighbouring selected
+    pixels.
+    """
     slopes, both = np.diff(z, axis=1) / pitch_um, chosen[:, 1:] & chosen[:, :-1]
     tilts = np.zeros(len(z))
     for i in np.flatnonzero(both.sum(axis=1) >= _FEWEST_SLOPES):

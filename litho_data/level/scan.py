@@ -1,4 +1,4 @@
-"""Level one scan, and return the levelled heights and the removed surface or write them to files."""
+"""Level one scan. Return the levelled heights and the removed surface, or write them to files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,9 @@ _DIMS = ("y", "x")
 
 
 class LevelRecord(RunFacts, Result):
-    """Source, recipe and results of a levelling, stored beside the levelled file as ``<file>.json``."""
+    """Record of the source, recipe and results of one levelling, stored beside the levelled file as
+    ``<file>.json``.
+    """
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
     FILE_NAME: ClassVar[str] = "level.json"
@@ -35,10 +37,11 @@ class LevelRecord(RunFacts, Result):
 
 
 def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
-    """Level a scan by a recipe, given as an object or as a TOML file.
+    """Level a scan with a recipe, which is given as an object or as a TOML file.
 
     Returns:
-        The scan with levelled heights, and the removed surface (ny, nx) in µm; both maps add up to the input.
+        The scan with levelled heights, and the removed surface in µm, shape (ny, nx). The levelled heights
+        and the removed surface add up to the input.
 
     Raises:
         InputError: the recipe is invalid, or a step cannot be applied.
@@ -49,11 +52,12 @@ def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, Array]:
 
 
 def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
-    """Level a scan and write ``out``, ``<out stem>.removed<suffix>`` and ``<out>.json``.
+    """Level a scan. Write the levelled heights to ``out``, the removed surface to ``<out
+    stem>.removed<suffix>`` and the record to ``<out>.json``.
 
     Args:
         scan: a scan that was read from a file.
-        recipe: the steps.
+        recipe: the levelling steps.
         out: a ``.gsf`` or ``.npy`` file.
 
     Raises:

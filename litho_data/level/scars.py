@@ -27,16 +27,18 @@ def mark_scars(
     max_width_px: Count = 4,
     sign: ScarSign = "both",
 ) -> Array:
-    """Mark scars: streaks along the rows that stand out from the rows above and below.
+    """Mark scars, which are streaks along the rows that are higher or lower than the rows above and below
+    them.
 
     A streak may be up to ``max_width_px`` rows wide. In each column, its prominence is the height of its
     lowest pixel minus that of the higher pixel just above or below the streak. Negative streaks are found in
-    the same way in the negative map. The unit of prominence is the rms difference, sqrt(sum of squared
-    differences between rows / number of pixels). A run along a row counts if it is at least ``min_length_px``
-    long and its prominence reaches ``high`` somewhere and never falls below ``low``.
+    the same way after the sign of the heights is reversed. The prominence is divided by the rms difference
+    between rows, sqrt(sum of squared differences between neighbouring rows / number of pixels). A run of
+    pixels along a row is a scar if it is at least ``min_length_px`` long, and its prominence reaches ``high``
+    somewhere and never falls below ``low``.
 
     Returns:
-        bool (ny, nx); only selected pixels are marked.
+        A bool array of shape (ny, nx). Only selected pixels are marked.
 
     Raises:
         InputError: a threshold or size is outside its range, or the sign is unknown.
@@ -60,11 +62,12 @@ def mark_scars(
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
-    Laplace's equation is solved inside the marked areas; the border of the image counts as insulated. All
-    other pixels keep exactly their values, and ``removed`` is zero there.
+    Laplace's equation is solved inside the marked areas; the gradient across the border of the image is zero
+    there. All unmarked pixels keep exactly their values, and ``removed`` is zero there.
 
     Raises:
-        InputError: the marks have another shape, or a marked area has no measured neighbour.
+        InputError: ``scars`` is not a bool array of the shape of the heights, or a marked area has no
+            measured neighbour.
     """
     z = as_height(height)
     if scars.shape != z.shape or scars.dtype != np.bool_:
@@ -83,7 +86,7 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
-    """Return how far each pixel stands out as part of a ridge that is at most ``max_width_px`` rows wide."""
+    """Return the prominence of each pixel, as part of a ridge that is at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
     for width in range(1, min(max_width_px, ny - 2) + 1):
@@ -108,7 +111,7 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 
 def _harmonic(z: Array, unknown: Array) -> Array:
-    """Return harmonic values for the unknown pixels, in the order of ``z[unknown]``.
+    """Return values for the unknown pixels that satisfy Laplace's equation, in the order of ``z[unknown]``.
 
     Laplace's equation is solved over the unmeasured pixels as well.
     """

@@ -10,10 +10,10 @@ Masking = Literal["ignore", "exclude", "include"]
 
 
 class Levelled(NamedTuple):
-    """A levelled map and the removed surface; ``height + removed`` is the input.
+    """A levelled height map and the surface that levelling removed; ``height + removed`` is the input.
 
-    Both maps are float64 (ny, nx) in the unit of the input. Pixels that are NaN in the input are NaN in
-    ``height``. ``removed`` is a number everywhere, and may be a read-only view if it is constant along an
+    Both maps are float64 arrays of shape (ny, nx) in the unit of the input. Pixels that are NaN in the input
+    are NaN in ``height``. ``removed`` has no NaN, and may be a read-only view if it is constant along an
     axis.
     """
 
@@ -22,14 +22,16 @@ class Levelled(NamedTuple):
 
 
 class MaskedLevelling(NamedTuple):
-    """A levelled map, and the mask of the features that were excluded."""
+    """A levelled height map with the removed surface, and the mask of the features that were excluded from
+    the fit.
+    """
 
     levelled: Levelled
     mask: Array
 
 
 def as_height(height: Array) -> Array:
-    """Return the map as a contiguous float64 array (ny, nx).
+    """Return the height map as a contiguous float64 array of shape (ny, nx).
 
     Raises:
         InputError: the map is not two-dimensional, or is smaller than 2 x 2 pixels.
@@ -41,7 +43,8 @@ def as_height(height: Array) -> Array:
 
 
 def select(z: Array, mask: Array | None, masking: Masking) -> Array:
-    """Return the pixels that an operation may use, bool (ny, nx), which never include unmeasured (NaN) ones.
+    """Return a bool array of shape (ny, nx) that is True at the pixels that an operation may use. Unmeasured
+    pixels (NaN) are never used.
 
     Raises:
         InputError: the mask is not boolean or has another shape, or no pixel is left.
@@ -57,5 +60,5 @@ def select(z: Array, mask: Array | None, masking: Masking) -> Array:
 
 
 def subtract(z: Array, removed: Array) -> Levelled:
-    """Subtract the surface from the map."""
+    """Subtract a surface from a height map, and return both maps."""
     return Levelled(z - removed, removed)

@@ -217,7 +217,7 @@ def test_python_takes_the_same_changes():
         (("hoe", "--levels", "5", "--set", "layout.levels=6"), "another option sets too"),
         (("hoe", "--config", "unknown.toml"), "setting of unknown.toml, got 'layout.size'"),
         (("hoe", "--config", "broken.toml"), "broken.toml"),
-        (("hoe", "--config", "list.json"), "wanted settings by name"),
+        (("hoe", "--config", "list.json"), "wanted a table of settings by name"),
         (("hoe", "--config", "value.toml"), "layout, got 5"),
         (("hoe", "--config", "nowhere.toml"), "nowhere.toml"),
         (("hoe", "--config", "settings.yaml"), ".toml or .json"),
