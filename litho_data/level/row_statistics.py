@@ -34,8 +34,8 @@ def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
 def row_modus(values: Array, chosen: Array) -> Array:
     """Return the modus of each row: the mean of the middle third of the shortest window of the row's values.
 
-    A window contains round(sqrt n) consecutive ones of the n selected values in ascending order, and its
-    length is the difference between the last and the first value. With fewer than 9 values, the result is the
+    The n selected values are sorted, and a window contains round(sqrt n) consecutive sorted values. Its
+    length is the difference between its last and its first value. With fewer than 9 values, the result is the
     upper median; without selected values, it is 0.
 
     If heights have few digits, several windows often have the same length. Gwyddion chooses the window that

@@ -62,8 +62,8 @@ def mark_scars(
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
-    Laplace's equation is solved inside the marked areas; the gradient across the border of the image is zero
-    there. All unmarked pixels keep exactly their values, and ``removed`` is zero there.
+    Laplace's equation is solved inside the marked areas. At the border of the image, the gradient across the
+    border is zero. All unmarked pixels keep exactly their values, so ``removed`` is zero at these pixels.
 
     Raises:
         InputError: ``scars`` is not a bool array of the shape of the heights, or a marked area has no

@@ -26,8 +26,8 @@ Recorded = dict[str, list[tuple[str, Step]]]
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
     """Return the steps of one scan as text, from the raw files to the arrays, with parameters and hashes.
 
-    If no scan is given, the text has one line per scan. Each line leads from the raw files through the
-    operations to the scan's last array.
+    If no scan is given, the text has one line per scan. Each line names the raw files, the operations, and
+    the last array that they made.
 
     Raises:
         InputError: there is no such store or scan.
@@ -144,8 +144,8 @@ def replay(
         data_dir: folder of the raw files, as in ``verify``.
 
     Returns:
-        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if the shapes differ, or if a
-        pixel is NaN in only one of the two arrays), ``unit``, ``same_hash``.
+        A table with one row per array and the columns ``scan``, ``array``, ``max_abs_difference`` (inf if the
+        shapes differ, or if a pixel is NaN in only one of the two arrays), ``unit``, ``same_hash``.
 
     Raises:
         InputError: there is no such store, scan or array, or raw files are missing or have changed.
@@ -180,7 +180,9 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
-    """Yield arrays in the order in which they are made, each step using the outputs of earlier steps."""
+    """Run the recorded steps again, each with the outputs of earlier steps. Yield the name and values of each
+    array in the order in which the steps make them.
+    """
     made: dict[str, Array] = {}
     for step in steps:
         if step.op not in OPERATIONS:

@@ -96,7 +96,9 @@ def _missing(path: Path) -> Iterator[Finding]:
 
 
 def _documents(path: Path) -> Iterator[Finding]:
-    """Yield the metadata documents that are damaged or differ from their copy in the root document."""
+    """Yield a finding for each metadata document that is damaged or differs from its copy in the root
+    document.
+    """
     documents: dict[str, Any] = {}
     for name, content in read_documents(path, file_names(path)):
         try:
@@ -126,7 +128,7 @@ def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
 
 
 def _attributes(store: Store) -> Iterator[Finding]:
-    """Compare the root's attributes with those computed from the manifest and the arrays."""
+    """Compare the attributes of the root group with those computed from the manifest and the arrays."""
     attributes = dict(store.root.attrs)
     sha256 = attributes.get("dataset_sha256")
     try:
@@ -142,7 +144,9 @@ def _attributes(store: Store) -> Iterator[Finding]:
 
 
 def _tables(store: Store) -> Iterator[Finding]:
-    """Compare the tables with their hashes in the manifest, and the manifest with its hash in the root."""
+    """Compare the tables with their hashes in the manifest, and the manifest with its hash in the root
+    group.
+    """
     manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
     files = read_table(group_of(store.root, "manifest"), "path")
     if record_sha256([manifest, table_sha256(files)]) != store.root.attrs.get("manifest_sha256"):
@@ -216,7 +220,7 @@ def _other_code(history: Recorded) -> Iterator[str]:
         operations = ", ".join(sorted(other))
         yield (
             f"the code of these operations has changed since the build: {operations}; "
-            "replay shows whether this matters"
+            "replay shows whether the arrays change"
         )
 
 

@@ -110,10 +110,11 @@ class Page:
         """Add a sortable table; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
-            table: a frame, a mapping of names to columns, or a sequence of rows (mappings or records). A
-                record inside a row becomes one column per field, named ``row_field``. Intervals and lists
-                are written as text.
-            digits: decimal places; smaller numbers are shown with two significant digits.
+            table: a data frame, a mapping from column names to columns, or a sequence of rows (mappings or
+                records). A record inside a row becomes one column per field, named ``<key>_<field>``.
+                Intervals and lists become text.
+            digits: number of decimal places. Numbers that are too small for these places are shown with two
+                significant digits.
             columns: the columns to show, in this order; all by default.
         """
         frame = _frame(table, digits)
@@ -142,7 +143,7 @@ class Page:
         """Add small pictures in rows and columns.
 
         Args:
-            columns: title and colour bar of each column.
+            columns: for each column, its title and its colour bar, as :func:`colour_bar_png` returns it.
             rows: for each row, its label and one picture per column, as :func:`coloured_png` returns it.
             caption: text below the pictures.
         """
@@ -193,7 +194,7 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
 
 
 def _cells(row: Facts | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the columns and values of a row, including those of records inside the row."""
+    """Yield the column names and values of a row, including those of records inside the row."""
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):
             yield from _cells(value, digits, f"{prefix}{key}_")
@@ -219,7 +220,9 @@ def filled(template: Path, **values: object) -> str:
 
 
 def sentences(template: Path, about: str, one: object) -> str:
-    """Render a macro of a template as a single line."""
+    """Call the macro ``about`` of a Jinja template with the argument ``one``, and return the text as a single
+    line.
+    """
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Figures = Literal["pdf", "svg", "png"]
 Tables = Literal["csv", "latex", "markdown"]
 
-# Widths of one column and of both columns of a two-column page.
+# Widths in inches of one column and of both columns of a two-column page.
 _COLUMN_INCH, _PAGE_INCH = 3.5, 7.2
 # A figure that is wider than this on the screen would not be legible in one column.
 _WIDE_INCH = 8.0
@@ -61,8 +61,10 @@ def with_paper_copies(command: Callable[..., None]) -> Callable[..., None]:
         with paper_copies(values.pop("figures"), values.pop("tables")):
             command(**values)
 
-    figures = Annotated[Figures | None, option("also write figures in this format, for a paper's columns")]
-    tables = Annotated[Tables, option("also write tables in this format, in addition to CSV")]
+    figures = Annotated[
+        Figures | None, option("also write the figures in this format, as wide as a paper's column")
+    ]
+    tables = Annotated[Tables, option("also write the tables in this format, in addition to CSV")]
     return takes_more(run, command, [keyword("figures", figures), keyword("tables", tables, "csv")])
 
 
@@ -93,7 +95,7 @@ def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digit
 
     Args:
         frame: the table.
-        names: titles of its columns.
+        names: titles of the table's columns.
         csv_path: path of the CSV file, which has full precision.
     """
     if wanted().tables == "csv":

@@ -71,9 +71,10 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
     """Return an image as the data URL of a PNG, coloured by a matplotlib colour map and transparent at NaN.
 
     Args:
-        image: (ny, nx), one value per pixel of the picture.
+        image: array of shape (ny, nx) with one value for each pixel of the picture.
         colours: name of the colour map.
-        low, high: values of the first and the last colour; values outside get the nearest colour.
+        low, high: values that get the first and the last colour of the map. Values outside this range get the
+            nearer of these two colours.
     """
     import matplotlib
     from PIL import Image
@@ -89,13 +90,17 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
 
 
 def limits(image: Array) -> tuple[float, float]:
-    """Return the lowest and the highest value of an image, ignoring a few outliers."""
+    """Return the 0.5 % and 99.5 % quantiles of an image: its lowest and highest value without a few
+    outliers.
+    """
     low, high = np.nanpercentile(image, (0.5, 99.5))
     return float(low), float(high)
 
 
 def thumbnail(image: Array, side_px: int = 180) -> Array:
-    """Reduce an image (ny, nx) to every n-th pixel, so that no side exceeds ``side_px`` pixels."""
+    """Keep every n-th row and column of an image, so that no side of the result exceeds ``side_px``
+    pixels.
+    """
     step = max(1, -(-max(image.shape) // side_px))
     return image[::step, ::step]
 
@@ -110,7 +115,7 @@ def shown_html(line: str, **images: Array) -> str:
 
     Args:
         line: the ``repr`` of the object, on one line.
-        images: maps (ny, nx) by name.
+        images: maps by name, each an array of shape (ny, nx).
     """
     figures = []
     for name, values in images.items():

@@ -1,4 +1,6 @@
-"""Compute the amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
+"""Compute the amplitude parameters of a surface (named as in ISO 25178-2), its autocorrelation, and the
+uncertainty of Sq.
+"""
 
 import numpy as np
 import scipy.fft
@@ -8,7 +10,8 @@ from litho_data.foundation.results import Record
 
 
 class AmplitudeParameters(Record):
-    """Amplitudes about the mean height; they are valid only for one pitch, field of view and levelling.
+    """Amplitude parameters about the mean height. They can be compared only between surfaces with the same
+    pitch, field of view and levelling.
 
     Args:
         sa_nm: mean absolute deviation.
@@ -35,7 +38,7 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
 
     Args:
         height_um: levelled heights in µm, of any shape; NaN is ignored.
-        valid: pixels to use; all by default.
+        valid: bool array that is True at the pixels to use; by default all pixels are used.
 
     Raises:
         InputError: there is no valid pixel.
@@ -83,7 +86,8 @@ def autocorrelation(height_um: Array) -> Array:
 
 
 def effective_samples(height_um: Array) -> float:
-    """Return the effective number of independent heights for the variance of a field, pixels / Σ ρ².
+    """Return how many independent heights would determine the variance as well as the correlated heights of a
+    field do: pixels / Σ ρ², where ρ is the autocorrelation.
 
     For a Gaussian surface, the estimated mean square has the relative variance ``2 Σ ρ² / pixels``. The sum
     excludes lags beyond a quarter of the field, because ρ² consists only of noise there.

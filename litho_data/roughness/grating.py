@@ -1,4 +1,6 @@
-"""Find the period of a grating from the peak of its spectrum, then from the phase across the field."""
+"""Find the period of a grating, first from the peak of its spectrum, then more precisely from the phase
+across the field.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +18,8 @@ SEARCHED = 1.25
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
 # Largest accepted scatter of the phases. Phases of pure noise scatter by 1.8 rad.
 _MOST_SCATTER_RAD = 0.5
-# Neighbouring windows overlap by half, so their noise is correlated by 1/6 on both sides.
+# Neighbouring windows overlap by half, so the noise of a window has the correlation 1/6 with that of the
+# window on either side.
 _OVERLAP_VARIANCE = 1 + 2 / 6
 
 
@@ -32,21 +35,21 @@ class Wave:
 
 
 class Scale(Record):
-    """The factor from stated to true lengths, and its standard uncertainty."""
+    """The factor that converts stated lengths to true lengths, and its standard uncertainty."""
 
     factor: float
     uncertainty: float
 
 
 def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> Wave:
-    """Find the fundamental wave of a grating that repeats along an axis, to within a few degrees.
+    """Find the fundamental wave of a grating that repeats along an axis, or within 15° of this direction.
 
     The phase is measured in Hann windows of two periods along the axis, over the whole length of the other
     axis. The slope of the phase along the axis corrects the frequency. The scatter of the phases about a
     straight line gives the combined uncertainty from noise, drift and a bent scanner axis.
 
     Args:
-        height_um: (ny, nx), NaN where not measured.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured.
         pitch_um: stated (y, x) pitch.
         period_um: known period. The search covers periods from ``period_um / SEARCHED`` to ``period_um *
             SEARCHED``.
@@ -80,14 +83,14 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
 
 def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
-    """Return how far the middle of a line is displaced along x relative to its ends, with the uncertainty, in
-    µm.
+    """Measure how far the middle of a scan line is displaced along x relative to the ends of the line. Return
+    the displacement and its standard uncertainty, in µm.
 
     If the displacement is b, a pixel at x on a line of length L shows the surface at x + 4 b (x / L) (1 - x /
     L), apart from shift and scale.
 
     Args:
-        height_um: heights (ny, nx) of a grating along x.
+        height_um: heights of a grating that repeats along x, in µm, shape (ny, nx).
         pitch_um: stated (y, x) pitch.
         wave: the wave of the grating, as measured by ``find_wave``.
     """
@@ -125,8 +128,8 @@ def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]
 
 
 def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
-    """Return the frequency (along, across) with the highest power in the searched range, at most 15° from the
-    axis.
+    """Return the frequency with the highest power in the searched range, at most 15° from the axis. The
+    result contains its components along and across the axis.
     """
     ny, nx = flat.shape
     windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
@@ -141,8 +144,8 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """Return the correction to a frequency (along, across), the uncertainty of the correction along the axis,
-    and the scatter of the phases in rad.
+    """Return the correction to a frequency (its components along and across the axis), the uncertainty of the
+    component along the axis, and the scatter of the phases in rad.
     """
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))

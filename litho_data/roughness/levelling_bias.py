@@ -1,4 +1,5 @@
-"""Compute how much levelling lowers Sq, because levelling also removes some of the roughness.
+"""Compute how much levelling lowers Sq, the rms roughness, because levelling also removes some of the
+roughness.
 
 After a least-squares fit on a basis Q (orthonormal over the N pixels) is subtracted, a surface with
 correlation matrix C has the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. The formula is exact for any

@@ -1,4 +1,4 @@
-"""Separate the noise of pixels and of scan lines from the print."""
+"""Estimate the noise of pixels and of scan lines, separately from the print."""
 
 from math import comb
 
@@ -16,7 +16,7 @@ _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
-    """Estimate the white pixel noise and line noise of a scan, in nm, whatever was printed.
+    """Estimate the white pixel noise and the line noise of a scan, in nm, without knowing what was printed.
 
     A printer writes nothing finer than its spot, so high-order differences contain only noise. Differences
     along both axes give the pixel noise. Differences of the line means along the slow axis give the line
@@ -24,11 +24,12 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
     print, so they are not included.
 
     Args:
-        height_um: heights (ny, nx) in µm, NaN where not measured.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured.
         fast_axis: axis along which the tip moved.
 
     Returns:
-        sd of the pixel noise and of the line noise; NaN if there are too few pixels to determine it.
+        Standard deviations of the pixel noise and of the line noise; NaN if there are too few pixels to
+        determine them.
     """
     lines = lines_nm(height_um, fast_axis)
     pixel_nm = _fine_sd(_fine(_fine(lines, 0), 1))
@@ -44,7 +45,7 @@ def _fine(values: Array, axis: int) -> Array:
 
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
-    """Return differences of an order along an axis, scaled so that white noise keeps its variance.
+    """Return the differences of the given order along an axis, scaled so that white noise keeps its variance.
 
     The differences of polynomials of lower degree are zero.
     """

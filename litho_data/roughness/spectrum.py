@@ -29,9 +29,9 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
     corrected for the power of this window, so that ``Σ density·Δf`` is the mean square of the lines.
 
     Args:
-        height_um: finite heights (ny, nx) in µm.
+        height_um: finite heights in µm, shape (ny, nx).
         pitch_um: pitch along the axis, in µm.
-        axis: ``x`` along rows, ``y`` along columns.
+        axis: direction of the lines, ``x`` (along rows) or ``y`` (along columns).
         window: whether to remove the slope and use the window. False is suitable for periodic or noise-like
             surfaces.
 
@@ -48,7 +48,7 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
 
 
 def hann(shape: Shape) -> Array:
-    """Return the Hann window of a field (ny, nx), without the zeros at its ends."""
+    """Return a two-dimensional Hann window of shape (ny, nx), without the zeros at its border."""
     ny, nx = shape
     return np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
 

@@ -32,14 +32,15 @@ class StepHeight(Record):
 
 
 def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um: float) -> StepHeight:
-    """Return the height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
+    """Return the height of a ridge or groove of type A1 (ISO 5436-1) above its surroundings, positive for a
+    ridge and negative for a groove.
 
     ``z = a·x + b + h·δ`` is fitted to every line, with δ = 1 on the middle third of the feature and δ = 0 on
     two reference arms. If W is the width of the feature, the arms extend from W/3 to W from its edges, so the
     profile spans three widths.
 
     Args:
-        height_um: heights (ny, nx) in µm; NaN is ignored.
+        height_um: heights in µm, shape (ny, nx); NaN is ignored.
         left_um: position of the first edge along x, in µm from the field's border.
         right_um: position of the second edge, in µm from the same border.
 
@@ -138,7 +139,8 @@ def _independent_lines(values: Array) -> float:
 
 
 def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
-    """Find the edges of a step, ridge, groove or row of grooves in a scan, and return their mean height.
+    """Find the edges of a step, ridge, groove or row of grooves in a scan, and return the mean height of the
+    steps at these edges.
 
     The slope of the field is removed from the median profile. An edge is a place where the change of this
     profile is at least half as large as its largest change. ``stair_steps`` measures the heights of the

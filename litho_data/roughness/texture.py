@@ -17,7 +17,7 @@ _OWN = 3
 # have a correlation of 1, 4/9 or 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# The lowest frequencies contain the part of a bow that levelling did not remove.
+# First frequency that is used. Lower frequencies contain the part of a bow that levelling did not remove.
 _FIRST = 3
 
 
@@ -68,7 +68,8 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     P)² / Σ P² is the effective number of frequencies.
 
     Args:
-        heights_um: levelled heights (ny, nx), µm, on square pixels; NaN is replaced by the mean.
+        heights_um: levelled heights in µm, one array of shape (ny, nx) per surface. The pixels must be
+            square; NaN is replaced by the mean.
 
     Raises:
         InputError: a surface has fewer than 64 rows or columns.
@@ -112,15 +113,17 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
 
 
 def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
-    """Find the strongest period that the line means of all scans share; return None below 64 lines.
+    """Find the strongest period that the line means of all scans share. Return None if a scan has fewer than
+    64 lines.
 
-    If lines are random, the mean periodogram of F scans, divided by its level, is distributed as Gamma(F) /
-    F. The level is a parabola fitted to the logarithms at the surrounding frequencies, and its uncertainty is
-    integrated out. The p-value of the largest peak is corrected for the number of frequencies (Bonferroni).
+    If lines are random, the mean periodogram of F scans, divided by its smooth level, is distributed as
+    Gamma(F) / F. The level is a parabola fitted to the logarithms of the power at the surrounding
+    frequencies, and its uncertainty is integrated out. The p-value of the largest peak is corrected for the
+    number of frequencies (Bonferroni).
 
     Args:
         means_um: mean height of each line, one array per scan; all arrays are cropped to the shortest.
-        pitch_um: distance between lines.
+        pitch_um: distance between lines, µm.
     """
     count, scans = min(len(own) for own in means_um), len(means_um)
     if count < FEWEST_LINES:
@@ -151,8 +154,8 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """Return the level that the surrounding frequencies give at each frequency, and the probability that the
-    power exceeds it this much by chance.
+    """For each frequency, return the power level given by the surrounding frequencies, and the probability
+    that the actual power exceeds this level so far by chance.
     """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)

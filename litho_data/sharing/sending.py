@@ -15,17 +15,17 @@ from litho_data.foundation import Facts, InputError
 from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 
-# Options of mallopt(3), with the values that the C library reaches by itself if none is set.
+# Options of mallopt(3), with the values that the C library adapts to by itself if the options are not set.
 _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20)}
 
 
 @dataclass(frozen=True)
 class Known:
-    """Large objects that are not sent: every process makes them for itself, and jobs and results refer to
-    them by name.
+    """Large objects that are not sent to other processes. Every process makes these objects itself, and jobs
+    and results refer to them by name.
 
-    ``make`` is a function that makes ``objects`` again. It must be importable by name, or be a partial of
-    such a function. A process keeps only the objects that it made last.
+    ``make`` is a function that makes ``objects`` again. It must be importable by name, or be a
+    ``functools.partial`` of such a function. A process keeps only the objects that it made last.
     """
 
     make: Callable[[], Facts]
@@ -34,11 +34,11 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A function that runs in another process, but in the same folder as here. Its results record the command
-    line of this process.
+    """A function that runs in another process, with the working directory of this process. Results of the
+    function record the command line of this process.
 
-    ``plugins`` are files of plug-ins to load first; ``software`` is the software that a Dask worker must also
-    run.
+    ``plugins`` are plug-in files that the other process loads first. ``software`` states the versions and the
+    commit that a Dask worker must have, too.
     """
 
     function: Callable[[Any], Any]
@@ -66,14 +66,16 @@ def _made(make: bytes) -> Facts:
 
 
 def sent(content: Any, names: Mapping[int, str]) -> bytes:
-    """Convert anything to bytes. ``names`` maps the ``id`` of each object sent by name to that name."""
+    """Pickle any content. Known objects inside the content are replaced by their names; ``names`` maps the
+    ``id`` of each known object to its name.
+    """
     stream = BytesIO()
     _Sender(stream, names).dump(content)
     return stream.getvalue()
 
 
 def received(content: bytes, objects: Facts) -> Any:
-    """Replace the names in a sent job by these objects."""
+    """Unpickle what ``sent`` has pickled, and replace each name in it by the object that has this name."""
     return _Receiver(BytesIO(content), objects).load()
 
 
@@ -133,8 +135,8 @@ def _require_alike(wanted: Facts, folder: str) -> None:
 def _keep_freed_memory() -> None:
     """Let a Dask worker reuse freed memory, as processes do by default.
 
-    Dask starts its workers with MALLOC_TRIM_THRESHOLD_, so that every array above 128 KiB gets new pages.
-    Making these pages takes a third of the time of a build.
+    Dask starts its workers with the environment variable MALLOC_TRIM_THRESHOLD_, so that every array above
+    128 KiB gets new memory pages. Providing these pages takes a third of the time of a build.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)):
         for parameter, value in _MALLOC.values():

@@ -30,7 +30,8 @@ from litho_data.sharing.sending import Away, Known, received, sent
 J = TypeVar("J")
 R = TypeVar("R")
 
-# Variables that the numerical libraries read when they are loaded; Dask workers get the same values.
+# Environment variables that limit the numerical libraries to one thread. The libraries read them when they
+# are loaded, and Dask gives its workers the same values.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CONNECT_S = 5.0
 _TRIES = 3
@@ -38,7 +39,8 @@ _TRIES = 3
 
 class Pool(NamedTuple):
     """Workers that run jobs. ``present`` returns the current number of workers. Each error type in ``lost``
-    means that a job was lost because its worker died.
+    means that a job was lost because its worker died, and ``fate`` says in messages what happened to this
+    worker.
 
     ``tries`` is the maximum number of times that a job is started; ``restart`` is called before lost jobs are
     started again.
@@ -62,7 +64,7 @@ class Workers:
             means that jobs run in this process.
         dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
         known: objects that jobs use but that are not sent with them, because each worker makes them itself.
-        pool: see ``kept_open``.
+        pool: workers that are already running; see ``kept_open``.
     """
 
     processes: int = 1
@@ -269,7 +271,8 @@ def _dask(address: str) -> Iterator[Pool]:
         _require_scheduler(address)
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, MemoryError) as error:
-        # MemoryError: another program answers at the address, and its bytes are taken for sizes.
+        # A MemoryError means that another program answers at the address, and that its bytes were mistaken
+        # for the size of a message.
         said = str(error) or f"no answer in {_CONNECT_S:g} s"
         raise InputError(
             "Dask scheduler",

@@ -1,4 +1,6 @@
-"""Refer to scans of a store, so that other processes read them instead of receiving the arrays."""
+"""Refer to scans of a store by their ids, so that other processes read these scans instead of receiving their
+arrays.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,14 @@ class StoredScans:
 
     @classmethod
     def of(cls, store: Store, scans: Sequence[PrintedScan]) -> StoredScans:
-        """Make a reference to these scans."""
+        """Make a reference to some scans of a store."""
         return cls(str(store.path), store.sha256, tuple(scan.id for scan in scans))
 
     def read(self) -> list[PrintedScan]:
         """Read the scans.
 
         Raises:
-            InputError: there is no store at the path, or it contains another dataset.
+            InputError: there is no store at the path, or the store contains another dataset.
         """
         store = open_store(self.path)
         if store.sha256 != self.sha256:

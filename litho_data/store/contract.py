@@ -1,4 +1,4 @@
-"""Check a store when it is opened: refuse it if a declared file is missing or a number is impossible."""
+"""Check a store when it is opened: refuse it if a declared file is missing or a value is out of range."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def require_complete(path: Path) -> None:
     """Refuse a store that has lost a file, because zarr would read zeros or NaN in its place.
 
     Raises:
-        InputError: names the first missing file.
+        InputError: a file is missing; the message names the first one.
     """
     for name in missing_files(path):
         raise InputError(
@@ -165,7 +165,7 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        # xarray stores booleans as small integers, and notes this in the attributes.
+        # xarray stores booleans as small integers, and records the original type in the attribute ``dtype``.
         as_integers = variable.dtype == array.attrs.get("dtype") == "bool"
         known = as_integers or str(array.dtype) in (variable.dtype, variable.wider)
         if array.shape != wanted or not known:
@@ -184,7 +184,7 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
     may be removed only at the end.
 
     Raises:
-        InputError: rows or columns were removed elsewhere, or reversed.
+        InputError: rows or columns were removed elsewhere than at the end, or their order was changed.
     """
     for name, count in (
         (f"{axis}{unit}", n) for axis, n in zip("yx", shape, strict=True) for unit in ("_um", "")
@@ -198,7 +198,8 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """Return ``scan`` (the ids), ``print``, ``order`` and all optional columns of a store.
+    """Return the columns of a store by name: ``scan`` (the ids), ``print``, ``order`` and all optional
+    columns.
 
     Missing numbers are returned as None, and missing strings as "".
 
@@ -239,8 +240,8 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return the shape (ny, nx) of every scan without padding, and refuse shapes larger than the padded
-    field.
+    """Return the shape (ny, nx) of every scan without padding. Refuse a shape that is larger than the padded
+    array.
     """
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
@@ -260,7 +261,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
     measured.
 
     Raises:
-        InputError: names the value that is refused.
+        InputError: a value is refused; the message names it.
     """
     highest = int(samples["mask_level"].max())
     if highest >= levels:
@@ -283,7 +284,7 @@ def require_manifest(manifest: Facts, path: Path) -> None:
     A manifest that contains only the table of files does not come from a build, and needs fewer entries.
 
     Raises:
-        InputError: names the first entry that is missing or has the wrong type.
+        InputError: an entry is missing or has the wrong type; the message names the first one.
     """
     with damaged(f"manifest of {path}"):
         texts: list[Any] = []

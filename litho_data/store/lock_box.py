@@ -12,7 +12,9 @@ from litho_data.foundation import InputError
 
 
 class HasPrint(Protocol):
-    """The properties of a scan that determine whether it is put into the lock box: its id and its print."""
+    """Any object with the two properties of a scan that determine whether it is put into the lock box: its id
+    and its print.
+    """
 
     @property
     def id(self) -> str: ...
@@ -62,7 +64,7 @@ def require_unique(ids: Sequence[str]) -> None:
     """Refuse duplicate ids.
 
     Raises:
-        InputError: names the duplicate ids.
+        InputError: an id occurs twice; the message names all such ids.
     """
     if len(set(ids)) != len(ids):
         repeated = sorted({scan_id for scan_id in ids if list(ids).count(scan_id) > 1})

@@ -43,7 +43,8 @@ def outputs_of(record: Facts) -> list[Facts]:
 
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
-    """Yield the unfinished store of ``out`` and lock it, so that no other build uses it at the same time.
+    """Yield the unfinished store that will become ``out``, and lock it so that no other build uses it at the
+    same time.
 
     Raises:
         InputError: ``out`` exists but is not a dataset store, cannot be written, or is already being built.
@@ -54,7 +55,7 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
 
 
 class PartialStore:
-    """The finished scans on disk, and the group to which they are added."""
+    """A store under construction: the finished scans on disk, and the Zarr group to which scans are added."""
 
     def __init__(self, out: Path, folder: Path):
         self.out = out
@@ -74,7 +75,7 @@ class PartialStore:
             for child in others:
                 shutil.rmtree(child) if child.is_dir() else child.unlink()
         root = zarr.open_group(self.store, mode="a", zarr_format=3)
-        # The group must already exist, because several processes add to it.
+        # The group must exist before several processes add scans to it.
         root.require_group("scans")
         return root
 
@@ -101,7 +102,7 @@ class PartialStore:
         return records
 
     def add(self, piece: Piece) -> None:
-        """Store one finished scan, from any process; its record is written last."""
+        """Store one finished scan, and write its record last. Any process may call this."""
         import zarr
 
         scan_id = piece.record["id"]
@@ -151,6 +152,6 @@ def _require_replaceable(out: Path) -> None:
     if schema != STORE_SCHEMA or not out.is_dir():
         raise InputError(
             "output path",
-            got=f"{out}, which exists but is no dataset store",
+            got=f"{out}, which exists but is not a dataset store",
             wanted="a new path, or a dataset store to replace",
         )

@@ -18,9 +18,11 @@ class PrintedScan:
     Args:
         id: name of the scan. ``print_id`` names the block of fields with which it was printed, and ``order``
             is its position in the writing order.
-        mask_level: layout levels (ny, nx), uint8, or uint16 if there are more than 256 levels.
-        height_um: float32 (ny, nx), µm, NaN where not measured.
-        valid: bool (ny, nx), True where the pixel was measured and lies inside the scan.
+        mask_level: level of each pixel of the layout, shape (ny, nx); uint8, or uint16 if there are more than
+            256 levels.
+        height_um: measured height of each pixel in µm, shape (ny, nx), float32; NaN where not measured.
+        valid: bool array of shape (ny, nx) that is True where the pixel was measured and lies inside the
+            scan.
         pitch_um: pixel pitch of all three arrays, µm. ``level_height_um`` is the nominal height of a level,
             µm.
         levels: number of levels that the layout may use.
@@ -36,9 +38,11 @@ class PrintedScan:
             straightening.
         tip_radius_um: radius of the microscope's tip, or an upper bound for it; None if the store has
             neither.
-        height_sigma_um: standard uncertainty of ``height_um``, which excludes the offset of the scan; float32
-            (ny, nx), µm, NaN where not valid. None means that the store does not contain it.
-        groups: values of the named groups in the card's id pattern, such as the field, except the print.
+        height_sigma_um: standard uncertainty of ``height_um`` in µm, shape (ny, nx), float32; NaN where not
+            valid. It does not include the uncertainty of the scan's offset. None means that the store does
+            not contain it.
+        groups: values that the named groups of the card's id pattern have for this scan, such as the number
+            of the field. The group ``print`` is left out.
         instrument: name of the instrument, if the card's table gives it. ``seen_by`` is the kind of
             instrument, which determines what the heights mean (see ``Instrument``).
         surround: what lies around the printed field. ``substrate`` means bare substrate, which the layout
@@ -92,17 +96,17 @@ class PrintedScan:
 
     @property
     def usable(self) -> Array:
-        """Return a mask of the measured pixels, bool (ny, nx)."""
+        """Return a bool array of shape (ny, nx) that is True at valid pixels with a finite height."""
         return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
 
     @property
     def layout_um(self) -> Array:
-        """Return the nominal height, float32 (ny, nx), µm."""
+        """Return the nominal height of each pixel in µm, a float32 array of shape (ny, nx)."""
         return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return (ny, nx) in pixels."""
+        """Return the shape (ny, nx) in pixels."""
         return self.mask_level.shape[0], self.mask_level.shape[1]
 
 

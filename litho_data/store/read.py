@@ -155,7 +155,8 @@ class Store:
         return [self.scan(scan_id) for scan_id in self.ids]
 
     def sample(self, name: str, row: int) -> Array:
-        """Return one scan's part of an array over all scans, without padding.
+        """Return one scan's part of an array over all scans, without padding. ``row`` is the position of the
+        scan in ``ids``.
 
         Raises:
             InputError: a stored chunk cannot be decoded.
@@ -205,7 +206,9 @@ class Store:
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     def recorded_pitches_um(self) -> dict[str, YX]:
-        """Return the pitch (y, x) that the reader recorded for each scan, including references."""
+        """Return the pitch along y and x, in µm, that the reader recorded for each scan, including reference
+        scans.
+        """
         pitches = {}
         for row in self.manifest.get("files", []):
             if pitch := _read_facts(row).get("pitch_um"):
@@ -224,9 +227,10 @@ class Store:
 
     @cached_property
     def quality(self) -> pd.DataFrame:
-        """Return one row per scan with its registration, levelling and noise figures.
+        """Return a table with one row per scan that states how well it was registered and levelled, and its
+        noise.
 
-        If the store has no such figures, the rows contain only the ids.
+        If the store has no such table, the rows contain only the ids.
         """
         import pandas as pd
 

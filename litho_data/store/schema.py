@@ -54,12 +54,12 @@ SAMPLE_VARIABLES, (SIGMA,), SCAN_VARIABLES = (
     tuple(Variable(name, tuple(dims.split()), *rest) for name, (dims, *rest) in table.items())
     for table in table_beside(__file__, "variables.toml").values()
 )
-"""All arrays of a store: those over all scans, their uncertainty, and those of single scans (see
-``variables.toml``).
+"""All arrays of a store, as ``variables.toml`` defines them: arrays over all scans, the uncertainty of the
+heights, and arrays of single scans.
 """
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
-"""The arrays over all scans on the layouts' grid."""
-# An array with mixed units has no unit as a whole; hashes use 1.
+"""The arrays over all scans on the layout grid, including the uncertainty of the heights."""
+# An array with mixed units has no single unit; its hash uses the unit 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = {
@@ -71,15 +71,17 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Optional numbers per scan from the card's table, with their ranges. A number is NaN where the row has none.
+"""Optional numbers per scan from the card's table, with their ranges. Where a row of the table is empty, the
+number is NaN.
 """
 Instrument = Literal["afm", "profilometer", "confocal", "sem"]
-"""Kind of instrument. Heights are measured by a probe (``afm``, ``profilometer``) or by light
-(``confocal``). With ``sem``, they are a film's height times the share of a pixel that it covers, from the
-edges in an electron micrograph."""
+"""Kind of instrument. Heights are measured by a probe (``afm``, ``profilometer``) or by light (``confocal``).
+With ``sem``, a height is the film's full height times the share of the pixel that the film covers, computed
+from the film's edges in an electron micrograph.
+"""
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
-"""Optional words per scan from the card's table. A word is empty where the row has none."""
+"""Optional words per scan from the card's table. Where a row of the table is empty, the word is empty."""
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Write a dataset store. Each chunk contains one scan, as suits other tools, and has a checksum."""
+"""Write a dataset store. Each chunk contains one scan and has a checksum."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ def write_scan_group(
     Args:
         root: an open group.
         scan_id: name of the scan.
-        arrays: arrays by name; those that are not in the scan's own frame are ignored.
+        arrays: arrays by name. Arrays that do not belong to a single scan (see ``SCAN_VARIABLES``) are
+            ignored.
         use: use of the scan, as in the card's table.
-        pitch_um: (y, x) pitch of the scan.
+        pitch_um: pixel pitch of the scan along y and x, µm.
     """
     shown = next(name for name in SHOWN if name in arrays)
     attributes = {"use": use, "ome": _ome(scan_id, shown, pitch_um)}
@@ -165,7 +166,8 @@ def consolidate(root: zarr.Group) -> None:
     import zarr
 
     with warnings.catch_warnings():
-        # zarr-python warns that other readers may not support the copy. They use the separate documents.
+        # zarr-python warns that other readers may not support the copy. Such readers use the separate
+        # documents.
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(root.store)
 

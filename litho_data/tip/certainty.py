@@ -1,10 +1,10 @@
 """Find which pixels of a surface the tip touched, and reconstruct the surface from the image.
 
-The point of contact determines the height in the image. If a valley is more sharply curved than the tip, the
-contact jumps from one side of the valley to the other. The tip does not touch the surface in between, which
-appears in the image only as a single pixel where the image is more sharply curved than the tip. If such a
-pixel limits the height that a surface pixel can have, the tip did not touch that surface pixel (Villarrubia
-1997, section 5).
+The height of an image pixel is determined by the point where the tip touches the surface. If a valley is more
+sharply curved than the tip, the contact jumps from one side of the valley to the other. The tip does not
+touch the surface in between. In the image, this part of the surface appears only as a single pixel at which
+the image is more sharply curved than the tip. If such an image pixel limits the height that the surface can
+have at another pixel, the tip did not touch the surface at that pixel (Villarrubia 1997, section 5).
 """
 
 import numpy as np
@@ -22,27 +22,28 @@ from litho_data.tip.curvature import (
 from litho_data.tip.morphology import paraboloid_erosion
 
 # Curvature of a valley in the image, in units of the tip's curvature. Above the first value, the contact may
-# jump there; above the second value, it does. A valley of curvature k has k / (1 − kR) in the image, so 0.6
-# of the tip's curvature in the image means 0.375 in the surface. If noise requires a disc as wide as the
-# valley, the disc underestimates the curvature. Noise alone reaches 0.6 at 3.5 sd.
+# jump there; above the second value, it does. With a tip of radius R, a valley of curvature k has the
+# curvature k / (1 − kR) in the image, so 0.6 of the tip's curvature in the image means 0.375 of it in the
+# surface. If noise requires a disc as wide as the valley, the disc underestimates the curvature. Noise alone
+# reaches 0.6 at 3.5 sd.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
-# A jump also affects discs around it, up to their radius away, but less. The jump is where the signal exceeds
-# this share of its peak.
+# A jump also raises the curvature of discs whose centres are up to a disc radius away, but less. A pixel
+# belongs to the jump if its curvature exceeds this share of the maximum around it.
 _CORE = 0.55
 _SMOOTHING = 0.25
 
 
 def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Return a mask, bool (ny, nx), of the pixels that the tip touched. Untouched regions include a margin of
-    one pixel.
+    """Return a bool array of shape (ny, nx) that is True at the pixels that the tip certainly touched.
+    Untouched regions are widened by a margin of one pixel.
 
     If the radius is only an upper bound, some pixels that the tip touched are also marked as untouched.
     Unmeasured pixels are False.
 
     Args:
-        height_um: image (ny, nx), µm, NaN where not measured.
-        pitch_um: (y, x) pitch.
-        radius_um: radius of the end of the tip, which is assumed to be a paraboloid.
+        height_um: heights of the image in µm, shape (ny, nx); NaN where not measured.
+        pitch_um: pixel pitch along y and x, µm.
+        radius_um: radius of the end of the tip, µm. The tip is assumed to be a paraboloid.
 
     Raises:
         InputError: the radius is not a positive number.
@@ -67,7 +68,8 @@ def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
 
 
 def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
-    """Erode an image by the tip, and return the highest surface (ny, nx), µm, that gives this image.
+    """Erode an image by the tip. Return the highest surface from which the tip would produce this image, in
+    µm, shape (ny, nx).
 
     The result equals the true surface where the tip touched it, and lies above it elsewhere. Noise is treated
     as part of the surface: erosion widens each downward spike of the noise to the width of the tip, which

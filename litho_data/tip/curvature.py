@@ -10,7 +10,7 @@ import numpy as np
 from litho_data.foundation import YX, Array
 from litho_data.roughness.noise import fine_differences, robust_sd
 
-# Radii in pixels; each disc has more pixels than the one before.
+# Radii of the discs in pixels. Each disc has more pixels than the one before.
 DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
 # Largest acceptable noise of a curvature, as a share of the curvature of the tip.
 QUIET = 0.17
@@ -26,7 +26,7 @@ class Noise:
 
 
 def noise_of(height_um: Array) -> Noise:
-    """Estimate the noise of a scan (ny, nx), µm, from fourth differences.
+    """Estimate the noise of a scan from fourth differences of its heights. ``height_um`` has shape (ny, nx).
 
     Fourth differences vanish on the parabolas that a tip leaves in the image. If the noise is larger along
     the columns than along the rows, the excess is attributed to offsets of whole rows, and vice versa.
@@ -38,14 +38,14 @@ def noise_of(height_um: Array) -> Noise:
 
 def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array:
     """Fit a quadratic surface to a disc around each pixel, and return the highest principal curvature of each
-    fit, (ny, nx), 1/µm.
+    fit in 1/µm. The result has shape (ny, nx).
 
     The result is exact for a quadratic surface, and has the least noise of all linear estimates on the disc.
     It is NaN where the disc extends beyond the scan or contains an unmeasured pixel.
 
     Args:
-        height_um: (ny, nx), NaN where not measured.
-        pitch_um: (y, x) pitch.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured.
+        pitch_um: pixel pitch along y and x, µm.
         radius_px: radius of the disc, pixels.
     """
     from scipy.ndimage import binary_dilation
@@ -64,8 +64,8 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Return the standard deviation, 1/µm, of the curvature that is measured on a flat surface with this
-    noise.
+    """Return the standard deviation, in 1/µm, of the curvatures that ``highest_curvature`` measures on a flat
+    surface with this noise.
 
     The value is computed along each axis, and the larger one is returned.
     """
@@ -79,7 +79,8 @@ def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
 
 @lru_cache(maxsize=64)
 def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
-    """Return the weights (3, n, n), 1/µm², that give the second derivatives of a quadratic fit on a disc.
+    """Return the weights of the heights on a disc that give the second derivatives of a quadratic fit. The
+    result has shape (3, n, n) and the unit 1/µm².
 
     The order of the derivatives is xx, xy, yy.
     """
@@ -94,7 +95,7 @@ def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
 
 
 def disc(radius_px: float) -> Array:
-    """Return a mask, bool (n, n) with n odd, of the pixels in a disc."""
+    """Return a bool array of shape (n, n), with n odd, that is True at the pixels inside a disc."""
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9

@@ -24,8 +24,8 @@ class ScanUnderTip(Record):
     """The effect of the tip on one scan.
 
     ``certain_fraction`` is the share of pixels that the tip touched. ``resolution_um`` is the wavelength
-    below which the scan may show the tip. If the scans set no bound on the radius of the tip, both are None.
-    If the tip does not limit the resolution, ``resolution_um`` is None.
+    below which the scan may show the shape of the tip instead of the surface. If the scans set no bound on
+    the radius of the tip, both are None. If the tip does not limit the resolution, ``resolution_um`` is None.
     """
 
     name: str
@@ -47,7 +47,7 @@ class TipEstimate(RunFacts, Result):
         window_px: side length of the windows in which curvatures were measured; None if there is no bound.
         share: share of the sharp peaks that are about as sharp as the sharpest one. The share is high if the
             tip limits the sharpness.
-        pitch_um: (y, x) pitch of the scans.
+        pitch_um: pixel pitch of the scans along y and x, µm.
         scans: results for each scan.
     """
 
@@ -73,7 +73,8 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
 
     The radius comes from the sharpest peaks, because no peak in an image is more sharply curved than the end
     of the tip. If many peaks share the same maximum curvature and the valleys are more sharply curved, the
-    result is an estimate. Otherwise, the tip may be sharper than anything that it scanned.
+    result is an estimate. Otherwise, the tip may be sharper than anything that it scanned, and the result is
+    only an upper bound.
 
     Args:
         scans: scans that all have the same pitch. Levelling has little influence.

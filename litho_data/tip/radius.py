@@ -18,11 +18,11 @@ from litho_data.tip.curvature import QUIET, noise_of
 
 # Half sides of the square windows in which a parabola is fitted, pixels.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# A window with a half side of a third of the reach averages over as many pixels as still fit on the image of
-# an edge. Half sides of up to 0.45 of the reach are allowed.
+# The reach is the radius of the image of a spike. A window whose half side is a third of the reach averages
+# over as many pixels as still fit on the image of an edge. Half sides of up to 0.45 of the reach are allowed.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The edge is placed so that 98 % of the curvatures above half the edge lie below the edge. Noise raises it by
-# 1.4 standard deviations of the noise.
+# The upper edge of the distribution of curvatures is placed so that 98 % of the curvatures above half the
+# edge lie below the edge. Noise raises it by 1.4 standard deviations of the noise.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
 # Share of a line that is excluded at each end, because the scan is unreliable near the turning points.
@@ -67,8 +67,8 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
     bound.
 
     Args:
-        height_um: (ny, nx), µm, NaN where not measured. Tilt and bow have little influence.
-        pitch_um: (y, x) pitch.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured. Tilt and bow have little influence.
+        pitch_um: pixel pitch along y and x, µm.
     """
     depth_um = float(np.subtract(*np.nanpercentile(remove_bow(height_um), _SPAN[::-1])))
     noise = noise_of(height_um)
@@ -101,7 +101,7 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
     bound if there is no estimate.
 
     Estimates far above the lowest estimate come from rounded surfaces and are discarded. If the lowest bound
-    lies clearly below the mean estimate, the bound is returned instead.
+    lies clearly below the mean of the estimates, this bound is returned instead of the mean.
     """
     known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
     estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
@@ -120,7 +120,9 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 
 @dataclass(frozen=True)
 class _Tops:
-    """Curvatures (ny, nx), 1/µm, in windows of one size; positive at peaks, NaN where no window fits."""
+    """Curvatures of a scan in windows of one size, in 1/µm; positive at peaks, NaN where no window fits.
+    ``edge`` is the upper edge of their distribution.
+    """
 
     half_px: int
     noise: float

@@ -11,15 +11,15 @@ _SHARE = 0.5
 def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
     """Return the wavelength, µm, below which the scan may show the shape of the tip instead of the surface.
 
-    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is computed at the
-    distance λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result is the largest
-    λ at which this curvature reaches half of 1/R (Sanner et al., Scale-dependent roughness parameters for
-    topography analysis, arXiv:2106.16103). Noise peaks are not distinguished from peaks of the surface, so
-    the result is an upper bound.
+    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is computed from
+    heights that are λ/2 apart, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result
+    is the largest λ at which this curvature reaches half of 1/R (Sanner et al., Scale-dependent roughness
+    parameters for topography analysis, arXiv:2106.16103). Noise peaks are not distinguished from peaks of the
+    surface, so the result is an upper bound.
 
     Args:
-        height_um: (ny, nx), µm, NaN where not measured.
-        pitch_um: (y, x) pitch.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured.
+        pitch_um: pixel pitch along y and x, µm.
         radius_um: radius of the tip.
 
     Returns:
