@@ -317,6 +317,6 @@ def test_another_build_or_a_foreign_folder_is_left_alone(campaign: Path, tmp_pat
         build_dataset(campaign / "card.toml", tmp_path / "busy.zarr")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("years of work")
-    with pytest.raises(InputError, match="no dataset store"):
+    with pytest.raises(InputError, match="not a dataset store"):
         build_dataset(campaign / "card.toml", tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.txt").read_text() == "years of work"
