@@ -20,7 +20,7 @@ packages.
 
 
 def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
-    """Make sure that all files of a dataset are present and undamaged; return their folder.
+    """Make sure that all files of a dataset are present and undamaged, and return their folder.
 
     Without ``into``, the first complete folder among ``$LITHO_DATA_DIR/<name>`` and the user cache is used.
     If neither is complete, the missing files are downloaded into the user cache. Files with the right hash

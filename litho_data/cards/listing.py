@@ -222,11 +222,11 @@ def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")
     if card.write is None or card.write.field_um is None:
-        assumed.append("one scan is one write field, centred on it")
+        assumed.append("each scan shows exactly one write field, whose centre is that of the scan")
     if not any("order" in row for row in table.values()):
-        assumed.append("the writing order is that of the sorted ids")
+        assumed.append("the fields were written in the order of their sorted ids")
     if card.ids.print is None:
-        assumed.append("every scan is a print of its own")
+        assumed.append("every scan shows a separate print")
     return tuple(assumed)
 
 

@@ -239,7 +239,9 @@ def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
 
 
 def _given(options: Sequence[str], words: Sequence[str]) -> str | None:
-    """Return the value that follows an option on the command line; return None for an argument."""
+    """Return the value that follows an option on the command line. Return None for an argument, which no
+    option name precedes.
+    """
     for word, value in zip(words, [*words[1:], None], strict=True):
         name, equals, rest = word.partition("=")
         if name in options:

@@ -61,7 +61,7 @@ def progress(
     unless it exceeds a minute.
 
     Args:
-        items: the items to iterate over.
+        items: the items to iterate over. ``what`` is a text that says what is done with them.
         total: number of items, if ``len`` does not give it.
         estimate_of: number of items that the estimate covers; by default all. 0 means no estimate.
         at_once: number of items that are processed at the same time.

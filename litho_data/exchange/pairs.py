@@ -90,8 +90,8 @@ def import_pairs(
         data_dir=root,
         files={job.id: job.files for job in jobs} | {key: {key: root / key} for key in unpaired},
         assumptions=(
-            "one scan is one write field, centred on it",
-            "the writing order is that of the sorted ids",
+            "each scan shows exactly one write field, whose centre is that of the scan",
+            "the fields were written in the order of their sorted ids",
         ),
         unpaired=unpaired,
     )
@@ -154,8 +154,8 @@ class PairsJob:
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
     """Return the file names by field and quadrant, and the unusable files, each with the reason."""
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
-    unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
-    unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
+    unpaired = {f"mask/{name}": "no height file of this name" for name in sorted(masks - heights)}
+    unpaired |= {f"afm/{name}": "no layout file of this name" for name in sorted(heights - masks)}
     unpaired |= {f"afm/{name}": f"not in {SCALES_FILE}" for name in sorted((masks & heights) - set(scales))}
     complete = sorted(name for name in masks & heights & set(scales) if SAFE_ID.fullmatch(name))
     cut: dict[str, dict[int, str]] = {}

@@ -62,9 +62,9 @@ def growing_folder(
             were made one by one.
 
     Raises:
-        InputError: ``out`` is a file, contains something else, contains a result with other facts, is being
-            written by another process, or cannot be written. The error is raised before the ``with`` block
-            begins.
+        InputError: ``out`` is a file, contains something other than this result, contains this kind of result
+            with other facts, is being written by another process, or cannot be written. The error is raised
+            before the ``with`` block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)

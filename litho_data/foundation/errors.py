@@ -64,7 +64,7 @@ def said(error: Exception) -> str:
 
 
 def require_known(what: str, got: str, known: Iterable[str]) -> None:
-    """Refuse a name that is not among ``known``; the arguments are those of `unknown_name`.
+    """Refuse a name that is not among ``known``. The arguments are those of `unknown_name`.
 
     Raises:
         InputError: the name is not known.
@@ -76,7 +76,7 @@ def require_known(what: str, got: str, known: Iterable[str]) -> None:
 def unknown_name(
     what: str, got: object, known: Iterable[str], hint: str = "", *, also: str = ""
 ) -> InputError:
-    """Return the error for an unknown name; the hint is the nearest known name, if one is similar.
+    """Return the error for an unknown name. If a known name is similar, the hint suggests the nearest one.
 
     Args:
         what: what the name stands for.

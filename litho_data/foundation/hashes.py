@@ -54,8 +54,8 @@ def canonical_json(record: Any) -> str:
 
 
 def source_sha256(*paths: Path) -> str:
-    """Return the hash of source files; a folder stands for all Python and TOML files below it, in sorted
-    order.
+    """Return one hash of the names and contents of source files. A folder stands for all Python and TOML
+    files below it, in sorted order.
     """
     digest = hashlib.sha256()
     for path in paths:

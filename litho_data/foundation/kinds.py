@@ -7,7 +7,7 @@ import numpy as np
 
 Array = np.ndarray
 Shape = tuple[int, ...]
-"""(ny, nx), pixels."""
+"""Shape of a map in pixels: the number of rows and of columns, (ny, nx)."""
 YX = tuple[float, float]
 """A pitch, a size or a position: the values along y and along x."""
 Facts = Mapping[str, Any]

@@ -16,7 +16,8 @@ from litho_data.foundation.kinds import Facts
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
-    """Accept a free path, an empty folder, or a folder that contains nothing but an older result.
+    """Accept a path that does not exist, an empty folder, or a folder that contains nothing but an older
+    result.
 
     Args:
         path: where the result will be.
@@ -71,8 +72,8 @@ def first_difference(then: Facts, now: Facts, path: str = "") -> str:
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
-    """Accept a free path, an empty folder, or a folder with the same kind of result, whose record file is
-    ``record``.
+    """Accept a path that does not exist, an empty folder, or a folder with the same kind of result, whose
+    record file is ``record``.
 
     A file counts as the record of a result if its name matches the kind of result in its schema:
     ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.

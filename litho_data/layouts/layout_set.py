@@ -211,5 +211,5 @@ PATTERNS: dict[str, tuple[Callable[[SetSettings], Iterator[NamedLayout]], str]] 
     "siemens-star": (_star, "18 wedges around the centre"),
     "pillars": (_pillars, "isolated squares of full height on bare ground, one pixel wide and more"),
     "pits": (_pits, "isolated square holes in a film of full height, one pixel wide and more"),
-    "dose-matrix": (_dose_matrix, "one framed step ladder per dose, from 0.7 to 1.3 times the recipe's dose"),
+    "dose-matrix": (_dose_matrix, "one framed step ladder per dose, from 0.7 to 1.3 times the nominal dose"),
 }

@@ -34,7 +34,7 @@ def random_layout(
     their levels were rounded down; ``quantiser="floor", field_px=540`` makes similar layouts.
 
     Args:
-        shape: (ny, nx), pixels.
+        shape: shape (ny, nx) of the layout in pixels.
         levels: number of levels L; the result contains integers 0…L−1.
         cutoff_per_um: highest spatial frequency that the filter passes, cycles/µm.
         pitch_um: pixel pitch, µm.

@@ -35,7 +35,7 @@ class State:
 
 
 class Step(BaseModel):
-    """Base class of all steps; the fields of a step are the arguments of its operation.
+    """Base class of the steps of a recipe. The fields of a step are the arguments of its operation.
 
     ``masking`` says how the current mask is used. The current mask is the one that the last step made that
     marked pixels. Before any such step, it is the scan's mask.

@@ -106,7 +106,7 @@ def thumbnail(image: Array, side_px: int = 180) -> Array:
 
 
 def colour_bar_png(colours: str) -> str:
-    """Return a picture of the colours from low to high; it is one pixel high and is stretched for display."""
+    """Return a picture of a colour map from low to high. It is one pixel high, and pages stretch it."""
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
 
 

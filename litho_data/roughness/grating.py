@@ -50,7 +50,7 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
-        pitch_um: stated (y, x) pitch.
+        pitch_um: stated pixel pitch along y and x, µm.
         period_um: known period. The search covers periods from ``period_um / SEARCHED`` to ``period_um *
             SEARCHED``.
         axis: the axis along which the grating repeats.
@@ -91,7 +91,7 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
 
     Args:
         height_um: heights of a grating that repeats along x, in µm, shape (ny, nx).
-        pitch_um: stated (y, x) pitch.
+        pitch_um: stated pixel pitch along y and x, µm.
         wave: the wave of the grating, as measured by ``find_wave``.
     """
     y, x = (np.arange(n) * step for n, step in zip(height_um.shape, pitch_um, strict=True))
@@ -169,13 +169,15 @@ def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array
 
 
 def _line(places: Array, phases: Array) -> tuple[float, float, float]:
-    """Fit a straight line to phases; return the slope, its standard uncertainty, and the scatter."""
+    """Fit a straight line to phases. Return its slope, the standard uncertainty of the slope, and the scatter
+    of the phases about the line.
+    """
     return _last_weight([np.ones_like(places), places - places.mean()], phases)
 
 
 def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
-    """Fit values by least squares; return the weight of the last column, its standard uncertainty, and the
-    scatter.
+    """Fit values by a weighted sum of columns (least squares). Return the weight of the last column, the
+    standard uncertainty of this weight, and the scatter of the values about the fit.
     """
     design = np.column_stack(columns)
     weights, *_ = np.linalg.lstsq(design, values, rcond=None)
@@ -189,6 +191,6 @@ def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, flo
 def _wider(freedom: int) -> float:
     """Return the standard deviation of Student's t with this number of degrees of freedom.
 
-    This factor corrects an uncertainty whose scatter was estimated from few phases.
+    An uncertainty is multiplied by this factor if its scatter was estimated from few phases.
     """
     return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

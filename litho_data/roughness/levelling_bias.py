@@ -39,9 +39,10 @@ def retained_variance(
     To correct the Sq of a levelled surface, divide it by the square root of this share.
 
     Args:
-        shape: (ny, nx), pixels. For rows that are levelled separately, use (1, nx) and a degree of (0, n).
+        shape: shape (ny, nx) of the field in pixels. For rows that are levelled separately, use (1, nx) and a
+            degree of (0, n).
         pitch_um: pixel pitch, µm.
-        correlation: normalised autocorrelation as a function of (y, x) lags, µm.
+        correlation: normalised autocorrelation as a function of the lags along y and along x, µm.
         degree: the largest total degree (1 = plane), or the largest independent degrees along (y, x). Degree
             0 subtracts the mean.
     """

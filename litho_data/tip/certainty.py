@@ -25,7 +25,7 @@ from litho_data.tip.morphology import paraboloid_erosion
 # jump there; above the second value, it does. With a tip of radius R, a valley of curvature k has the
 # curvature k / (1 − kR) in the image, so 0.6 of the tip's curvature in the image means 0.375 of it in the
 # surface. If noise requires a disc as wide as the valley, the disc underestimates the curvature. Noise alone
-# reaches 0.6 at 3.5 sd.
+# reaches 0.6 only at 3.5 standard deviations.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
 # A jump also raises the curvature of discs whose centres are up to a disc radius away, but less. A pixel
 # belongs to the jump if its curvature exceeds this share of the maximum around it.

@@ -41,7 +41,8 @@ class TipEstimate(RunFacts, Result):
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of the estimate; None if the radius is only a bound.
         reason: why the radius is only a bound; empty if it is an estimate.
-        depth_um: range of heights in the scan that determines the radius, after removal of tilt and bow.
+        depth_um: range of heights, after removal of tilt and bow, in the scan from which the radius was
+            determined.
         reach_px: √(2 R depth) in pixels, which is the radius of the image of a spike.
         pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
         window_px: side length of the windows in which curvatures were measured; None if there is no bound.

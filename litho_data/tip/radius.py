@@ -33,14 +33,14 @@ _SMALLEST_REACH_PX = 5.0
 _TIP_SHARE = 0.25
 # The tip is the same everywhere in a scan, but the sharpest peaks of a surface are in a few places. The share
 # is therefore multiplied by the share of the scan's 5 x 5 parts whose own edge exceeds 0.9 of the whole
-# scan's edge, and the product must reach 0.13. Of the estimates that are more than 10 % too blunt, this limit
-# rejects most on rounded bumps, but only one in twenty on steep walls and spikes.
+# scan's edge, and the product must reach 0.13. Among the estimates that are more than 10 % too large, this
+# limit rejects most of those from rounded bumps, but only one in twenty of those from steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
 # If the tip limits the image, valleys are sharper than peaks. On other surfaces and in most noise, they are
 # not.
 _SHARPER_VALLEYS = 1.2
 # Relative scatter of the estimates for known tips, beyond the scatter among the parts of a scan, and number
-# of standard uncertainties that are added for a bound.
+# of standard uncertainties that are added to the radius to give a bound.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 

@@ -33,7 +33,7 @@ def test_ids_are_those_with_both_files(tmp_path: Path) -> None:
     assert [(one.id, one.print_id, one.order) for one in listing.fields] == [("P11", "1", 0), ("P12", "1", 1)]
     assert listing.unpaired == {"P13": "no file scans/P13.txt", "P14": "no file layouts/P14.tif"}
     assert not listing.refused
-    assert "the writing order is that of the sorted ids" in listing.assumptions
+    assert "the fields were written in the order of their sorted ids" in listing.assumptions
 
 
 def test_an_id_of_another_form_is_refused_with_a_reason(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
     (pairs / "afm" / "P213.tif").unlink()
     result = import_pairs(pairs, tmp_path / "back.zarr")
     assert open_store(tmp_path / "back.zarr").ids == ["P11", "P12", "P211", "P212", "P214"]
-    assert result.unpaired == {"mask/P213.tif": "no heights of this name"}
+    assert result.unpaired == {"mask/P213.tif": "no height file of this name"}
 
 
 def test_a_folder_that_is_not_in_the_pair_format_is_refused(tmp_path: Path) -> None:
