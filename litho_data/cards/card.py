@@ -214,7 +214,7 @@ class Standard(Record):
 
 
 class Grating(Standard):
-    """A grating that gives the scale of one axis; a square grating can be used for both axes."""
+    """A grating that calibrates the scale of one axis. A square grating can be used for both axes."""
 
     period_um: Length
 
@@ -253,7 +253,9 @@ class Write(Record):
 
 
 class KnownGrating(Record):
-    """The certified period of the grating in scans whose use is ``grating``; it holds for both axes."""
+    """The certified period of the grating that scans with the use ``grating`` show. It holds along both
+    axes.
+    """
 
     period_um: Length
     uncertainty_um: Uncertainty = 0.0

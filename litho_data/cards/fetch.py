@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import pooch
 
 CARDS = Path(__file__).parents[1] / "datasets"
-"""The cards that come with the package; in a source checkout this is a link to the folder beside the
-packages.
+"""Folder of the cards that come with the package. In a source checkout, it is a link to the folder
+``datasets`` beside the packages.
 """
 
 

@@ -32,9 +32,9 @@ class PrintedField:
     """One field to build: its files and what the card says about it.
 
     ``columns`` contains the optional numbers and words that the card's table states for this field, such as
-    its dose. ``read`` contains the reading options in the table, which replace those of the card. If the scan
-    is an integer image, ``full_scale_um`` is the height that the largest possible pixel value stands for.
-    ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
+    its dose. ``read`` contains the reading options that the table states for this scan; they replace those of
+    the card. If the scan is an integer image, ``full_scale_um`` is the height that the largest possible pixel
+    value stands for. ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
     """
 
     id: str
@@ -50,7 +50,8 @@ class PrintedField:
 
 @dataclass(frozen=True)
 class Listing:
-    """A card with the folder of its files, the fields to build, and the files of every id.
+    """A dataset card, the folder that contains its files, the fields to build, and the files found for each
+    id.
 
     Each id that is not built is a key of ``unpaired`` (its layout or its scan is missing) or of ``refused``
     (it cannot be used). The value is the reason.
@@ -185,7 +186,9 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
 
 
 def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:
-    """Return why an id that has all files cannot be used, or an empty text if it can be used."""
+    """Return the reason why an id that has all its files cannot be used, or an empty string if it can be
+    used.
+    """
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may contain only letters, digits, spaces and ._+-"
     if print_id is None and use == "dataset":

@@ -38,7 +38,7 @@ def masks(
     ] = 12,
     size_px: Annotated[int, option("side length of a layout, pixels", min=8)] = 512,
     levels: Annotated[
-        int, option("number of levels; a layout contains the levels 0 to levels − 1", min=2, max=65536)
+        int, option("number of levels L; a layout contains the levels 0 to L − 1", min=2, max=65536)
     ] = 13,
     cutoff_per_um: Annotated[
         float, option("cut-off frequency of the low-pass filter that makes random layouts, cycles/µm")

@@ -1,4 +1,6 @@
-"""Release a store as one file, or as a folder with descriptions in RO-Crate and Croissant."""
+"""Export a store for release, as one file or as a folder with descriptions in the formats RO-Crate and
+Croissant.
+"""
 
 import json
 import zipfile

@@ -45,7 +45,8 @@ def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any],
             the package, because importing the subpackage or module would bind that name to it.
         file: the package's ``__init__`` file; every name that it imports with ``as`` is public.
 
-    ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.
+    ``__version__`` is always one of the names. It is the version of the distribution, or ``"0"`` if the
+    distribution is not installed.
     """
     homes = {
         alias.asname: (str(node.module), alias.name)

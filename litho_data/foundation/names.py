@@ -31,7 +31,7 @@ def require_plain_name(what: str, name: str) -> str:
     """Return the name if it is plain.
 
     Raises:
-        InputError: the name is not plain; a path that contains it could lead to another folder.
+        InputError: the name is not plain, so a path that contains the name could lead to another folder.
     """
     if not is_plain_name(name):
         raise InputError(what, got=repr(name)[:80], wanted="a plain name, without a path")

@@ -1,8 +1,8 @@
 """Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
-A missing or empty folder is accepted. So is the folder of an earlier run of the same command on the same
-subject (dataset, model, design) with the same settings; this run is resumed or repeated. Anything else is
-refused, and nothing is changed.
+A missing or empty folder is accepted. The folder of an earlier run is accepted if it is a run of the same
+command on the same subject (dataset, model, design) with the same settings. This run is resumed or repeated.
+Anything else is refused, and nothing is changed.
 """
 
 import json
@@ -79,7 +79,8 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
 
     Args:
-        path: where the result will be; other files in a folder that holds this result are left alone.
+        path: folder of the result. If it already holds a result of this kind, other files in it are left
+            alone.
         record: name of the record file of a finished result.
         begun: names, or patterns of names, of files that an interrupted run of the same kind leaves.
 

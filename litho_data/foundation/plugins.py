@@ -19,7 +19,7 @@ _LOADED: dict[str, str] = {}
 
 
 def load_plugins(files: Iterable[str | Path] = ()) -> None:
-    """Import all installed plug-ins and these files, each once per process.
+    """Import all installed plug-ins and the plug-in files ``files``, each once per process.
 
     Raises:
         InputError: a file is not Python, or a plug-in fails to load.
@@ -40,7 +40,9 @@ def plugin_files() -> list[str]:
 
 
 def plugin_versions() -> dict[str, str]:
-    """Return each loaded plug-in with its version, or with the beginning of its file's hash."""
+    """Return a dict that maps each loaded plug-in to its version, or to the beginning of the hash of its
+    file.
+    """
     return {f"plug-in {Path(name).name}": version for name, version in _LOADED.items()}
 
 

@@ -105,7 +105,7 @@ class Result(Record):
 
 
 def first_error(error: ValidationError) -> str:
-    """Return the first error of pydantic as one line with the place, the problem and the value."""
+    """Return pydantic's first error as one line that states the key, the problem and the value."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
     if first["type"] == "extra_forbidden":

@@ -58,7 +58,9 @@ def run_facts() -> dict[str, Any]:
 
 @contextmanager
 def running_command(command: str) -> Iterator[None]:
-    """Record a command line in the results made inside this context, because library code cannot know it."""
+    """Record a command line in all results that are made inside this context. Library code alone cannot know
+    the command line.
+    """
     token = _COMMAND.set(command)
     try:
         yield

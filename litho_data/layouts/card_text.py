@@ -1,4 +1,6 @@
-"""Write a set of layouts to disk: one TIFF per layout, a table, and a dataset card for the later scans."""
+"""Write a set of layouts to disk: one TIFF file per layout, a table, and a dataset card to which scans can be
+added later.
+"""
 
 import csv
 import json

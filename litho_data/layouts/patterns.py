@@ -1,4 +1,4 @@
-"""Draw calibration patterns, whose prints measure one property at a time.
+"""Draw calibration patterns. The print of each pattern shows one property of the printer at a time.
 
 All pattern functions return an array of levels, shape (ny, nx), in the smallest unsigned type. Lengths are in
 whole pixels.

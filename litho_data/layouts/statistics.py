@@ -25,7 +25,7 @@ class LayoutStatistics(Result):
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
         power_share: share of the spectral power (without that of the mean level) in each bin; the shares sum
             to 1.
-        settings: settings of the set if ``write_layout_set`` made it, otherwise None.
+        settings: settings with which ``write_layout_set`` made the layouts; None if it did not make them.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/layouts/2"

@@ -71,8 +71,8 @@ def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
     The function receives two arrays of shape (ny, nx): the heights (float64), and which pixels are usable
     (bool). Callers of the decorated function pass a height map of any type, a ``mask`` and ``masking``, from
     which ``select`` determines the usable pixels. Keyword arguments of the function become fields of the step
-    and are checked at every call, except for those that come with the scan. The function returns a
-    ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
+    and are checked at every call, except for arguments whose values come with the scan. The function returns
+    a ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

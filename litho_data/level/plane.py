@@ -85,7 +85,9 @@ def prevailing_slope(slopes: Array, *, sharpness: float, passes: int, settled2: 
 
 
 def _without_tilt(z: Array, slope_x: float, slope_y: float) -> Levelled:
-    """Subtract the plane that has these slopes per pixel and is zero at column nx/2 and row ny/2."""
+    """Subtract the plane that has the given slopes, in height per pixel, and is zero at column nx/2 and row
+    ny/2.
+    """
     y, x = (np.arange(n) - n / 2 for n in z.shape)
     return subtract(z, np.add.outer(slope_y * y, slope_x * x))
 

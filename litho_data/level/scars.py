@@ -30,12 +30,12 @@ def mark_scars(
     """Mark scars, which are streaks along the rows that are higher or lower than the rows above and below
     them.
 
-    A streak may be up to ``max_width_px`` rows wide. In each column, its prominence is the height of its
-    lowest pixel minus that of the higher pixel just above or below the streak. Negative streaks are found in
-    the same way after the sign of the heights is reversed. The prominence is divided by the rms difference
-    between rows, sqrt(sum of squared differences between neighbouring rows / number of pixels). A run of
-    pixels along a row is a scar if it is at least ``min_length_px`` long, and its prominence reaches ``high``
-    somewhere and never falls below ``low``.
+    A streak may be up to ``max_width_px`` rows wide. In each column, the prominence of a streak is the height
+    of its lowest pixel minus the height of the pixel just above or just below the streak, whichever is
+    higher. Negative streaks are found in the same way after the sign of the heights is reversed. The
+    prominence is divided by the rms difference between rows, sqrt(sum of squared differences between
+    neighbouring rows / number of pixels). A run of pixels along a row is a scar if it is at least
+    ``min_length_px`` long, and its prominence reaches ``high`` somewhere and never falls below ``low``.
 
     Returns:
         A bool array of shape (ny, nx). Only selected pixels are marked.

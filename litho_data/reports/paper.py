@@ -40,7 +40,9 @@ _WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=Non
 
 @contextmanager
 def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
-    """Make every report that is written in this context also write copies for a paper."""
+    """Make every report that is written in this context also write copies of its figures and tables for a
+    paper.
+    """
     token = _WANTED.set(PaperCopies(figures, tables))
     try:
         yield

@@ -36,8 +36,8 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     ridge and negative for a groove.
 
     ``z = a·x + b + h·δ`` is fitted to every line, with δ = 1 on the middle third of the feature and δ = 0 on
-    two reference arms. If W is the width of the feature, the arms extend from W/3 to W from its edges, so the
-    profile spans three widths.
+    two reference arms. If W is the width of the feature, the arms cover the distances from W/3 to W outside
+    its edges, so the profile spans three widths.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN is ignored.
@@ -66,7 +66,8 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
 def stair_steps(
     height_um: Array, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
 ) -> list[StepHeight]:
-    """Return the heights of the steps of a staircase, one per edge, positive upwards.
+    """Return the height of each step of a staircase, one step per edge. It is positive if the surface rises
+    along the axis.
 
     On every line, one height per tread and one common slope are fitted to the middle thirds of the treads.
     The height of a step is the difference between two neighbouring treads.
@@ -100,7 +101,7 @@ def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Arr
 
 
 def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[StepHeight]:
-    """Return the differences of neighbouring treads, line by line, with one slope per line."""
+    """Fit the heights of all treads and one slope to each line, and return the height of each step."""
     used = np.any(treads, axis=0)
     design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
         used

@@ -30,7 +30,7 @@ class LineDirection:
             positive angles are from x towards y.
         strength: length of the mean double-angle vector of the power spectrum; 0 for an isotropic surface, 1
             for lines that all have one direction.
-        p: probability of at least this strength on an isotropic surface (Rayleigh's test).
+        p: probability that an isotropic surface has at least this strength by chance (Rayleigh's test).
     """
 
     angle_deg: float
@@ -43,9 +43,9 @@ class LinePeriod:
     """The strongest period of lines.
 
     Args:
-        period_um: period at the centre of the peak that exceeds its surroundings most.
+        period_um: period at the centre of the peak that rises furthest above the spectrum around it.
         share: share of the power of the line means that lies in the peak.
-        p: probability of such a peak anywhere in a smooth spectrum.
+        p: probability that a smooth spectrum has such a peak at any frequency by chance.
         amplitude_um: amplitude at this period, as a root mean square over the surfaces.
         coherence: agreement of the phases at this period. Every surface has a phasor of unit length, and the
             coherence is the length of the mean phasor. It is 1 if all surfaces have the same phase, and about
@@ -62,10 +62,10 @@ class LinePeriod:
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) contributes a vector at twice its angle, with its power as the length. Each
-    surface is scaled by its own variance. The powers of random surfaces are independent and exponentially
-    distributed. The mean vector of an isotropic surface is therefore normal with variance 1 / n, where n = (Σ
-    P)² / Σ P² is the effective number of frequencies.
+    Each frequency (fx, fy) contributes a vector whose angle is twice that of the frequency and whose length
+    is the power. Each surface is scaled by its own variance. The powers of random surfaces are independent
+    and exponentially distributed. The mean vector of an isotropic surface is therefore normal with variance 1
+    / n, where n = (Σ P)² / Σ P² is the effective number of frequencies.
 
     Args:
         heights_um: levelled heights in µm, one array of shape (ny, nx) per surface. The pixels must be

@@ -98,8 +98,8 @@ class _Receiver(pickle.Unpickler):
 
 
 def _require_alike(wanted: Facts, folder: str) -> None:
-    """Refuse a Dask worker whose results would differ; this is checked with each job, because workers may
-    join and leave.
+    """Refuse a Dask worker that has several threads, other software or other files, because its results could
+    differ. Every job makes this check, because workers may join and leave.
     """
     from distributed import get_worker
 

@@ -95,8 +95,8 @@ def run_jobs(
 ) -> Generator[tuple[J, R], None, None]:
     """Yield each job with its result, in the order in which the jobs finish.
 
-    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. Jobs whose
-    local workers died are run again, one at a time and at most twice. On a Dask cluster, the scheduler
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. If local
+    workers die, their jobs are run again, one at a time and at most twice. On a Dask cluster, the scheduler
     decides how often such jobs are repeated.
 
     Args:

@@ -109,7 +109,7 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
 
 
 def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """Read the one-dimensional arrays of a group as a table whose first column is ``first``.
+    """Read the one-dimensional arrays of a group as the columns of a table. The column ``first`` comes first.
 
     Raises:
         InputError: metadata or chunks are damaged, or the columns have different lengths.

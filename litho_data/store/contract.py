@@ -152,8 +152,8 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """Return a dict of the arrays over all scans. Refuse a store in which one is missing, or has a wrong
-    shape, type or dimensions.
+    """Return a dict of the arrays over all scans. Refuse a store in which one of these arrays is missing or
+    has a wrong shape, type or dimensions.
     """
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}

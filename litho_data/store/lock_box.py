@@ -28,7 +28,7 @@ def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """Choose a sixth of the scans, but at least one, from different prints if possible.
+    """Choose the lock box: a sixth of the scans, but at least one, from different prints if possible.
 
     If there are only one or two scans, none is chosen.
 

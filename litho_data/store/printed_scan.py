@@ -1,4 +1,4 @@
-"""Define one printed field as the whole project uses it, and the hash of its content."""
+"""Define the record of one printed field that the whole project uses, and the hash of its content."""
 
 import math
 from collections.abc import Mapping
@@ -34,8 +34,8 @@ class PrintedScan:
         turned_deg: rotation of the scan relative to the other scans. ``direction`` is 1 for trace and -1 for
             retrace, ``tip`` is the number of the tip, and ``pixel_size`` is the pixel size relative to the
             other scans. None means that the card does not state the value.
-        bend_um: bend of the scan. If there is one, ``scan_to_layout`` applies to the positions after
-            straightening.
+        bend_um: bend of the scan; None if the scan is not bent. For a bent scan, ``scan_to_layout`` applies
+            to positions from which the bend has been removed.
         tip_radius_um: radius of the microscope's tip, or an upper bound for it; None if the store has
             neither.
         height_sigma_um: standard uncertainty of ``height_um`` in µm, shape (ny, nx), float32; NaN where not
@@ -111,7 +111,9 @@ class PrintedScan:
 
 
 def scan_sha256(scan: PrintedScan) -> str:
-    """Return the hash of all fields of a scan, which is its key in caches, resumed work and dataset ids."""
+    """Return a hash of all fields of a scan. It serves as the key of the scan in caches, resumed work and
+    dataset ids.
+    """
     return record_sha256(_hashed(scan))
 
 

@@ -194,7 +194,7 @@ class Store:
         return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
-        """Return the ids of the reference scans, each with its use, such as ``flat``.
+        """Return a dict that maps the id of each reference scan to its use, such as ``flat``.
 
         Reference scans do not belong to the dataset; ``scan_frame`` reads their heights.
         """
@@ -217,7 +217,9 @@ class Store:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """Return the card, the build record and one row per raw file; empty if the store has no manifest."""
+        """Return the manifest: the dataset card, the record of the build and one row per raw file. It is
+        empty if the store has no manifest.
+        """
         if not has_child(self.root, "manifest"):
             return {}
         group = group_of(self.root, "manifest")

@@ -34,7 +34,8 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write one scan in its own frame as the group ``scans/<id>``, which is also an OME-Zarr image.
+    """Write the arrays of one scan, in the scan's own frame, as the group ``scans/<id>``. The group is also
+    an OME-Zarr image.
 
     Args:
         root: an open group.

@@ -70,7 +70,7 @@ class TipEstimate(RunFacts, Result):
 
 
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
-    """Estimate the tip that made one or more scans, such as those of one day.
+    """Estimate the radius of the tip that recorded one or more scans, such as all scans of one day.
 
     The radius comes from the sharpest peaks, because no peak in an image is more sharply curved than the end
     of the tip. If many peaks share the same maximum curvature and the valleys are more sharply curved, the

@@ -44,8 +44,8 @@ def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
 def _erode_rows(
     heights: Array, places: Array, range_um: float, pitch_um: float, radius_um: float
 ) -> tuple[Array, Array]:
-    """Return, for each pixel, the minimum of height + distance²/2R over its row, and the place of the
-    minimum.
+    """Return, for each pixel, the minimum of height + distance² / (2 R) over all pixels of its row, and the
+    position of the minimum.
     """
     lowest, owner = heights.copy(), places.copy()
     # Beyond this distance, the tip has risen by more than the range of heights in the image.

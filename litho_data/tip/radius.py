@@ -50,8 +50,8 @@ class PeakRadius:
     """The radius of a tip, µm: an estimate or an upper bound, or None if there is no bound.
 
     ``reason`` says why the radius is only a bound, and is empty for an estimate. ``sd_um`` is the standard
-    uncertainty; a bound is the radius found plus twice this value. ``depth_um`` is the range of heights.
-    ``window_px`` and ``share`` are explained in ``TipEstimate``.
+    uncertainty. A bound is the measured radius plus twice this uncertainty. ``depth_um`` is the range of
+    heights. ``window_px`` and ``share`` are explained in ``TipEstimate``.
     """
 
     radius_um: float | None
