@@ -1,4 +1,6 @@
-"""Read self-describing arrays (HDF5 of any program, NetCDF 3 and 4, MATLAB) with scale, unit and axes."""
+"""Read files of self-describing arrays (HDF5 of any program, NetCDF 3 and 4, MATLAB). Scale, unit and axes
+are taken from the file.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,17 @@ _MATLAB_7 = b"MATLAB 7.3 MAT-file"
 _APPLIED = ("scale_factor", "add_offset")
 _MISSING = ("_FillValue", "missing_value")
 _RANGE = ("valid_min", "valid_max", "valid_range")
-# Attributes whose numbers would change the values in an unknown way.
+# Names of attributes whose numbers may scale the values in a way that is not known here.
 _UNKNOWN = re.compile(
     r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb|sensitiv|"
     r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
     re.I,
 )
-# Names of the numbers that convert counts into heights, such as m and b in m counts + b.
+# Names of numbers that convert counts into heights, such as m and b in "m · counts + b".
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# Names of such numbers among the many attributes beside or above an array, where only clear names count.
+# Names of scales and offsets outside an array's own attributes: in single values beside the array and in
+# attributes of its groups. There, many attributes have nothing to do with the array, so only unambiguous
+# names are listed.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
     r"(z|heights?|data|values?|topography|add)[ _-]?offset",
@@ -47,10 +51,10 @@ Read = Callable[[], Array]
 
 @dataclass(frozen=True)
 class Coordinate:
-    """The positions along one dimension in the unit that the file states. If the file states only a length,
-    there are no positions.
+    """The positions of the pixels along one dimension of an array.
 
-    ``axis`` is x or y if the file states the axis in addition to the name of the dimension.
+    ``values`` contains the positions, in ``unit``. It is None if the file states only a ``length``. ``axis``
+    is "x" or "y" if the file names the axis in addition to the dimension.
     """
 
     values: Array | None
@@ -59,7 +63,7 @@ class Coordinate:
     axis: str = ""
 
     def extent(self, count: int) -> float | None:
-        """Return the length from edge to edge; None if unknown.
+        """Return the length from edge to edge of ``count`` pixels, or None if it is unknown.
 
         Raises:
             InputError: the steps are uneven.
@@ -76,11 +80,12 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Held:
-    """An array in a file: its type and shape, a function that reads it, and what the file says about it.
+    """An array in a file, which is read only when needed: its type and shape, a function that reads it, and
+    what the file says about it.
 
-    ``dims`` are the names of its dimensions. ``coordinates`` maps the names of dimensions to their
-    coordinates; it may include dimensions of other arrays in the file. ``around`` contains the single values
-    beside the array and the attributes of the groups that contain it.
+    ``dims`` contains the names of the array's two dimensions. ``coordinates`` maps names of dimensions to
+    their coordinates, and may include dimensions of other arrays in the file. ``around`` contains the single
+    values that are stored beside the array, and the attributes of the groups that contain it.
     """
 
     dtype: np.dtype
@@ -93,7 +98,7 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """Wrap an array that was already read."""
+        """Wrap an array that has already been read; ``described`` is passed on as the further fields."""
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
 
@@ -104,14 +109,14 @@ class Held:
 
 
 def array_channel(name: str, held: Held) -> Channel:
-    """Make the channel of a two-dimensional array. Its indices are [y, x] unless the names of its dimensions
-    say otherwise.
+    """Make the channel of a two-dimensional array. The array is indexed [y, x] unless the names of its
+    dimensions say otherwise.
 
-    x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
+    In the channel, x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
 
     Raises:
-        InputError: the array has attributes that change the values in an unknown way (the message names
-            them), values that are not real numbers, or coordinates that are not evenly spaced.
+        InputError: the array has attributes that may scale its values in an unknown way (the message names
+            them), its values are not real numbers, or its coordinates are not evenly spaced.
     """
     says = {key: _plain(value) for key, value in held.attributes.items()}
     beside = {key: _plain(value) for key, value in held.around.items()}
@@ -157,10 +162,10 @@ def array_channel(name: str, held: Held) -> Channel:
 
 
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
-    """Return the names of y and x, and whether the first index runs along x.
+    """Return the names of the dimensions along y and x, and whether the array's first index runs along x.
 
-    If neither dimension has coordinates, but the file contains coordinates of matching lengths that are named
-    x and y, these are used.
+    If neither dimension of the array has coordinates, but the file contains coordinates named x and y whose
+    lengths match the array, these are used.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
@@ -181,7 +186,7 @@ def _changes(key: str, value: Any, counts: bool) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value to a number, a text, or a list of numbers."""
+    """Convert an attribute's value to a number, a text, or a list of numbers."""
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     if isinstance(value, Array):
@@ -190,7 +195,10 @@ def _plain(value: Any) -> Any:
 
 
 def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
-    """Find missing pixels by comparing the numbers as stored in the file, and then apply scale and offset."""
+    """Read the values, set missing pixels to NaN, and apply scale and offset.
+
+    Marks of missing pixels are compared with the numbers as stored, that is before scaling.
+    """
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
     values = np.asarray(raw(), dtype=float)
@@ -202,9 +210,10 @@ def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
 
 
 def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
-    """Make one channel per map in a file without groups; ``around`` is what the file says about all of them.
+    """Make one channel per two-dimensional array in a file without groups.
 
-    Arrays along one dimension are coordinates, and single values describe all other arrays.
+    One-dimensional arrays are taken as coordinates, and single values as descriptions of all maps. ``around``
+    contains the attributes of the whole file.
     """
     lines = {name: _coordinate(one.read(), one.attributes) for name, one in arrays.items() if _is_line(one)}
     single = {name: one.read().ravel()[0] for name, one in arrays.items() if _size(one) == 1}
@@ -219,8 +228,9 @@ def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
-    """Read one channel per two-dimensional dataset of an open HDF5 file; MATLAB stores datasets column by
-    column.
+    """Read one channel per two-dimensional dataset of an open HDF5 file.
+
+    MATLAB stores arrays column by column, so in its files the first index runs along x.
     """
     datasets: list[Any] = []
     file.visititems(
@@ -238,12 +248,12 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 
 
 def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
-    """Return the names of those arrays that are masks, by shape."""
+    """Return the names of the arrays that are masks (of type bool), as a dictionary from their shapes."""
     return {one.shape: name for name, one in arrays if one.dtype.kind == "b"}
 
 
 def _refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Refuse a map if the file has a mask of the same shape, because the mask's meaning is unknown."""
+    """Reject a map if the file has a mask of the same shape, because it is unknown what the mask marks."""
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")
 
@@ -278,8 +288,8 @@ def _hdf5_array(path: Path, item: Any, matlab: bool) -> Held:
 
 
 def _is_line(array: Any) -> bool:
-    """Return whether an array contains numbers along one dimension. In MATLAB files, such an array has a
-    second dimension of length 1.
+    """Return whether an array contains numbers along a single dimension. Other dimensions of length 1 do not
+    count, because MATLAB stores a vector as a matrix with one row or column.
     """
     return array.dtype.kind in _NUMBERS and _size(array) > 1 and max(array.shape) == _size(array)
 
@@ -311,8 +321,9 @@ def _coordinate(values: Array, attributes: Facts) -> Coordinate:
 
 
 def read_netcdf(path: Path) -> list[Channel]:
-    """Read one channel per two-dimensional variable of a NetCDF 3 file; attributes with CF names give scale,
-    unit and missing pixels.
+    """Read one channel per two-dimensional variable of a NetCDF 3 file.
+
+    Scale, unit and missing pixels are taken from attributes named as in the CF conventions.
     """
     from scipy.io import netcdf_file
 
@@ -327,7 +338,7 @@ def read_netcdf(path: Path) -> list[Channel]:
 
 
 def read_matlab(path: Path) -> list[Channel]:
-    """Read one channel per matrix of a MATLAB file, with rows along y."""
+    """Read one channel per matrix of a MATLAB file. A row of the matrix is a row of the map."""
     if path.open("rb").read(len(_MATLAB_7)) == _MATLAB_7:
         import h5py
 

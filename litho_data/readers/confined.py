@@ -1,8 +1,8 @@
 """Run other projects' parsers in a child process, within limits of time and memory.
 
 A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
-that reads files starts one child with its first file and keeps it. A new child is needed only after a parser
-has exceeded a limit.
+that reads files starts one child process at its first file and uses it for all files. A new child is started
+only after a parser has exceeded a limit or crashed.
 """
 
 import atexit
@@ -25,21 +25,27 @@ from litho_data.readers.reader import DAMAGED, foreign_parser
 T = TypeVar("T")
 
 _MIB = 1 << 20
-# Intact files need a hundredth of this time and a tenth of this memory.
+# The limits of computing time and memory: a constant, plus a part that grows with the size of the file.
+# Undamaged files need about a hundredth of this time and a tenth of this memory.
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
-# Largest ratio of waiting time to computing time. A busy machine stays below it; a parser that waits for
-# something does not.
+# The longest wait for a result, in multiples of the computing time allowed. A parser on a busy computer
+# answers within this time, but a parser that waits for something never does.
 _WAITING_PER_COMPUTING = 20
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 
 
 def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, ...]) -> T:
-    """Run a function that parses a file, and return its result; any error becomes one InputError about the
+    """Run a function that parses a file, and return its result. Any error becomes one InputError about the
     file.
 
-    ``parsers`` names modules that the function needs. The function then runs in the child process and must be
-    picklable. Without POSIX it runs in this process.
+    Args:
+        function: the function, which takes no argument.
+        path: the file that it parses. The limits depend on the size of the file.
+        kind: the format, in words for messages.
+        parsers: names of other projects' modules that the function needs. If any are named, the function runs
+            in the child process and must be picklable. On systems other than POSIX, it always runs in this
+            process.
     """
     guarded = partial(_guarded, function, kind)
     return _CHILD.call(guarded, path, parsers) if parsers and os.name == "posix" else guarded()
@@ -51,7 +57,7 @@ def _guarded(function: Callable[[], T], kind: str) -> T:
 
 
 class _Child:
-    """One child process, started when it is first needed and again after it has ended."""
+    """One child process. It is started when it is first needed, and started again if it has ended."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -59,10 +65,10 @@ class _Child:
         self._owner = 0
 
     def call(self, function: Callable[[], Any], path: Path, imports: tuple[str, ...]) -> Any:
-        """Return the function's result.
+        """Run the function in the child, and return its result.
 
         Raises:
-            InputError: the function raised it, took too long, needed too much memory or crashed.
+            InputError: the function raised an InputError, took too long, needed too much memory or crashed.
         """
         size = path.stat().st_size
         computing_s = _COMPUTING_S + _COMPUTING_S_PER_MIB * size / _MIB
@@ -77,14 +83,14 @@ class _Child:
             except (EOFError, OSError) as error:
                 raise InputError("cannot be read", got=self._end(error, computing_s), hint=DAMAGED) from error
             except BaseException:
-                self.stop()  # A late answer must not count as the answer for the next file.
+                self.stop()  # otherwise, a late answer would be taken for the answer about the next file
                 raise
         if refusal:
             raise InputError(refusal)
         return result
 
     def _start(self) -> None:
-        # A forked copy of this process must not talk to its parent's child.
+        # A forked copy of this process must start its own child and not use that of the original process.
         if self._process is not None and self._owner == os.getpid() and self._process.poll() is None:
             return
         self._pipe, far_end = Pipe()
@@ -101,7 +107,7 @@ class _Child:
         self._owner = os.getpid()
 
     def _end(self, error: Exception, computing_s: float) -> str:
-        """Say why there is no answer."""
+        """End the child, and return the reason for the missing answer in words for a message."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
             self._process.kill()
@@ -120,7 +126,9 @@ class _Child:
 
 
 def serve(descriptor: int) -> None:
-    """Run one function after another in the child until its parent is gone."""
+    """Receive functions in the child process, run them and send back their results, until the parent process
+    has ended.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe = Connection(descriptor)
     with suppress(EOFError):
@@ -139,13 +147,15 @@ def serve(descriptor: int) -> None:
 
 @contextmanager
 def _limits(computing_s: float, memory: int) -> Iterator[None]:
-    """End the process when it has used this much computing time. Raise MemoryError if it needs more than this
-    number of additional bytes.
+    """Limit the block's computing time in seconds and its additional memory in bytes.
+
+    If the block computes for longer, a signal ends the process. If it needs more memory, Python raises
+    MemoryError.
     """
     import resource
 
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
-    with suppress(OSError):  # only Linux tells how much memory is in use
+    with suppress(OSError):  # only Linux states in this file how much memory is in use
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, unlimited[1]))
     signal.setitimer(signal.ITIMER_PROF, computing_s)

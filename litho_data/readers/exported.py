@@ -1,4 +1,6 @@
-"""Read the levels of files that the design package exported for a printer, with the help of sidecars."""
+"""Read the levels from files that the design package exported for a printer. The sidecar, a JSON file beside
+each exported file, says how to read it.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,11 @@ _STL_HEADER_BYTES = 80
 
 
 def export_of(file: Path) -> dict[str, Any]:
-    """Return the sidecar that the design package wrote for an exported file; empty for other files.
+    """Return the content of the sidecar that the design package wrote beside an exported file. It is empty if
+    the file has no such sidecar.
 
     Raises:
-        InputError: the sidecar belongs to another file.
+        InputError: the file is not the one that the sidecar describes, because its SHA-256 differs.
     """
     path = file.with_name(f"{file.name}.json")
     try:
@@ -42,10 +45,15 @@ def export_of(file: Path) -> dict[str, Any]:
 
 
 def exported_levels(path: Path, says: Facts) -> Array:
-    """Return the levels of the element alone, uint8 (ny, nx) with row 0 at the top.
+    """Return the levels of the designed element, without alignment marks. The array is uint8 of shape (ny,
+    nx) with row 0 at the top.
+
+    Args:
+        path: the exported file.
+        says: the content of its sidecar, from ``export_of``.
 
     Raises:
-        InputError: an incomplete sidecar, or a file that does not match it.
+        InputError: the sidecar is incomplete, or the file does not match it.
     """
     levels = exported_rows(path, says)[:]
     if marks := says.get("marks"):
@@ -55,11 +63,11 @@ def exported_levels(path: Path, says: Facts) -> Array:
 
 
 def exported_rows(path: Path, says: Facts) -> Any:
-    """Return the levels of a whole file, including alignment marks. For TIFF and GDS, only the requested rows
-    are read.
+    """Return the levels of a whole exported file, including its alignment marks, as an array or an object
+    that is sliced by rows. For TIFF and GDS, such an object reads only the rows that are requested.
 
     Raises:
-        InputError: as for ``exported_levels``.
+        InputError: the sidecar is incomplete, or the file does not match it.
     """
     with damaged(f"{path}.json"):
         shape, pitch_um, step_um = tuple(says["shape_px"]), says["pitch_um"], says["level_height_um"]
@@ -83,7 +91,7 @@ def exported_rows(path: Path, says: Facts) -> Any:
 
 
 class TiffRows:
-    """The levels on the first page of a TIFF, uint8; only the requested strips are read."""
+    """The levels on the first page of a TIFF, as uint8. Only the strips with the requested rows are read."""
 
     def __init__(self, path: Path):
         import tifffile
@@ -98,10 +106,11 @@ class TiffRows:
 
 
 def _image_levels(path: Path, greys: Sequence[int]) -> Array:
-    """Return levels uint8 (ny, nx) from an exported PNG or BMP.
+    """Read the levels from an exported PNG or BMP. ``greys`` contains the grey value of each level. The
+    result is uint8 of shape (ny, nx).
 
     Raises:
-        InputError: the file is not an image, or a grey value lies between two levels.
+        InputError: the file is not an image, or it contains a grey value that is not in ``greys``.
     """
     import cv2
 
@@ -115,8 +124,10 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Read levels uint8 (ny, nx) with row 0 at the top, from closed polylines. Each polyline begins with its
-    layer and an unused number.
+    """Read the levels from the closed polylines of an exported DXF. The result is uint8 of shape (ny, nx)
+    with row 0 at the top.
+
+    Each polyline begins with its layer, which is the grey value of a level, and a number that is not used.
     """
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)
@@ -131,10 +142,11 @@ def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int])
 def _gwl_levels(
     path: Path, shape: Shape, pitch_um: float, level_height_um: float, pedestal_um: float, slicing_um: float
 ) -> Array:
-    """Read levels uint8 (ny, nx) with row 0 at the top, from the number of slices stacked at each pixel.
+    """Read the levels from an exported GWL file, by counting the slices that are written at each pixel. The
+    result is uint8 of shape (ny, nx) with row 0 at the top.
 
     Raises:
-        InputError: the height of a column of resist is not a whole number of levels.
+        InputError: the slices at a pixel do not add up to a whole number of levels.
     """
     steps = np.zeros((shape[0], shape[1] + 1), np.int32)
     stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
@@ -163,10 +175,11 @@ def _gwl_levels(
 
 
 def read_stl_triangles(path: Path) -> Array:
-    """Return the corners float32 (n, 3, 3) of a binary STL, µm.
+    """Return the corners of the n triangles in a binary STL, in µm. The array is float32 of shape (n, 3, 3),
+    indexed by triangle, corner and coordinate.
 
     Raises:
-        InputError: the length of the file does not match its triangle count.
+        InputError: the length of the file does not match the number of triangles that it states.
     """
     data = path.read_bytes()
     count = (
@@ -180,8 +193,10 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Read the levels of the cells, uint8 (ny, nx) with row 0 at the top, from the upper faces of the solid.
-    Each face lies in one cell.
+    """Read the levels of the cells in an exported STL from the heights of the solid's upper faces. The result
+    is uint8 of shape (ny, nx) with row 0 at the top.
+
+    Each face lies in a single cell of side ``cell_um``.
 
     Raises:
         InputError: a cell has no upper face.

@@ -1,5 +1,6 @@
-"""Read GDSII files of the design package, one band of rows at a time. They contain rectangles in repeated
-cells.
+"""Read the levels from GDSII files that the design package wrote, one band of rows at a time.
+
+Such a file describes the layout by rectangles in cells, which are placed repeatedly.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 _UNIT_M, _PRECISION_M = 1e-6, 1e-9
-# Side of the blocks into which the design package cuts a layout, px.
+# Side of the blocks into which the design package divides a layout, in px.
 _BLOCK_PX = 128
 # Number of shapes that are read at once.
 _CHUNK = 1 << 10
 _CELL_NAME, _REFERENCE_NAME, _PLACE, _END_LIBRARY = 0x0606, 0x1206, 0x1003, 0x0400
 
-# One rectangle: the records BOUNDARY, LAYER, DATATYPE 0, XY of five corners, ENDEL, one after the other.
+# One rectangle consists of these records, one after the other: BOUNDARY, LAYER, DATATYPE 0, XY with five
+# corners, and ENDEL.
 _RECTANGLE = np.dtype(
     [
         ("start", ">u8"),
@@ -33,7 +35,7 @@ _START = 0x0004080000060D02
 
 
 class GdsRows:
-    """The levels of a GDS file, uint8 with row 0 at the top; only the requested rows are read."""
+    """The levels of a GDS file, as uint8 with row 0 at the top. A slice of rows reads only these rows."""
 
     def __init__(self, path: Path, shape: Shape, pitch_um: float, layers: str):
         self.shape = shape
@@ -42,7 +44,7 @@ class GdsRows:
         self._shapes: dict[str, tuple[int, int]] = {}
         self._references: dict[str, list[tuple[str, int, int]]] = {}
         self._index()
-        # Every row of blocks, with its lower left corner in pixels.
+        # The cell of every row of blocks, with the position of its lower left corner in pixels.
         self._bands = [
             (round((x + dx) / self._step), round((y + dy) / self._step), cell)
             for name, x, y in self._references["LAYOUT"]
@@ -52,8 +54,8 @@ class GdsRows:
     def __getitem__(self, rows: slice) -> Array:
         top, bottom, _ = rows.indices(self.shape[0])
         low, high = self.shape[0] - bottom, self.shape[0] - top
-        # A rectangle is the sum of its four corners: each corner adds a constant, of either sign, above and
-        # to the right of it.
+        # A rectangle is added through its four corners: each adds or subtracts the level everywhere above and
+        # to the right of the corner. The sums over rows and columns do this for all corners at once.
         steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
@@ -70,12 +72,12 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """For every cell, find the position of its shapes in the file, and find the other cells to which it
-        refers.
+        """Find, for every cell, the position of its rectangles in the file and the other cells that it
+        places.
         """
         at, cell, name = 0, "", ""
         while True:
-            # Only the records of shapes are longer than this.
+            # 64 bytes hold any record that is used here. Only records of rectangles are longer.
             part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
             length, kind = struct.unpack(">HH", part[:4])
             body = part[4:length]
@@ -93,7 +95,7 @@ class GdsRows:
             at += length
 
     def _shapes_from(self, at: int) -> int:
-        """Return the number of rectangles that follow in the file."""
+        """Return the number of rectangles that follow one another in the file from byte ``at`` on."""
         count = 0
         while True:
             start = at + count * _RECTANGLE.itemsize

@@ -1,4 +1,6 @@
-"""Read and write Gwyddion Simple Field: a text header, NUL padding, little-endian float32 rows."""
+"""Read and write the format Gwyddion Simple Field (GSF). A file consists of a text header, one to four NUL
+bytes, and the rows of the field as little-endian float32.
+"""
 
 from pathlib import Path
 
@@ -14,7 +16,7 @@ _UM_PER_M = 1e6
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read the one field of a GSF file; it has a unit and a size only if the header states them.
+    """Return the only channel of a GSF file. It has a unit and a size only if the header states them.
 
     Raises:
         InputError: the file is not a GSF file, its header lacks XRes or YRes or contains a scale, or the
@@ -27,7 +29,8 @@ def read_channels(path: Path) -> list[Channel]:
     header = _parse_header(raw[len(_MAGIC) : header_end if header_end >= 0 else None])
     refuse_scales(header)
     shape = (_count(header, "YRes"), _count(header, "XRes"))
-    # There is at least one NUL, even if the header already ends on a multiple of four.
+    # The data start at a multiple of four bytes. At least one NUL precedes them, even if the header itself
+    # ends at such a multiple.
     start = (header_end // _ITEM + 1) * _ITEM
     wanted = shape[0] * shape[1] * _ITEM
     if header_end < 0 or len(raw) - start != wanted:
@@ -76,8 +79,12 @@ def _size_um(header: dict[str, str]) -> YX | None:
 
 
 def gsf_bytes(height_um: Array, pitch_um: YX | None, title: str = "") -> bytes:
-    """Return the bytes of a GSF file of heights (ny, nx) in µm, stored as float32 metres; NaN where not
-    measured.
+    """Return the bytes of a GSF file. Heights are stored as float32 in metres.
+
+    Args:
+        height_um: heights in µm, shape (ny, nx), NaN where not measured.
+        pitch_um: pitch (y, x) in µm; without it, the file states no size.
+        title: name of the field.
     """
     ny, nx = height_um.shape
     fields = {"XRes": str(nx), "YRes": str(ny), "ZUnits": "m", "Title": " ".join(title.split())}

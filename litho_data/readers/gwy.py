@@ -1,4 +1,4 @@
-"""Read Gwyddion's own files: every data field becomes a channel, and masks are kept."""
+"""Read Gwyddion's own files. Every data field becomes a channel, and its mask is kept."""
 
 import re
 import struct
@@ -12,16 +12,17 @@ from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, one_by_one
 
 _MAGIC = b"GWYP"
-# Types of single values; the capital letter stands for an array of the same type.
+# The types of single values, by their letter in the file. The capital letter stands for an array of the type.
 _NUMBERS = {"b": "?", "c": "u1", "i": "<i4", "q": "<i8", "d": "<f8"}
 _FIELD_KEY = re.compile(r"/(\d+)/data")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per data field; heights under a mask are kept, together with the mask.
+    """Return one channel per data field. Masked pixels keep their heights, and the mask is returned with
+    them.
 
-    A pixel counts as masked where the mask is above zero. The metadata that Gwyddion keeps for a channel
-    becomes the channel's header.
+    A pixel is masked if Gwyddion's mask is above zero there. The metadata that Gwyddion stores for a channel
+    become the channel's header.
 
     Raises:
         InputError: the file is not a Gwyddion file.
@@ -68,15 +69,20 @@ def _pixels(what: str, field: dict[str, Any], shape: Shape) -> Array:
 
 
 def _unit(field: dict[str, Any], key: str) -> str | None:
-    """Return the unit; None if Gwyddion states no unit, as it does for pure numbers."""
+    """Return the unit, or None if Gwyddion states an empty one, as it does for pure numbers."""
     return str(field.get(key, {}).get("unitstr", "")) or None
 
 
 def _object(data: bytes, start: int, limit: int) -> tuple[dict[str, Any], int]:
-    """Read the components of an object by name; also return where the object ends.
+    """Return the components of an object by name, and the position where the object ends.
+
+    Args:
+        data: the bytes of the file.
+        start: position where the object starts.
+        limit: position that the object must not exceed.
 
     Raises:
-        EOFError, struct.error: a stated size does not fit the file.
+        EOFError, struct.error: a size that the file states exceeds the file or the enclosing object.
     """
     _, at = _text(data, start, limit)
     end, at = at + 4 + _count(data, at), at + 4
@@ -116,7 +122,7 @@ def _count(data: bytes, at: int) -> int:
 
 
 def _text(data: bytes, start: int, limit: int) -> tuple[str, int]:
-    """Return the text before the closing NUL, and the position after it."""
+    """Return the text from ``start`` to the next NUL, and the position after that NUL."""
     end = data.find(b"\0", start, limit)
     if end < 0:
         raise EOFError(f"a string at {start} does not end")

@@ -1,4 +1,6 @@
-"""Read HDF5 files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results), and all others."""
+"""Read HDF5 files: those of known programs (JPK's series, Nanosurf's NHF, TopoStats' results) by their own
+conventions, and those of all other programs as self-describing arrays.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -16,7 +18,7 @@ _JPK = b"JPK SCAN"
 _UM_PER_M = 1e6
 _UM_PER_NM = 1e-3
 _NANOSURF = "nsf_file_version_major"
-# Names of each attribute in versions 2 and 1 of Nanosurf's files.
+# The name of each attribute in version 2 of Nanosurf's files, followed by its name in version 1.
 _NAMES, _LOW, _HIGH, _UNIT = (
     ("signal_name", "name"),
     ("signal_calibration_min", "base_calibration_min"),
@@ -27,13 +29,14 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per signal and direction from JPK and Nanosurf files. From TopoStats files, read the
-    flattened image and the raw image, both in nm.
+    """Return the channels of an HDF5 file.
 
-    Thumbnails, traces of grains and other tables are skipped.
+    From JPK and Nanosurf files, one channel is read per signal and direction (trace and retrace). From
+    TopoStats files, the flattened image and the raw image are read, both in nm. Thumbnails, traces of grains
+    and other tables in these files are skipped. Other files are read by ``read_hdf5``.
 
     Raises:
-        InputError: the file is damaged, or contains no map.
+        InputError: the file is damaged.
     """
     import h5py
 
@@ -52,8 +55,10 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
-    """Read the signals of one measurement: values (pixel, frame), with pixels in the order of
-    ``Position_Indices``.
+    """Return the channels of one measurement in a JPK file, one per signal and frame.
+
+    The values of a signal have shape (pixels, frames). The dataset ``Position_Indices`` contains the column
+    and row of each pixel.
     """
     grid = {key: measurement.attrs[f"position-pattern.grid.{key}"] for key in ("ilength", "jlength")}
     size_m = [float(measurement.attrs[f"position-pattern.grid.{key}length"]) for key in "vu"]
@@ -83,8 +88,8 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
 
 
 def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: float) -> Loaded:
-    """Read values in the default calibration. The y axis of the grid points up, so the rows are returned in
-    reverse order.
+    """Read the values of one frame, converted with the file's default calibration. JPK counts rows from the
+    bottom, so the rows are returned in reverse order.
     """
     column, row = positions().astype(int).T
     values = np.full((row.max() + 1, column.max() + 1), np.nan)
@@ -93,7 +98,7 @@ def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: f
 
 
 def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
-    """Read one channel per signal of every image and direction; other groups contain no images."""
+    """Return one channel per signal, for every image and direction. Groups without images are skipped."""
     import h5py
 
     channels = []
@@ -110,8 +115,10 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """Make a channel from counts. The range of their integer type corresponds to the calibrated range. Rows
-    and columns stay as stored.
+    """Make the channel of a signal that is stored as integer counts.
+
+    The full range of the integer type corresponds to the calibrated range that the file states. Rows and
+    columns stay as stored.
     """
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])

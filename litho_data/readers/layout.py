@@ -1,4 +1,6 @@
-"""Read layouts (what was sent to the printer) as integer levels, from files of levels or greyscale images."""
+"""Read layouts (what was sent to the printer) as integer levels. The file contains the levels or grey values
+that stand for levels.
+"""
 
 from pathlib import Path
 
@@ -19,27 +21,28 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Read the levels of a layout (ny, nx) with row 0 at the top, as uint8, or as uint16 above 256 levels.
+    """Read the level numbers of a layout as an array of shape (ny, nx) with row 0 at the top.
 
-    The file may be TIFF (with any compression that tifffile and imagecodecs support), PNG, BMP or NPY; a
-    colour image is treated as greyscale if its channels are identical. A file in any format that the design
-    package exported is read with the help of the sidecar beside it.
+    The array is uint8, or uint16 for more than 256 levels. The file may be TIFF (with any compression that
+    tifffile and imagecodecs support), PNG, BMP or NPY. A colour image is treated as greyscale if its channels
+    are identical. A file that the design package exported, in any of its formats, is read with the help of
+    its sidecar (the JSON file beside it).
 
     Args:
         path: the file.
-        grey_per_level: difference between the grey values of neighbouring levels, if the file is a greyscale
-            image of the layout.
-        levels: number of levels, by default at most 256. If the file contains larger values, it is read as a
-            greyscale image in which white is the highest level, provided that all values are multiples of the
-            grey step.
-        average_px: side of a square in pixels, for an image with only two grey values. Each square becomes
-            one pixel of the layout, whose level is the number of lighter pixels in the square. Pixels that
-            remain at the right and at the bottom are cropped.
+        grey_per_level: difference between the grey values of two successive levels, if the file is a
+            greyscale image of the layout.
+        levels: number of levels of the layout; by default, up to 256 levels are accepted. If the file
+            contains values too large for level numbers, it is read as a greyscale image in which white is the
+            highest level. All its values must then be multiples of the same grey step.
+        average_px: side of a square in pixels, for an image with only two grey values. Each square of the
+            image becomes one pixel of the layout, whose level is the number of lighter pixels in the square.
+            Pixels at the right and at the bottom that do not fill a square are cropped.
 
     Raises:
-        InputError: the file does not exist, is damaged, has a format that is not supported or is a true
-            colour image; its values are neither levels nor multiples of the grey step; or its sidecar belongs
-            to another file.
+        InputError: the file does not exist, is damaged, has a format that is not supported, or has pixels
+            whose colours differ; its values are neither levels nor multiples of the grey step; or its sidecar
+            belongs to another file.
     """
     file = require_file(path)
     if says := export_of(file):
@@ -60,7 +63,7 @@ def read_layout(
 
 
 def _averaged(file: Path, pixels: Array, side: int) -> Array:
-    """Count the light pixels in squares of an image with two grey values."""
+    """Count the light pixels in each square of ``side`` pixels, in an image with two grey values."""
     ny, nx = (length // side for length in pixels.shape)
     greys = np.unique(pixels)
     if len(greys) > 2 or not ny * nx:
@@ -72,7 +75,9 @@ def _averaged(file: Path, pixels: Array, side: int) -> Array:
 
 
 def _white_step(pixels: Array, levels: int | None) -> float:
-    """Return the grey step of an image in which white is the highest level; 1 if the file contains levels."""
+    """Return the difference between the grey values of successive levels, in an image in which white is the
+    highest level. Return 1 if the file contains the level numbers themselves.
+    """
     if levels is None or pixels.max() < levels:
         return 1.0
     for step in (one for white in _WHITE for one in (white / (levels - 1), float(white // (levels - 1)))):

@@ -1,4 +1,6 @@
-"""Handle missing pixels, which a file marks by a number or a word. The caller must state these marks."""
+"""Handle missing pixels. A file may mark them with a number or a word, and the caller must state these
+marks.
+"""
 
 from collections.abc import Sequence
 
@@ -10,26 +12,26 @@ from litho_data.readers.text_blocks import WORDS
 
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
-# Apart from the usual marks, an extreme value counts as a mark if its distance from the other values exceeds
-# this multiple of their span. For a single pixel, the second limit applies.
+# An extreme value that is not one of the usual marks looks like a mark if its distance from the other values
+# exceeds this multiple of their span. If only one pixel has the value, the second multiple applies.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
-# Relative tolerances for equal values: values may be stored as float32, and very large values are written
-# with few digits.
+# Values count as equal within these relative tolerances, because they may be stored as float32. Values above
+# the limit _LARGE are written with few digits, so their tolerance is wider.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# An extreme value is suspicious if it fills at least this share of the pixels, this number of pixels, and
-# this multiple of the mean count of a value.
+# The lowest or highest value is suspicious if it fills at least this share of the pixels, at least this
+# number of pixels, and at least this multiple of the number of pixels that a value fills on average.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
 def without_missing(channel: Channel, values: Array, missing: Sequence[float | str] | None) -> Array:
-    """Return the values, with NaN in place of the marks of missing pixels.
+    """Return the values of a channel, with NaN in place of the marks of missing pixels.
 
     Args:
-        channel: what was read.
-        values: (ny, nx) as in the file.
-        missing: the numbers and words that mark missing pixels. An empty list means that there are no marks,
-            and None means that the caller does not know.
+        channel: the channel from which the values were read.
+        values: array of shape (ny, nx) of the numbers in the file.
+        missing: the numbers and words that mark missing pixels. An empty list says that there are no marks.
+            None says that the caller does not know of any.
 
     Raises:
         InputError: the file contains a word that is not in ``missing``, or ``missing`` is None and a number
@@ -73,8 +75,8 @@ def _marks(values: Array) -> list[tuple[float, int]]:
 
 
 def extreme_note(values: Array) -> str:
-    """Return a note if the lowest or highest value of a map occurs in many pixels; otherwise, return an empty
-    text.
+    """Return a warning if the lowest or highest value of a map occurs in suspiciously many pixels, otherwise
+    an empty text.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     if not len(numbers):

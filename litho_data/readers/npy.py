@@ -1,4 +1,4 @@
-"""Read NumPy arrays from ``.npy`` and ``.npz`` files; pickled objects are refused."""
+"""Read NumPy arrays from ``.npy`` and ``.npz`` files. Pickled objects are never loaded."""
 
 import zipfile
 from functools import partial
@@ -19,10 +19,10 @@ _READ_HEADER = {
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read the one channel of a two-dimensional array; a ``.npy`` file states neither unit nor size.
+    """Return the only channel of a ``.npy`` file. The file states neither unit nor size.
 
     Raises:
-        InputError: the file is damaged, or is not a two-dimensional array of numbers.
+        InputError: the file is damaged, or does not contain a two-dimensional array of real numbers.
     """
     array = load_array(path)
     if array.ndim != 2:
@@ -31,9 +31,10 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def read_archive(path: Path) -> list[Channel]:
-    """Read one channel per two-dimensional array of numbers in an ``.npz`` file; other arrays are skipped.
+    """Return one channel per two-dimensional array of numbers in an ``.npz`` file.
 
     Single values and one-dimensional arrays in the same file give the unit and the axes, as in a MATLAB file.
+    Other arrays are skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -58,10 +59,10 @@ def _member(path: Path, name: str) -> Array:
 
 
 def load_array(path: Path) -> Array:
-    """Memory-map the array of a ``.npy`` file without reading it.
+    """Return the array of a ``.npy`` file as a memory map, so that its values are read only when used.
 
     Raises:
-        InputError: the file is damaged or contains pickled objects, or the values are not real numbers.
+        InputError: the file is damaged or contains pickled objects, or its values are not real numbers.
     """
     with foreign_parser("NPY"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -75,7 +76,10 @@ def load_array(path: Path) -> Array:
 
 
 def _is_archive(head: bytes) -> bool:
-    """Return whether the first file in a ZIP archive is an array. Its name follows a header of 30 bytes."""
+    """Return whether a file begins like a ZIP archive whose first member is a ``.npy`` file.
+
+    The name of the first member follows a header of 30 bytes.
+    """
     length = int.from_bytes(head[26:28], "little")
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 

@@ -15,16 +15,18 @@ _GZIP = b"\x1f\x8b"
 _SURF, _PACKED_SURF = b"DIGITAL SURF", b"DSCOMPRESSED"
 _MOST_BYTES = 1 << 30
 _PIECE = 1 << 20
-# Position of the sizes of the comment and the private zone, which follow Digital Surf's header of 512 bytes.
+# Digital Surf's header has 512 bytes. A comment and a private zone follow it; their sizes stand in the header
+# at byte 334.
 _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """Yield the file itself, or a temporary file with the unpacked content.
+    """Yield the path of the file itself, or, if the file is packed, that of a temporary file with the
+    unpacked content.
 
     Raises:
-        InputError: the file is damaged, or contains more than 1 GiB.
+        InputError: the file is damaged, or its content is larger than 1 GiB.
     """
     with path.open("rb") as stream:
         head = stream.read(len(_PACKED_SURF))
@@ -51,8 +53,10 @@ def _unpack_gzip(path: Path, content: Path) -> None:
 
 
 def _unpack_surf(path: Path, content: Path) -> None:
-    """Copy the header, the comment and the private zone, and append the unpacked streams. In the file, the
-    private zone is followed by the number of streams, then by their sizes, and then by the streams.
+    """Write an unpacked copy of a compressed Digital Surf file.
+
+    The copy consists of the header, the comment, the private zone and the unpacked streams. In the compressed
+    file, the private zone is followed by the number of streams, their sizes, and the compressed streams.
     """
     raw = path.read_bytes()
     start = _SURF_HEADER + sum(struct.unpack_from("<2H", raw, _SURF_ZONES))

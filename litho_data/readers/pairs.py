@@ -1,7 +1,8 @@
-"""Read fields in the authors' pair format: 8-bit layouts and heights, cut into four quadrants.
+"""Read printed fields in the pair format of the paper's authors. Each field is stored as pairs of 8-bit
+images, one of the layout and one of the heights, and may be cut into four quadrants.
 
-A grey value stands for value / 255 · full scale. The format has no mask of valid pixels, no negative heights
-and only 256 grey values, so it loses accuracy.
+In an image of heights, a grey value stands for the height grey value / 255 · full scale. The format has no
+mask of valid pixels, no negative heights and only 256 grey values, so it loses accuracy.
 """
 
 from collections.abc import Sequence
@@ -18,11 +19,18 @@ GREY_MAX = 255
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
 ) -> dict[str, Array]:
-    """Join the quadrants of one field. ``files`` contains all layouts, followed by all heights, both in the
-    order of ``quadrants``.
+    """Join the quadrants of one field, and return the arrays of the field by name.
+
+    Args:
+        files: the images of the layout, followed by the images of the heights, both in the order of
+            ``quadrants``.
+        quadrants: the numbers of the quadrants, 1 to 4, or only 0 for an undivided field.
+        full_scale_um: for each image of heights, the height that grey value 255 stands for.
+        levels: number of levels that the layout may have.
 
     Raises:
-        InputError: a file is unreadable, quadrants have different sizes, or levels exceed the stated number.
+        InputError: a file is unreadable, the images have different sizes, or a layout contains a level that
+            exceeds ``levels - 1``.
     """
     images = [read_layout(path) for path in files]
     if len({image.shape for image in images}) != 1:
@@ -44,7 +52,10 @@ def stitch_field(
 
 
 def quadrant_slices(quadrant: int, shape: Shape) -> tuple[slice, slice]:
-    """Return the rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
+    """Return the slices of the rows and columns of a quadrant in a field of the given shape.
+
+    Quadrants 1 to 4 are numbered row by row, and quadrant 0 is the whole field.
+    """
     if quadrant == 0:
         return slice(None), slice(None)
     ny, nx = shape[0] // 2, shape[1] // 2

@@ -1,4 +1,4 @@
-"""Read pictures with one grey value per pixel, from TIFF, PNG, BMP and NPY."""
+"""Read pictures that have one grey value per pixel, from TIFF, PNG, BMP and NPY files."""
 
 from pathlib import Path
 
@@ -12,16 +12,17 @@ from litho_data.readers.tiff import open_tiff, require_upright, single_sample
 
 
 def read_picture(path: str | Path, what: str = "picture") -> Array:
-    """Read the stored numbers (ny, nx) with row 0 at the top. A colour image is treated as greyscale if its
-    channels are identical.
+    """Return the stored numbers of a picture as an array of shape (ny, nx) with row 0 at the top.
+
+    A colour image is treated as greyscale if its channels are identical.
 
     Args:
         path: the file.
-        what: the word for the file in messages, such as "layout".
+        what: what messages call the file, such as "layout".
 
     Raises:
-        InputError: the file does not exist, is damaged, has a format that is not supported, is a true colour
-            image, or contains numbers that are not finite.
+        InputError: the file does not exist, is damaged, has a format that is not supported, has pixels whose
+            colours differ, or contains numbers that are not finite.
     """
     file = require_file(path)
     with about(f"{what} {file}"):
@@ -38,7 +39,7 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
 
 
 def value_range(pixels: Array) -> str:
-    """Describe the type and range of the numbers, for messages."""
+    """Return the type and range of the numbers of a picture, in words for messages."""
     if pixels.dtype.kind not in "uif":
         return str(pixels.dtype)
     return f"{pixels.dtype} from {pixels.min():g} to {pixels.max():g}"

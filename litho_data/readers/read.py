@@ -1,4 +1,4 @@
-"""Read one scan: format, channel, unit and size are decided here for all formats."""
+"""Read one scan. This module chooses the channel, unit and size in the same way for all formats."""
 
 import re
 from collections.abc import Sequence
@@ -25,9 +25,10 @@ from litho_data.readers.registry import PICTURE, detect_format, reader_of, requi
 from litho_data.scan import Axis, Scan
 
 _NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
-# Files state sizes rounded to a few digits.
+# Relative tolerance when two stated sizes are compared, because files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
-# A scan's side lies in this range. The range decides the unit of coordinates that have none.
+# The side of a scan lies in this range. If a file states coordinates without a unit, the range decides which
+# unit is possible.
 _SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
@@ -46,24 +47,26 @@ def read_scan(
     """Read one height map.
 
     Args:
-        path: the instrument's file.
+        path: the file that the instrument wrote.
         format: one of ``formats()``, or ``"auto"`` to detect it from the content.
-        unit: unit of the heights, needed if the file states none.
-        size_um: extent (y, x) from edge to edge in µm, for files that state none. If it is not given either,
-            the pitch stays unknown (None).
-        channel: name of the channel to read; needed if a file has several height channels.
-        fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
-        full_scale_um: height of the largest integer value, for images that hold integers: height = value /
-            largest value · full_scale_um. It replaces ``unit``.
-        missing: numbers (as in the file) and words that mark pixels without a measurement, in addition to the
-            marks that the file states. An empty list says that there are no such marks.
-        defaults: if true, ``unit`` and ``size_um`` are ignored if the file states its own. If false, they
-            must not contradict the file.
+        unit: unit of the heights. It is needed if the file does not state the unit.
+        size_um: side lengths (y, x) of the scan in µm, from edge to edge, for files that do not state them.
+            If neither the file nor the caller states the size, the pitch stays unknown (None).
+        channel: name of the channel to read. It is needed if the file has several height channels.
+        fast_axis: ``"x"`` or ``"y"``, the axis along which the tip moved fast, for files that do not state
+            it.
+        full_scale_um: for images of integers, the height in µm that the largest possible integer stands for:
+            height = value / largest integer · full_scale_um. It is given in place of ``unit``.
+        missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
+            to the marks that the file itself states. An empty list says that there are no further marks.
+        defaults: if true, ``unit`` and ``size_um`` are only used if the file does not state the unit or the
+            size. If false, they must agree with what the file states.
 
     Raises:
-        InputError: the file is unreadable; it has no height channel, or several and none was chosen; its unit
-            is missing, or its unit or size is contradictory; a value looks like a mark of missing pixels but
-            is not in ``missing``; the heights are impossible; or none of them is finite.
+        InputError: the file is unreadable; it has no height channel, or it has several and ``channel`` is not
+            given; its unit is missing; its unit or size contradicts the arguments; a value looks like a mark
+            of missing pixels but is not in ``missing``; the heights are impossibly large; or no height is
+            finite.
     """
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
@@ -102,7 +105,7 @@ def read_scan(
 
 
 def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
-    """Return all channels of a file, heights and others, without choosing one.
+    """Return all channels of a file, both those that contain heights and those that do not.
 
     Raises:
         InputError: the file is unreadable or has an unknown format.
@@ -110,7 +113,7 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
     given = require_file(path)
     with about(str(given)), unpacked(given) as file:
         channels = _read_channels(_settle_format(file, format), file)
-    # An unpacked file is gone by the time a channel is loaded.
+    # The temporary unpacked file is deleted before a channel is loaded, so loading must unpack it again.
     return [replace(one, load=partial(_load, given, format, one.name)) for one in channels]
 
 
@@ -170,7 +173,7 @@ def _choose(channels: list[Channel], name: str | None) -> Channel:
 def _settle_unit(
     channel: Channel, values: Array, unit: str | None, full_scale_um: float | None
 ) -> tuple[str, float]:
-    """Return the unit of the file, and the factor from its values to µm."""
+    """Return the unit of the heights, and the factor that converts the values of the file to µm."""
     if full_scale_um is not None:
         if channel.full_scale is None or channel.unit is not None or unit is not None:
             raise InputError("full scale", got=full_scale_um, wanted="an integer image and no unit")
@@ -180,7 +183,7 @@ def _settle_unit(
     if unit is None and channel.unit is None:
         first = ", ".join(f"{value:g}" for value in np.asarray(values)[0, :3])
         raise InputError(
-            "it does not state the unit of its heights",
+            "the file does not state the unit of its heights",
             wanted="the option unit, for example 'm'",
             hint=f"the first row begins {first}: with unit 'm' these are metres, with 'nm' nanometres",
         )
@@ -191,8 +194,8 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """Convert the values to µm; a factor below one is applied as a division, so that 100 nm is exactly 0.1
-    µm.
+    """Multiply the values by the factor to µm. A factor below one is applied as a division, because only then
+    does 100 nm become exactly 0.1 µm.
     """
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
@@ -210,8 +213,10 @@ def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
 
 
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
-    """Return (y, x) in µm for coordinates without a unit. The unit is taken to be µm or the unit of the
-    heights, if only one of the two gives a possible size.
+    """Return the size (y, x) in µm from coordinates whose unit the file does not state.
+
+    Two units are tried: µm, and the unit of the heights. The result is None unless exactly one possible size
+    follows.
     """
     if channel.extent is None or channel.full_scale is not None:
         return None

@@ -1,4 +1,6 @@
-"""The interface of a reader, which recognises a file and describes its channels before they are loaded."""
+"""Define the interface of a reader. A reader recognises a file and describes its channels before they are
+loaded.
+"""
 
 import logging
 import re
@@ -17,16 +19,16 @@ import numpy as np
 from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.scan import Axis
 
-# Largest scan, 2 GiB as float64. A larger size is far more likely to come from a damaged header than from a
-# scan.
+# Largest number of pixels of a scan (2 GiB as float64). A larger number is far more likely to come from a
+# damaged header than from a real scan.
 _MAX_PIXELS = 2**28
-# Largest compression ratio: that of Deflate, the strongest compression in use.
+# Largest ratio of unpacked to packed size. This is the limit of Deflate, the strongest compression in use.
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
-# Words of parsers' messages about a truncated or changed file. Any other message means that the kind of file
-# is unknown.
+# Words that occur in a parser's message if the file is truncated or changed. Any other message is taken to
+# mean that the file is of an unknown kind.
 _CUT = re.compile(
     r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
     r"crc|incomplete|reach(es)? beyond",
@@ -43,21 +45,22 @@ class Channel:
     """One two-dimensional map in a file.
 
     Args:
-        name: unique within the file.
-        shape: (ny, nx) in pixels.
-        unit: unit of the values as the file states it; None if it does not.
-        size_um: (y, x) extent from edge to edge; None if the file does not state it.
-        load: function that returns the values (ny, nx) in ``unit``, with row 0 at the top, and the mask of
-            the file or None.
-        full_scale: the largest value of an integer image; None for real numbers.
-        fast_axis: axis along which the tip moved; None if the file does not state it.
-        header: everything that the file states, as strings.
-        problem: why the channel cannot be read; empty if it can.
-        x_is: the direction in the file that runs along x, in words, such as "a row of the file".
-        extent: (y, x) extent from edge to edge, in a unit that the file does not state.
-        words: words that occur in the file in place of numbers, each with the line where it first occurs. The
-            pixels with these words are NaN.
-        notes: warnings for whoever uses the map.
+        name: name of the channel, unique within the file.
+        shape: shape (ny, nx) of the map in pixels.
+        unit: unit of the values as the file states it; None if the file does not state it.
+        size_um: side lengths (y, x) of the map in µm, from edge to edge; None if the file does not state
+            them.
+        load: function that reads the map. It returns the values in ``unit``, an array of shape (ny, nx) with
+            row 0 at the top, and the file's mask of the same shape, or None if the file has no mask.
+        full_scale: the largest value that the integer type of an image can hold; None for real numbers.
+        fast_axis: axis along which the tip moved fast; None if the file does not state it.
+        header: everything that the file states about the channel, as strings.
+        problem: the reason why the channel cannot be read; empty if it can be read.
+        x_is: which direction in the file runs along x, in words, such as "a row of the file".
+        extent: side lengths (y, x) of the map from edge to edge, if the file states them without a unit.
+        words: words that stand in the file in place of numbers. Each is mapped to the line where it first
+            occurs. The pixels with these words are NaN.
+        notes: warnings for the user of the map.
     """
 
     name: str
@@ -85,13 +88,13 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Return whether the channel may contain heights: its unit is a length, or the file does not state
-        the unit.
+        """Return whether the channel may contain heights. It may if its unit is a length, or if the file does
+        not state its unit.
         """
         return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
-        """Return the name, size and unit in a few words, for messages."""
+        """Return a short description of the channel for messages: its name, size in pixels and unit."""
         if self.problem:
             return f"{self.name!r} (not read: {self.problem})"
         unit = "no unit" if self.unit is None else self.unit
@@ -103,13 +106,16 @@ class Reader:
     """A file format: how to recognise and read it.
 
     Args:
-        name: as in ``format = "…"`` of a card and ``--format`` of the commands.
-        recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
-        read_channels: function that returns the channels of a file, in the order of the file. Any exception
-            here, or when a channel is loaded, becomes one line about the file.
-        parsers: modules of other projects that ``read_channels`` uses. If there are any, ``read_channels``
-            runs in a child process within limits of time and memory, so it must be importable by name, and
-            its results must be picklable.
+        name: name of the format. It is written as ``format = "…"`` in a dataset card and after ``--format``
+            in the commands.
+        recognises: function ``recognises(path, head)`` that returns True if the file has this format.
+            ``head`` contains the first 64 KiB of the file.
+        read_channels: function ``read_channels(path)`` that returns the channels of a file, in the order of
+            the file. If this function or a channel's ``load`` raises any exception, the user sees a one-line
+            message about the file.
+        parsers: names of the modules of other projects that ``read_channels`` uses. If any are named,
+            ``read_channels`` runs in a child process within limits of time and memory. The function must then
+            be importable by name, and its results must be picklable.
     """
 
     name: str
@@ -119,8 +125,8 @@ class Reader:
 
 
 def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
-    """Make a channel. If this fails, make a substitute that says why the channel cannot be read, so that the
-    other channels stay usable.
+    """Make a channel. If this fails, return a substitute channel whose ``problem`` says why it cannot be
+    read, so that the other channels of the file stay usable.
     """
     try:
         with foreign_parser("a map"):
@@ -134,7 +140,7 @@ def _refuse(problem: str) -> Loaded:
 
 
 def in_memory(values: Array) -> Callable[[], Loaded]:
-    """Make a loader for a map that has already been read."""
+    """Return a function for ``Channel.load`` that returns a copy of a map that has already been read."""
     return partial(_copied, values)
 
 
@@ -143,8 +149,8 @@ def _copied(values: Array) -> Loaded:
 
 
 def extent_um(y: float, x: float, unit: str | None) -> YX | None:
-    """Convert a stated extent to (y, x) in µm; return None unless both are positive and the unit is a
-    length.
+    """Convert stated side lengths to (y, x) in µm. Return None unless both are positive and finite and the
+    unit is a length.
     """
     if unit is None or not is_length(unit):
         return None
@@ -153,12 +159,14 @@ def extent_um(y: float, x: float, unit: str | None) -> YX | None:
 
 
 def unknown_content(head: bytes) -> InputError:
-    """Make the error for a file that no reader recognises."""
+    """Return the error to raise for a file that no reader recognises."""
     return InputError("format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
-    """Number channels with the same name, such as trace and retrace, so that each can be chosen."""
+    """Return the channels with unique names. A name that occurs again gets a number, so that each channel can
+    be chosen by its name.
+    """
     seen: dict[str, int] = {}
     unique = []
     for channel in channels:
@@ -169,7 +177,7 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
-    """Silence Python warnings, and silence these loggers up to and including the level ``above``."""
+    """Silence Python warnings, and silence the named loggers up to and including the level ``above``."""
     named = [logging.getLogger(name) for name in loggers]
     levels = [logger.level for logger in named]
     try:
@@ -185,11 +193,14 @@ def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
 
 @contextmanager
 def foreign_parser(kind: str) -> Iterator[None]:
-    """Run another project's parser on a file; turn any exception into one InputError.
+    """Guard a block that runs another project's parser: turn any exception into one InputError.
 
-    If a file is damaged, such parsers raise errors of many types (struct, index, key, value, memory, decode,
-    assertion and types of their own) and log to stderr. A caller could not handle these errors in any useful
-    way.
+    Args:
+        kind: what the file should be, in words for the message, such as ``"TIFF"``.
+
+    On a damaged file, such parsers write to the log and raise errors of many types: struct, index, key,
+    value, memory, decoding and assertion errors, and types of their own. A caller could not handle so many
+    types in any useful way.
     """
     try:
         with quiet(*_LOGGERS):

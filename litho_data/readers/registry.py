@@ -1,4 +1,4 @@
-"""The formats that can be read; a file's format follows from its content, never from its suffix."""
+"""List the formats that can be read, and detect a file's format from its content, never from its suffix."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ from litho_data.foundation import InputError, unknown_name
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
-# Readers are listed in the order in which they are tried: first formats with a signature, then containers and
-# texts that any program writes.
+# Readers are listed in the order in which they are tried. Formats with a signature of their own come first.
+# Containers and text files, which many programs write, come after them.
 _READERS = [
     gsf.READER,
     gwy.READER,
@@ -33,10 +33,10 @@ def formats() -> tuple[str, ...]:
 
 
 def register_reader(reader: Reader) -> Reader:
-    """Register a reader of another format; it is tried before the existing readers.
+    """Register a reader for another format. It is tried before the existing readers.
 
-    To build in several processes, call this in a plug-in, or at the top level of the script that starts the
-    build.
+    A build may start several processes, and each of them must register the reader. Therefore, call this
+    function in a plug-in, or at the top level of the script that starts the build.
 
     Raises:
         InputError: a format of that name already exists.
@@ -60,7 +60,7 @@ def reader_of(format: str) -> Reader:
 
 
 def detect_format(path: Path) -> str:
-    """Return the name of the first format that recognises the file; ``"image"`` for PNG and BMP.
+    """Return the name of the first format whose reader recognises the file, or ``"image"`` for PNG and BMP.
 
     Raises:
         InputError: no format recognises the file.

@@ -1,4 +1,6 @@
-"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), with y upwards."""
+"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7). Their rows run from
+bottom to top.
+"""
 
 import struct
 from pathlib import Path
@@ -9,13 +11,14 @@ from litho_data.foundation import Array, InputError
 from litho_data.readers.reader import Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
-# The value of blank pixels, as float32 and as text with six digits.
+# Pixels with at least this value are blank (not measured). It lies below the value in files with float32 and
+# in text files, which is 1.70141e38.
 _BLANK = 1.7014e38
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read the one grid; its coordinates are those of the pixel centres, in a unit that the file does not
-    state.
+    """Return the only channel of the file, a grid. The coordinates in the file are those of pixel centres,
+    and their unit is not stated.
 
     Raises:
         InputError: the file is not a Surfer grid.
@@ -30,8 +33,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _older(raw: bytes) -> tuple[Array, float, float, float]:
-    """Read the heights and the numbers of columns and rows, with the ranges of x, y and z, from text or
-    binary data.
+    """Return the heights, the steps along y and x, and the value of blank pixels, from a DSAA or DSBB file.
+
+    The file states the numbers of columns and rows, followed by the ranges of x, y and z and the heights.
     """
     if raw.startswith(b"DSAA"):
         numbers = np.array(raw.split()[1:], dtype=float)
@@ -45,7 +49,11 @@ def _older(raw: bytes) -> tuple[Array, float, float, float]:
 
 
 def _sections(raw: bytes) -> tuple[Array, float, float, float]:
-    """Read sections of tag, size and content: GRID contains the geometry, and DATA, after it, the heights."""
+    """Return the heights, the steps along y and x, and the value of blank pixels, from a DSRB file.
+
+    The file consists of sections, each with a tag, a size and a content. The section GRID contains the
+    geometry, and the section DATA after it contains the heights.
+    """
     position = 0
     ny = nx = step_x = step_y = blank = 0
     while True:

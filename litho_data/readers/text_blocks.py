@@ -1,4 +1,4 @@
-"""Cut text files into blocks of numbers, each with the lines of words above it."""
+"""Divide text files into blocks of numbers, and assign to each block the lines of words above it."""
 
 import codecs
 import re
@@ -9,14 +9,14 @@ from pathlib import Path
 from litho_data.foundation import YX, InputError, Shape, is_length, table_beside, um_per
 from litho_data.readers.reader import DAMAGED
 
-# In these expressions, no two neighbouring repetitions match the same characters; otherwise a long line of
-# blanks or digits would take hours.
+# In these expressions, two successive repetitions never match the same characters. Otherwise, matching a long
+# line of blanks or digits would take hours.
 NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf(inity)?", re.IGNORECASE)
 _LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
 _ASSIGNMENT = re.compile(r"[:=]")
 _KEY = re.compile(r"[\w ()>./-]+")
-# A semicolon may also precede the first cell of a row. A spreadsheet's cell with an error, such as #N/A,
-# begins with the character of a comment.
+# A semicolon does not start a comment here, because it may also precede the first cell of a row. An error in
+# a spreadsheet's cell, such as #N/A, is not a comment although it begins like one.
 _COMMENT = re.compile(r"[#%](?!(N/A|NV|NULL|NUM|ZAHL|NOMBRE|DIV|VALUE|WERT|VALEUR|REF|BEZUG|NAME)\b)")
 _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
@@ -30,7 +30,8 @@ _QUOTED = re.compile(r'"([^",\n]*)"')
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = table_beside(__file__, "words.toml")
 _KEYS: dict[str, list[str]] = WORDS["keys"]
-# The unit of a column or of all numbers, as in "Height [nm]". A unit before a number belongs to a length.
+# The unit in the title of a column or of the whole table, as in "Height [nm]". A title that is followed by a
+# number, as in "Height [nm]: 50", states a length and not the unit of the values.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
     r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
@@ -52,8 +53,11 @@ _SCALE_IN_WORDS = re.compile(
 
 @dataclass
 class Block:
-    """A block of consecutive lines of numbers, with the header above the block and the number of its first
-    line.
+    """A block of consecutive lines of numbers, with the header that stands above it.
+
+    ``header`` maps the keys of the header's lines to their values, and ``words`` contains these lines as they
+    stand. ``rows`` contains the lines of numbers as text, and ``first_line`` is the number of the first of
+    them in the file.
     """
 
     header: dict[str, str]
@@ -62,15 +66,15 @@ class Block:
     rows: list[str] = field(default_factory=list)
 
     def first(self, *keys: str) -> str:
-        """Return the header's value for the first of these keys that it contains; empty if it contains
-        none.
+        """Return the header's value for the first of the given keys that the header contains, or an empty
+        text if it contains none of them. Each key also stands for its translations in ``words.toml``.
         """
         lower = {_NO_LETTER.sub("", key.lower()): value for key, value in self.header.items()}
         return next((lower[name] for key in keys for name in _KEYS.get(key, [key]) if name in lower), "")
 
     @property
     def name(self) -> str:
-        """Return the name of the channel, if the header gives one."""
+        """Return the name of the channel, or an empty text if the header gives none."""
         return self.first("channel")
 
     @property
@@ -84,7 +88,7 @@ class Block:
         return self.first("unit").strip("[]() ") or next(iter(lengths + others), None)
 
     def require_pixels(self, shape: Shape) -> None:
-        """Compare the numbers of rows and columns with what the header states.
+        """Check that the numbers of rows and columns are those that the header states, if it states them.
 
         Raises:
             InputError: the header states other numbers.
@@ -96,7 +100,7 @@ class Block:
 
     @property
     def factor(self) -> float | None:
-        """Return the factor from values to metres, if the header gives one.
+        """Return the factor that converts the values to metres, or None if the header gives none.
 
         Raises:
             InputError: the header gives a scale of an unknown kind.
@@ -118,8 +122,8 @@ class Block:
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
-        """Return the size (y, x) in µm if the header states the size of a pixel or of both sides; None
-        otherwise.
+        """Return the size (y, x) in µm if the header states the pixel size or both side lengths, otherwise
+        None.
         """
         if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
@@ -128,7 +132,7 @@ class Block:
 
 
 def refuse_scales(header: Mapping[str, str]) -> None:
-    """Refuse a header with a scale that no known format uses.
+    """Reject a header that contains a scale of a kind that no known format uses.
 
     Raises:
         InputError: the header has such a scale.
@@ -139,12 +143,13 @@ def refuse_scales(header: Mapping[str, str]) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file, with lines separated by ``\\n``. The encoding is UTF-8, UTF-16 or an 8-bit
-    encoding of Western European languages.
+    """Return the text of a file, with lines separated by ``\\n``.
+
+    The encoding may be UTF-8, UTF-16 or Latin-1.
 
     Raises:
-        InputError: UTF-16 text contains an incomplete character, or the bytes are not text (the message then
-            names the line).
+        InputError: the file is not valid UTF-16 although it begins like it, or it contains bytes that do not
+            occur in text (the message then names the line).
     """
     raw = path.read_bytes()
     halves = {"utf-16-be": raw[:_LOOKED_AT:2], "utf-16-le": raw[1:_LOOKED_AT:2]}
@@ -168,20 +173,21 @@ def read_text(path: Path) -> str:
 
 
 def without_quotes(text: str) -> str:
-    """Remove quotes from the text, except where a cell contains a comma."""
+    """Remove the quotation marks around the cells of a text, except around cells that contain a comma."""
     return _QUOTED.sub(r"\1", text)
 
 
 def blocks_of(text: str) -> list[Block]:
-    """Find the blocks of numbers in a text; blank lines and lines of words end a block.
+    """Find the blocks of numbers in a text. A blank line or a line of words ends a block.
 
-    A line counts as words only if less than half of its cells are numbers; otherwise it is a row of the
-    block, with words in place of numbers. If every other line is blank, all rows are one block.
+    A line counts as a line of words only if less than half of its cells are numbers. Otherwise it is a row of
+    the block in which words stand in place of some numbers. If every second line is blank, all rows belong to
+    one block.
     """
     found = list(_blocks(text))
     if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):
         for one in found[1:]:
-            # Blank lines are inserted to keep the line numbers right.
+            # Empty rows are inserted so that line numbers in messages stay right.
             found[0].rows += [""] * (one.first_line - found[0].first_line - len(found[0].rows)) + one.rows
         return found[:1]
     return found
@@ -205,7 +211,7 @@ def _blocks(text: str) -> Iterator[Block]:
 
 
 def header_of(text: str) -> Block:
-    """Make the header from lines of words that have no numbers below them."""
+    """Return a block without rows, whose header is made from the lines of a text."""
     block = Block({}, [], 0)
     for number_of_line, line in enumerate(text.splitlines(), start=1):
         block.words.append(line.strip())
@@ -214,10 +220,10 @@ def header_of(text: str) -> Block:
 
 
 def is_row(line: str) -> bool:
-    """Return whether a line is a row of numbers: it is not a comment, and at least half of its cells are
-    numbers.
+    """Return whether a line is a row of numbers, which means that it is not a comment and that at least half
+    of its cells are numbers.
 
-    A line that consists of one repeated word is a row of missing pixels, unless the word is a unit.
+    A line that repeats a single word is also a row, of missing pixels only, unless the word is a unit.
     """
     if _COMMENT.match(line) or not line.strip():
         return False
@@ -227,7 +233,7 @@ def is_row(line: str) -> bool:
     words = [cell for cell in cells if NUMBER.fullmatch(cell) is None]
     if len(cells) >= _FEWEST_EQUAL and len(set(words)) == 1 and not is_length(words[0].strip("[]()")):
         return True
-    # `ncols 32` and `Width: 6,4 µm` are words with their values, not rows of numbers.
+    # `ncols 32` and `Width: 6,4 µm` are keys of a header with their values, not rows of numbers.
     starts = NUMBER.match(cells[0]) is not None
     return 2 * len(words) <= len(cells) and (
         starts or (len(cells) != 2 and not _ASSIGNMENT.search(" ".join(cells[:2])))
@@ -255,8 +261,8 @@ def _note(line: str, header: dict[str, str], number_of_line: int) -> None:
 
 
 def number(text: str) -> float:
-    """Read the number at the start of a text, with a decimal comma or Fortran's exponent; NaN if there is
-    none.
+    """Return the number at the start of a text, or NaN if there is none. It may have a decimal comma and an
+    exponent as in Fortran.
     """
     found = NUMBER.match(text.strip())
     return float(re.sub("[dD]", "e", found[0]).replace(",", ".")) if found else float("nan")

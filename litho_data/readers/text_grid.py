@@ -1,4 +1,6 @@
-"""Find coordinates in a table of numbers: axes in the first row and column, or points that fill a grid."""
+"""Find the coordinates in a table of numbers. They are axes in the first row and column, or the x and y of
+points that fill a grid.
+"""
 
 import re
 from collections.abc import Sequence
@@ -8,10 +10,10 @@ import numpy as np
 
 from litho_data.foundation import YX, Array, InputError, is_length, um_per
 
-# Coordinates are written with few digits, so a step may differ from the usual one by this share.
+# Coordinates are written with few digits, so a step may differ from the mean step by this share of it.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# A single axis, or axes with uneven steps, must have at least this many numbers.
+# A single axis, or a pair of axes with uneven steps, counts as an axis only from this many numbers on.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -25,10 +27,12 @@ _AXIS = re.compile(r"[xyz](?![a-z])|(?=height)")
 
 @dataclass(frozen=True)
 class Map:
-    """Heights with row 0 at the top and x to the right, and the side lengths of the map, if the table states
-    them. ``size_um`` is in µm, and ``extent`` is in an unknown unit.
+    """A map of heights without its axes, with row 0 at the top and x to the right.
 
-    ``corner`` says whether the first cell of the table belonged to an axis.
+    ``size_um`` contains the side lengths (y, x) in µm, if the table states them with a unit. ``extent``
+    contains them if the table states them without a unit. ``x_is`` says in words which direction in the file
+    runs along x. ``corner`` is true if the first cell of the table does not belong to the map, so that it may
+    contain a word.
     """
 
     values: Array
@@ -40,15 +44,15 @@ class Map:
 
 
 def without_axes(values: Array, words: Sequence[str]) -> Map:
-    """Remove a first row or column of coordinates or counts from the matrix.
+    """Remove from a matrix the first row and column if they contain coordinates or pixel numbers.
 
-    Evenly spaced numbers are taken as coordinates unless the neighbouring line has the same spacing, because
-    neighbouring lines of a map are alike. The numbers 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing
-    about lengths.
+    Evenly spaced numbers are taken as coordinates, unless the next row or column has the same spacing. In
+    that case both belong to the map, because neighbouring lines of a map are alike. The numbers 0, 1, 2, …
+    (or 1, 2, 3, …) count pixels and say nothing about lengths.
 
     Raises:
-        InputError: the first row and column look like coordinates that are not evenly spaced, or the last row
-            and column look like coordinates.
+        InputError: the first row and column look like coordinates that are not evenly spaced, or the
+            coordinates seem to stand in the last row and column.
     """
     body = values[1:, 1:]
     if min(body.shape) <= _FEWEST_STEPS:
@@ -87,7 +91,7 @@ def _rises(line: Array) -> bool:
 
 
 def _spacing(line: Array) -> float | None:
-    """Return the step of evenly spaced numbers; None for other numbers."""
+    """Return the step of evenly spaced numbers, or None if the numbers are not evenly spaced."""
     steps = np.diff(line)
     if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all():
         return None
@@ -105,7 +109,9 @@ def _counts(line: Array) -> bool:
 
 
 def _size_um(words: Sequence[str], extent: YX) -> YX | None:
-    """Return (y, x) in µm, if the words above the numbers give units for x and y."""
+    """Return the size (y, x) in µm if the words above the numbers give a unit for x, otherwise None. If they
+    give no unit for y, it has the unit of x.
+    """
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
     if "x" not in units:
@@ -114,8 +120,10 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 
 
 def _columns(words: Sequence[str], count: int) -> list[int]:
-    """Find the columns of x, y and z by the words above them, or take the columns in order if there are only
-    three. Otherwise return no columns.
+    """Return the numbers of the columns that contain x, y and z.
+
+    The columns are found by the words above them. Without such words, a table of three columns is taken as x,
+    y, z. In all other cases the list is empty.
     """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))
@@ -126,10 +134,10 @@ def _columns(words: Sequence[str], count: int) -> list[int]:
 
 
 def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
-    """Make a map of points that fill a regular grid; return None if they do not.
+    """Make a map from a table of points that fill a regular grid, or return None if they do not fill one.
 
-    The columns are x, y, z unless words say otherwise. The rows keep the order of the file; x grows to the
-    right. Grid points that the file lacks are missing pixels.
+    The columns are x, y, z unless the words above them say otherwise. In the map, x grows to the right, and
+    rows keep the order of the file. Grid points that the file lacks become missing pixels.
     """
     columns = _columns(words, points.shape[1])
     if not columns:
@@ -148,9 +156,7 @@ def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
     size_um = _size_um(words, extent)
-    note = (
-        f"points of a grid; rows are in the order of the file, so y {'grows' if down else 'falls'} downwards"
-    )
+    note = f"points of a grid; rows keep the order of the file, so y {'grows' if down else 'falls'} downwards"
     counted = _counts(x) and _counts(y)
     return Map(
         values, None if counted else extent, size_um, x_is=f"column {columns[0] + 1} of points", notes=(note,)

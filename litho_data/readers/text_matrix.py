@@ -1,4 +1,4 @@
-"""Read height maps from text: one or several matrices, with or without axes, or the points of a grid."""
+"""Read height maps from text files that contain matrices, with or without axes, or the points of a grid."""
 
 import re
 from functools import partial
@@ -13,21 +13,24 @@ from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# A long table with only a few numbers per row contains points, not the lines of a map.
+# A table with few columns and many rows contains points, not the lines of a map. A table is long enough to
+# count as points if it has at most this many columns and at least this many rows per column.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
 _IGOR = "IGOR\n"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per block of numbers; unit and size are known only if the lines above the numbers
+    """Read one channel per block of numbers. Its unit and size are known only if the lines above the numbers
     state them.
 
-    Lines of words, and lines that start with ``#``, ``%`` or ``;``, are the header of what follows. Axes in
-    the first row and column, and points that lie on a regular grid, become a map.
+    Lines of words, and lines that start with ``#`` or ``%``, are the header of the numbers below them. If the
+    first row and column contain coordinates, they are taken as axes. A table of points that fill a regular
+    grid is converted to a map.
 
     Raises:
-        InputError: the file is binary or empty, rows differ in length, separators are mixed, a number is too
-            large, or the last number was cut off; the message names the line.
+        InputError: the file is binary or contains no numbers, rows have different numbers of cells, different
+            separators are mixed, a number is too large, or the last number was cut off. The message names the
+            line.
     """
     text = read_text(path)
     if text.startswith(_IGOR):
@@ -80,13 +83,14 @@ def _may_be_points(shape: Shape) -> bool:
 
 
 def write_text_matrix(path: str | Path, height_um: Array) -> None:
-    """Write heights with five significant digits, one line per row.
+    """Write heights in metres as text with five significant digits, one line per row.
 
     Args:
-        height_um: finite heights below 10 m, µm, shape (ny, nx).
+        path: the file to write.
+        height_um: finite heights in µm, of less than 10 m, shape (ny, nx).
 
     Raises:
-        InputError: the format cannot hold a value.
+        InputError: a height is NaN or infinite, which the format cannot hold.
     """
     if not np.isfinite(height_um).all():
         raise InputError("height in a text matrix", got="NaN or infinity", wanted="finite numbers")
@@ -99,10 +103,10 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    """Return whether the file begins like a text with rows of numbers.
+    """Return whether the file begins like a text with rows of at least two numbers.
 
     Raises:
-        InputError: the rows are points of a profile or of a point cloud.
+        InputError: the rows are the points of a profile or of a point cloud, which is not a map.
     """
     lines = re.split("\r\n|\r|\n", _start_of_text(head))
     rows = [line for line in lines[:_MOST_HEADER_LINES] if is_row(line)]
@@ -114,7 +118,7 @@ def _recognises(path: Path, head: bytes) -> bool:
 
 
 def _refuse_points(path: Path) -> None:
-    """Refuse a table of points unless they fill a grid or the caller says that it is a matrix."""
+    """Reject a file with a table of points that do not fill a regular grid."""
     for block in blocks_of(read_text(path)):
         table = numbers_of(block)
         columns = table.values.shape[1]
@@ -127,7 +131,7 @@ def _refuse_points(path: Path) -> None:
 
 
 def _start_of_text(head: bytes) -> str:
-    """Return the beginning of the file as text; empty if the bytes are not text."""
+    """Return the first bytes of a file as text, or an empty text if they are not text."""
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return head[: len(head) // 2 * 2].decode("utf-16", errors="ignore")
     if b"\0" in head:

@@ -1,4 +1,6 @@
-"""Convert rows of text to numbers: handle separators, decimal commas and words, and detect damage."""
+"""Convert rows of text to numbers. Separators, decimal commas and words are handled, and damage is
+detected.
+"""
 
 import io
 import re
@@ -22,8 +24,10 @@ _TRUNCATED = "the file may be truncated"
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers (rows, columns), with NaN in place of words. ``words`` maps every word to the line where it
-    first occurs, and ``corner`` is the word in the first cell.
+    """A table of numbers read from text.
+
+    ``values`` has shape (rows, columns), with NaN in place of words. ``words`` maps every word, except one in
+    the first cell, to the line where it first occurs. ``corner`` is the word in the first cell, or None.
     """
 
     values: Array
@@ -32,15 +36,15 @@ class Table:
 
 
 def numbers_of(block: Block) -> Table:
-    """Convert a block to numbers. Words become NaN, and so does ``nan``; an empty cell is treated as an empty
-    word.
+    """Convert a block of text to numbers. Words become NaN, and so does the text ``nan``. An empty cell
+    counts as an empty word.
 
-    Decimal commas are accepted if the cells are not separated by commas. Exponents as in Fortran's
-    ``1.0D-07`` are accepted as well.
+    Decimal commas are accepted if the cells are not separated by commas. Exponents may be written as in
+    Fortran, for example ``1.0D-07``.
 
     Raises:
-        InputError: rows differ in length, separators are mixed, a number is too large, or the last number was
-            cut off; the message names the line and shows the first rows.
+        InputError: rows have different numbers of cells, different separators are mixed, or a number is too
+            large. The message names the line and shows the first rows.
     """
     try:
         return _numbers("\n".join(block.rows), block.first_line)
@@ -60,17 +64,17 @@ def _numbers(text: str, first_line: int) -> Table:
 
 
 def _plain(text: str, first_line: int) -> tuple[str, str | None]:
-    """Return the text with decimal points, and the separator of its cells; None stands for blanks.
+    """Return the text with decimal points, and the separator between its cells. None stands for any blanks.
 
-    Commas separate cells only if nothing else does. Otherwise they are decimal commas, and the file has no
-    decimal points.
+    Commas are taken as separators only if nothing else separates the cells. Otherwise they are decimal
+    commas, and the text must not contain decimal points.
 
     Raises:
         InputError: the text contains commas in addition to another separator, as in ``1,234.5;2,345.6``;
             commas that may be either decimal commas or separators; or commas that may separate thousands.
     """
     rows = [row.rstrip(" ") for row in text.replace("\x0c", " ").split("\n")]
-    for mark in "\t;,":  # a separator at the end of every row separates nothing
+    for mark in "\t;,":  # remove a separator that stands at the end, or at the start, of every row
         if all(row.endswith(mark) for row in rows if row):
             rows = [row[:-1] for row in rows]
         if all(row.startswith(mark) for row in rows if row):
@@ -112,7 +116,11 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
 
 
 def _refuse_decimal_commas(text: str, first_line: int) -> None:
-    """Refuse rows like ``0,9000,0,3100``: every second cell, and no other, has the same number of digits."""
+    """Reject rows like ``0,9000,0,3100``, where commas seem to be both decimal commas and separators.
+
+    The sign of this is that all cells in even places have the same number of digits, and cells in odd places
+    have other numbers of digits.
+    """
     if "." in text:
         return
     rows = [row.split(",") for row in text.split("\n") if row]
@@ -132,7 +140,7 @@ def _cell_by_cell(text: str, separator: str | None, first_line: int) -> Table:
     ]
     width = max(len(cells) for _, cells in rows[1:]) if len(rows) > 1 else len(rows[0][1])
     if len(rows) > 2 and len(rows[0][1]) == width - 1:
-        rows[0][1].insert(0, "")  # fills the corner between a column and a row of coordinates
+        rows[0][1].insert(0, "")  # the corner between a row and a column of coordinates was left out
     width, width_line = len(rows[0][1]), rows[0][0]
     words: dict[str, int] = {}
     corner = rows[0][1][0] if _number(rows[0][1][0]) is None else None
@@ -166,10 +174,12 @@ def _number(cell: str) -> float | None:
 
 
 def refuse_cut_end(text: str) -> None:
-    """Refuse a copy that was cut off inside the last number: 5.4e-007 cut to 5.4 would read as 5.4 m.
+    """Reject a text that was cut off inside its last number. For example, 5.4e-007 cut to 5.4 would be read
+    as 5.4 m.
 
     Raises:
-        InputError: the last number is not spelt like the one before it.
+        InputError: the exponent of the last number is missing, or is shorter than that of the number before
+            it.
     """
     if text.endswith("\n"):
         return

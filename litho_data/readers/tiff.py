@@ -1,4 +1,4 @@
-"""Read TIFF images: every page is a channel, and values stay as stored."""
+"""Read TIFF images. Every page becomes a channel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _ORIENTATION, _UPRIGHT = 274, 1
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
-# Some makers store heights beside a picture in private tags.
+# Some instrument makers store the heights in private tags, beside a picture of them.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
 _LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
@@ -35,12 +35,12 @@ _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per page; RGB pages count as one channel if their samples are identical.
+    """Read one channel per page. In an RGB page, the three samples of each pixel must be identical.
 
-    The size of a pixel is taken from OME metadata. Without such metadata, it is taken from the resolution
-    tags, but only if ImageJ names their unit; otherwise, these tags usually describe a print on paper and not
-    the sample. Calibrations of the values that ImageJ or GDAL wrote are applied. GDAL's no-data value marks a
-    missing pixel. Copies of a page at reduced resolution are skipped.
+    The pixel size is taken from OME metadata. Without them, it is taken from the resolution tags, but only if
+    ImageJ names their unit. Otherwise, these tags usually describe a print on paper and not the sample. If
+    ImageJ or GDAL stored a calibration of the values, it is applied; other values stay as stored. GDAL's
+    no-data value marks missing pixels. Copies of a page at reduced resolution are skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -59,7 +59,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[TiffFile]:
-    """Open a TIFF file; any error of a damaged file becomes an InputError."""
+    """Open a TIFF file. Any error that a damaged file causes in the block becomes an InputError."""
     import tifffile
 
     with foreign_parser("TIFF"), tifffile.TiffFile(path) as file:
@@ -67,10 +67,10 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
 
 
 def require_upright(page: Any) -> None:
-    """Refuse a page marked as rotated or mirrored, because programs differ in how they show it.
+    """Reject a page that is marked as rotated or mirrored, because programs differ in how they show it.
 
     Raises:
-        InputError: the orientation is not upright.
+        InputError: the page's orientation tag says that it is not upright.
     """
     stated = page.tags.valueof(_ORIENTATION, _UPRIGHT)
     if stated != _UPRIGHT:
@@ -78,8 +78,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Return the instrument maker's format to which the tags of this TIFF belong, by SurfaceTopography's name
-    for it; return an empty text if there is none.
+    """Return the instrument maker's format of this TIFF, which its tags reveal, by the name that
+    SurfaceTopography uses. Return an empty text if the tags belong to no such format.
     """
     try:
         with open_tiff(path) as file:
@@ -87,7 +87,7 @@ def maker_of(path: Path) -> str:
             pages = islice(file.pages, _FIRST_PAGES)
             lext = any(_LEXT in str(getattr(page, "description", "")) for page in pages)
             return "lext" if lext else next((kind for code, kind in _SIGNED.items() if code in tags), "")
-    except InputError:  # the reader that tries the file next reports the error
+    except InputError:  # the next reader that tries the file reports the error
         return ""
 
 
@@ -127,10 +127,11 @@ def _may_hold_heights(tag: Any, shape: Shape) -> bool:
 
 
 def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str | None, float | None]:
-    """Return scale, offset, unit and no-data value of a page.
+    """Return the scale, offset, unit and no-data value of a page; height = scale · value + offset.
 
     Raises:
-        InputError: an ImageJ calibration is not a straight line, or the description has an unknown scale.
+        InputError: ImageJ's calibration is not a straight line, or the page's description contains a scale
+            of an unknown kind.
     """
     scale, offset, unit, missing = 1.0, 0.0, None, None
     if not imagej and _XML not in str(page.description)[:_LOOKED_AT]:
@@ -154,7 +155,7 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
 
 
 def _plain_text(description: str) -> str:
-    """Convert a description to lines of keys and values, even if it is JSON."""
+    """Return a page's description as lines of text. JSON is converted to lines ``key: value``."""
     try:
         return "\n".join(f"{key}: {value}" for key, value in json.loads(description).items())
     except (ValueError, AttributeError):  # no JSON, or no object
@@ -166,11 +167,11 @@ def _plain_unit(unit: Any) -> str:
 
 
 def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
-    """Read the pixel size (y, x) of every page from OME metadata. Lengths are in µm unless the metadata name
-    another unit.
+    """Read the pixel size (y, x) in µm of every page from OME metadata. Lengths without a unit are in µm.
 
     The pages of the first image come first, then those of the second, and so on. The number of pages of an
-    image is the product of its sizes in z, channel and time.
+    image is the product of its sizes in z, channel and time. If these numbers do not add up to the number of
+    pages, every entry is None.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
@@ -180,11 +181,11 @@ def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
 
 
 def _ome_pitch_um(image: str) -> YX | None:
-    """Read the pixel size (y, x) from the OME element of one image."""
+    """Read the pixel size (y, x) in µm from the OME element of one image, or return None if it has none."""
     says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
         pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]
-    except (KeyError, ValueError):  # not stated, no number, or in pixels
+    except (KeyError, ValueError):  # the size is not stated, is not a number, or is in pixels
         return None
     return (pitch[0], pitch[1]) if all(0 < one < np.inf for one in pitch) else None
 
@@ -215,10 +216,13 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
 
 
 def single_sample(pixels: Array) -> Array:
-    """Reduce pixels (ny, nx) or (ny, nx, 1 to 4) to (ny, nx). All pixels must be grey and opaque.
+    """Return the grey values of an image as an array of shape (ny, nx).
+
+    The image has shape (ny, nx) or (ny, nx, samples) with one to four samples per pixel. All pixels must be
+    grey and opaque.
 
     Raises:
-        InputError: the colours differ, so a pixel has no single value, or pixels are transparent.
+        InputError: the colours of a pixel differ, so it has no single grey value, or a pixel is transparent.
     """
     if pixels.ndim == 3 and 1 <= pixels.shape[2] <= 4:
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != pixels[..., -1].max()).any():
@@ -233,7 +237,7 @@ def single_sample(pixels: Array) -> Array:
 
 
 def is_tiff(head: bytes) -> bool:
-    """Return whether a file begins like a TIFF."""
+    """Return whether a file that begins with these bytes is a TIFF."""
     return head.startswith(_MAGIC)
 
 

@@ -1,4 +1,4 @@
-"""Read instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
+"""Read instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) with the library SurfaceTopography."""
 
 import re
 import struct
@@ -33,8 +33,8 @@ _STARTS = {
 _ZIP, _HDF5 = b"PK\x03\x04", b"\x89HDF\r\n\x1a\n"
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
-# Digital Surf's kinds of files that are not one surface (series, layers, pictures, curves, spectra), and the
-# position of the kind in the file.
+# The kinds of Digital Surf files that do not contain a single surface (series, layers, pictures, curves,
+# spectra), and the position in the file where the kind is stored.
 _NO_SURFACES, _SURFACE_KIND_AT = (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 15, 20, 21), 18
 _IGOR_HEADERS = {1: 8 + 110, 2: 16 + 110, 3: 20 + 110, 5: 64 + 320}
 _IGOR_5_SIZES = "15I"
@@ -44,10 +44,10 @@ _LONGEST_HEADER = 1 << 20
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read the two-dimensional channels of an instrument's file, in the order of the file.
+    """Return the two-dimensional channels of an instrument's file, in the order of the file.
 
     Raises:
-        InputError: no reader recognises the file, it is damaged, or it holds no map.
+        InputError: no format recognises the file, or the file is damaged.
     """
     kind = _recognise(path)
     header = _vendor_header(path, kind)
@@ -61,7 +61,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return the formats whose signature the file has, by their names in SurfaceTopography."""
+    """Return the formats whose signature the file has. They have the names that SurfaceTopography gives
+    them.
+    """
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
         signed = (maker,) if (maker := maker_of(path)) else ()
@@ -77,8 +79,8 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Return whether the header has the version number of an Igor wave and a correct checksum. The usual
-    version 5 is accepted without a checksum.
+    """Return whether a file begins with the header of an Igor wave: a known version number and a correct
+    checksum. For version 5, the usual one, the checksum is not tested.
     """
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
@@ -88,11 +90,13 @@ def _is_igor(head: bytes) -> bool:
 
 
 def _recognise(path: Path) -> str:
-    """Return the format, by its name in SurfaceTopography. Of the formats whose signature the file has, it is
-    the first whose reader can open the file.
+    """Return the file's format, by the name that SurfaceTopography gives it.
+
+    Several formats may share a signature. The result is the first format with the file's signature whose
+    reader can open the file.
 
     Raises:
-        InputError: no signature is known, or no reader with that signature can read the file.
+        InputError: the file has no known signature, or no reader for its signature can open it.
     """
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
@@ -114,8 +118,8 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Refuse an Igor wave that is shorter than its header states. igor2 trusts headers of version 5, so it
-    could try to read gigabytes.
+    """Reject an Igor wave of version 5 that is shorter than its header states. The library igor2 does not
+    check such headers, so it could try to read gigabytes.
     """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
@@ -159,7 +163,10 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
 
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
-    """Load heights with row 0 at the top; SurfaceTopography indexes [x, y] with y downwards."""
+    """Load the heights as an array indexed [y, x] with row 0 at the top.
+
+    SurfaceTopography indexes heights [x, y], with y downwards, so they are transposed here.
+    """
     # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with _open(path, kind) as reader:
@@ -178,9 +185,8 @@ def _flatten(content: Facts, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _vendor_header(path: Path, kind: str) -> dict[str, str]:
-    """Read the header of an Igor wave or a Nanoscope file verbatim; return an empty dict for other formats.
-
-    SurfaceTopography passes on only parts of these headers.
+    """Return the complete header of an Igor wave or a Nanoscope file, because SurfaceTopography passes on
+    only parts of it. Return an empty dictionary for other formats.
     """
     if kind == "ibw":
         return _igor_note(path)
@@ -188,10 +194,10 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 
 
 def _fast_axis(header: dict[str, str]) -> Axis | None:
-    """Return ``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
+    """Return ``"x"`` if the header of an Asylum file gives a scan angle of 0° or 180°, otherwise None.
 
-    At other angles, the lines may follow either the axes of the scanner or those of the scan. The file does
-    not say which, so the caller must state the axis.
+    At other angles, the file does not say whether the lines follow the axes of the scanner or those of the
+    scan, so the caller must state the fast axis.
     """
     try:
         angle = float(header["ScanAngle"]) % 180
@@ -201,8 +207,9 @@ def _fast_axis(header: dict[str, str]) -> Axis | None:
 
 
 def _layer_names(path: Path, kind: str) -> list[str]:
-    """Read the labels of an Igor wave's layers, because SurfaceTopography drops the label of a single
-    layer.
+    """Return the labels of the layers of an Igor wave; the list is empty for other formats.
+
+    They are read here because SurfaceTopography drops the label if there is only one layer.
     """
     if kind != "ibw":
         return []
@@ -225,7 +232,9 @@ def _igor_note(path: Path) -> dict[str, str]:
 
 
 def _nanoscope_header(path: Path) -> dict[str, str]:
-    """Return ``section/key`` for every entry; sections with the same name are numbered."""
+    """Return the entries of a Nanoscope header by ``section/key``. Sections with the same name are
+    numbered.
+    """
     with path.open("rb") as stream:
         raw = stream.read(_LONGEST_HEADER)
     text = raw[: max(raw.find(_NANOSCOPE_END), 0)].decode("latin-1")

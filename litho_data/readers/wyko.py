@@ -1,5 +1,7 @@
-"""Read Wyko ASCII files. A header with tab-separated cells is followed by blocks of numbers in waves or nm.
-Missing pixels are marked ``Bad``.
+"""Read Wyko ASCII files.
+
+A header of tab-separated cells is followed by blocks of numbers, in wavelengths or nm. The word ``Bad`` marks
+missing pixels.
 """
 
 from pathlib import Path
@@ -18,15 +20,15 @@ _BAD = "Bad"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per block; the second flag of the first line says whether heights are in nm or in
-    waves.
+    """Return one channel per block of numbers. A flag in the first line says whether heights are in nm or in
+    wavelengths.
 
-    The format stores one column after another, each from bottom to top. A file with one line per row is read
-    row by row.
+    In this format, a line of the file contains a column of the map, from bottom to top. If the numbers of
+    lines and cells show that each line contains a row instead, the file is read row by row.
 
     Raises:
-        InputError: the header lacks the sizes or the wavelength, or a block does not have the size that the
-            header states.
+        InputError: the header does not state the wavelength although heights are in wavelengths, or a block
+            does not have the size that the header states.
     """
     lines = read_text(path).split("\n")
     in_nm = lines[0].removeprefix(_MAGIC).split()[1:2] == ["1"]
