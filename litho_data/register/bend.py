@@ -1,4 +1,6 @@
-"""Describe the bend of a scan: the smooth difference between the scanner's true and stated positions."""
+"""Describe the bend of a scan: the smooth difference between the true and the nominal positions of its
+points, which a nonlinear scanner causes.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,10 @@ from litho_data.foundation import YX, Array, Shape
 
 _QUADRATIC_TERMS = 3
 CREEP_DEGREE = 6
-# Tolerance of the iteration, as a share of half the width of the scan. This is far below a thousandth of a
-# pixel.
+# ``Bend.undo`` iterates until its steps are below this share of half the scan's side, which is far less than
+# a thousandth of a pixel.
 _SETTLED = 1e-9
-# Undoing a bend with a slope of 0.1 takes 10 steps; a slope of 0.9 takes 200.
+# Largest number of these steps. A bend with a slope of 0.1 takes 10 steps, one with a slope of 0.9 takes 200.
 _STEPS = 400
 # Number of points along each side of the frame at which the size of a bend is evaluated.
 _GRID = 65
@@ -21,14 +23,17 @@ _GRID = 65
 
 @dataclass(frozen=True)
 class Bend:
-    """The displacement of the points of a scan. It is a polynomial of u and v, which run from -1 to 1 over
-    the frame.
+    """The displacement of the points of a scan from their nominal to their true positions.
 
-    ``amount`` (2, 3) contains the coefficients of u² - 1/3, uv and v² - 1/3, one row for x and one for y. If
-    the scanner creeps, ``amount`` has the shape (2, 11) and also contains the coefficients of the Legendre
-    polynomials P₃(u), P₃(v), P₄(u), … P₆(v). All terms are centred, so the best affine fit to a bend over the
-    frame is zero. ``middle`` and ``half`` are the centre and half the size (x, y) of the frame, in the unit
-    of ``amount``; u = (x - middle) / half.
+    The displacement is a polynomial of u and v. These are the coordinates along x and y, scaled so that they
+    run from -1 to 1 over the frame of the scan.
+
+    ``amount`` has shape (2, 3), with one row for the displacement along x and one for that along y. Its
+    columns are the coefficients of u² - 1/3, uv and v² - 1/3. For a scanner that creeps, ``amount`` has shape
+    (2, 11). The further columns are the coefficients of the Legendre polynomials P₃(u), P₃(v), P₄(u), …
+    P₆(v). All terms are centred, so the best affine fit to a bend over the frame is zero. ``middle`` and
+    ``half`` contain the centre (x, y) and half the size (x, y) of the frame, in the unit of ``amount``, so
+    that u = (x - middle) / half.
     """
 
     amount: Array
@@ -37,17 +42,18 @@ class Bend:
 
     @classmethod
     def of_scan(cls, amount_um: Array, scan_shape: Shape, scan_pitch_um: YX) -> Bend:
-        """Make the bend of a scan with this (ny, nx) shape and (y, x) pitch, in µm in the scan's
-        own frame.
+        """Make a bend from its coefficients ``amount_um`` in µm, in the frame of a scan with the given shape
+        (ny, nx) and pitch (y, x).
         """
         half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
         return cls(np.asarray(amount_um, dtype=float), half_um, half_um)
 
     @property
     def figures(self) -> dict[str, float]:
-        """Return the largest displacement and the six coefficients of the bend for the quality record, in µm.
+        """Return the figures of the bend for the quality record: its largest displacement and its six
+        quadratic coefficients, in µm.
 
-        ``bend_x_by_xx_um`` is the coefficient of u² - 1/3 in the displacement along x, and so on.
+        For example, ``bend_x_by_xx_um`` is the coefficient of u² - 1/3 in the displacement along x.
         """
         names = [f"bend_{axis}_by_{term}_um" for axis in "xy" for term in ("xx", "xy", "yy")]
         values = (float(value) for value in self.amount[:, :3].ravel())
@@ -55,23 +61,23 @@ class Bend:
 
     @classmethod
     def none_yet(cls, shape: Shape) -> Bend:
-        """Make a bend of zero in the index frame of a scan with this (ny, nx) shape."""
+        """Return a bend of zero displacement, in the index frame of a scan with the given shape (ny, nx)."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
     def in_pixels(self, pitch_um: YX) -> Bend:
-        """Convert a bend in µm to the index frame of a scan with this (y, x) pitch."""
+        """Return a bend in µm, converted to the index frame of a scan with the given pitch (y, x)."""
         pitch_x_y = np.array(pitch_um[::-1])
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
 
     def scaled(self, factor: float) -> Bend:
-        """Express the same bend in another unit of length, so that all lengths are multiplied by
-        ``factor``.
+        """Return the same bend in another unit of length, in which all lengths are ``factor`` times as
+        large.
         """
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the displacement (along x, along y) of points of the scan from their nominal positions.
+        """Return the displacements along x and along y of points of the scan at the nominal positions (x, y).
 
         A point outside the frame has the displacement of the nearest point of the frame.
         """
@@ -81,12 +87,14 @@ class Bend:
         return along_x, along_y
 
     def straighten(self, points: Array) -> Array:
-        """Return the true positions of points (n, 2) of the scan."""
+        """Return the true positions of points of the scan. Both are arrays of shape (n, 2) with columns x,
+        y.
+        """
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the points of the scan whose true positions are (x, y). They are exact if ``slope`` is below
-        1.
+        """Return the nominal positions (x, y) of the points whose true positions are given. This is the
+        inverse of ``straighten``. It is exact if ``slope`` is below 1.
         """
         at_x, at_y = x, y
         for _ in range(_STEPS):
@@ -104,17 +112,19 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """Return the largest local stretch or rotation that the bend causes, as a fraction.
+        """Return the largest change of the displacement per unit of length, over the frame.
 
-        A bend with a slope of 1 or more may fold the scan.
+        It is the spectral norm of the displacement's gradient, and bounds the local stretch and rotation. A
+        bend with a slope of 1 or more may fold the scan.
         """
-        # On this grid, the slope is exact for a quadratic bend and accurate to a thousandth for creep.
+        # The gradient is computed by differences on a grid. These are exact for a quadratic bend, and
+        # accurate to a thousandth for creep.
         spacing = 2 * self.half[::-1] / (_GRID - 1)
         gradient = np.array([np.gradient(one, *spacing, edge_order=2) for one in self._field()])
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
     def _field(self) -> tuple[Array, Array]:
-        """Return the displacements on a regular grid over the frame."""
+        """Return the displacements along x and along y on a regular grid over the frame."""
         unit = np.linspace(-1, 1, _GRID)
         return self.shift(*np.meshgrid(*(self.middle[:, None] + self.half[:, None] * unit)))
 
@@ -129,7 +139,7 @@ class Bend:
         return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
 
     def unit(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the coordinates (u, v) of points."""
+        """Return the coordinates u and v of points at the positions (x, y)."""
         return (x - self.middle[0]) / self.half[0], (y - self.middle[1]) / self.half[1]
 
 
@@ -144,14 +154,22 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """Fit an affine map (3×3) and a bend, which together map points (n, 2) to their images, by least squares.
+    """Fit, by least squares, an affine map and a bend that together map points to their images.
 
-    The model is ``images`` ≈ affine(``points`` + bend(``points``)). ``middle`` and ``half`` define the bend's
-    frame; ``degree`` is 2, or 6 for creep.
+    The model is ``images`` ≈ affine(``points`` + bend(``points``)).
+
+    Args:
+        points: positions (x, y), shape (n, 2).
+        images: the positions to which the points are mapped, shape (n, 2).
+        middle, half: centre (x, y) and half the size (x, y) of the bend's frame.
+        degree: degree of the bend: 2, or 6 for creep.
+
+    Returns:
+        The 3×3 matrix of the affine map, and the bend.
 
     Raises:
-        numpy.linalg.LinAlgError: the points do not determine six coefficients per axis, because they are too
-            few or lie on one conic, such as a line; or the images lie on a line.
+        numpy.linalg.LinAlgError: the points do not determine all coefficients, because they are too few or
+            lie on a conic section, such as a line; or the images lie on a line.
     """
     u, v = ((points - middle) / half).T
     basis = np.stack([np.ones_like(u), u, v, *_terms(u, v, degree)], axis=1)

@@ -1,5 +1,5 @@
-"""Find orientation, polarity and a robust affine warp by keypoints or correlation, accurate to a
-few pixels.
+"""Find the orientation and polarity of a scan, and a warp that is accurate to a few pixels, by matching
+keypoints or by correlation.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from litho_data.register.geometry import (
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
 
 CLEAR_MARGIN = 0.1
-# Above this correlation, a hypothesis is accepted without matching features.
+# Above this correlation, the upright hypothesis is chosen even if another one fits slightly better.
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
@@ -29,11 +29,12 @@ SEARCH_BLUR_PX = 2.0
 
 @dataclass(frozen=True)
 class CoarseFit:
-    """The position of the scan to within a few pixels.
+    """The orientation, polarity and position of the scan, to within a few pixels.
 
-    ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
-    ``points`` is None if keypoints were not used or if too few of them match. The fit is then the shift with
-    the best correlation.
+    ``layout_to_oriented`` is a 3×3 matrix. It maps pixel indices of the layout to pixel indices of the
+    oriented scan, ``orient(scan, orientation) * polarity``. ``points`` contains the matched keypoints. It is
+    None if keypoints were not used or too few of them match. The matrix is then the shift with the highest
+    correlation.
     """
 
     orientation: str
@@ -55,14 +56,14 @@ def find_coarse(
     features: bool,
     seed: int,
 ) -> CoarseFit | None:
-    """Find the best coarse fit; return None if scan or layout shows no structure.
+    """Find the best coarse fit, or return None if the scan or the layout shows no structure.
 
     Args:
-        scan: (ny, nx) heights at the layout's pitch, with the bow removed; NaN where not measured.
-        layout_level: (ny, nx) integer levels.
-        smooth_layout: (ny, nx) topography predicted from the layout with a blur of ``SEARCH_BLUR_PX``.
-        features: whether to match keypoints. This should be false on a repeating layout, where keypoints
-            would match everywhere.
+        scan: heights at the layout's pitch, with the bow removed, shape (ny, nx), NaN where not measured.
+        layout_level: integer levels, shape (ny, nx).
+        smooth_layout: topography predicted from the layout with a blur of ``SEARCH_BLUR_PX``, shape (ny, nx).
+        features: whether to match keypoints. It should be false for a layout that repeats itself, because its
+            keypoints match in many places.
         seed: seed of the robust estimators.
     """
     hypotheses = search_orientation(scan, smooth_layout)
@@ -77,7 +78,9 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """Return the best hypothesis, or the upright one if it fits about as well, as on a symmetric layout."""
+    """Return the best hypothesis. If the upright one fits about as well, as it does on a symmetric layout,
+    return the upright one.
+    """
     best = hypotheses[0]
     for hypothesis in hypotheses:
         upright = (hypothesis.orientation, hypothesis.polarity) == ("identity", 1)
@@ -89,8 +92,8 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, int]]:
     """Return the orientations and polarities in which to look for keypoints.
 
-    ORB features are invariant to rotation, so only the four combinations of mirroring and polarity differ.
-    All four are tried if the correlation does not determine the orientation.
+    ORB keypoints match in any rotation. Therefore, at most four combinations of mirroring and polarity must
+    be tried. All four are tried if the correlation does not clearly determine the orientation.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
@@ -106,7 +109,9 @@ def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str,
 def _fit_features(
     scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
-    """Fit a warp to matched keypoints; return None if the inliers are too few or too clustered."""
+    """Fit a warp to matched keypoints. Return None if too few of the matches agree with the warp (inliers),
+    or if these matches cover too small a part of the field.
+    """
     points = match_features(polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:
         return None
@@ -114,7 +119,7 @@ def _fit_features(
     layout_shape = layout_level.shape
     from_family = np.linalg.inv(orientation_matrix(orientation, shape))
     to_layout = np.linalg.inv(linear_part(from_family @ points.layout_to_scan, centre(layout_shape)))
-    # The keypoints may show a rotation by 90° that the correlation missed.
+    # The keypoints may show that the scan is rotated by a multiple of 90° that the correlation did not find.
     found = nearest_orientation(to_layout)
     turn = orientation_matrix(found, shape) @ from_family
     warp = turn @ points.layout_to_scan

@@ -1,8 +1,9 @@
-"""Register scans of scanners that bend the image or creep, which no straight warp fits.
+"""Register scans whose scanner bends the image or creeps. No straight warp fits such scans.
 
-A bend displaces the image by a quadratic function of position. A scanner that is still settling (creep)
-displaces its lines along both axes by a smooth function of the slow axis alone. A straight warp absorbs the
-linear part of this creep. The rest distorts the print by a tenth of the creep and leaves no other trace.
+A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling:
+it displaces its lines, along both axes, by a smooth function of the position along the slow axis alone. A
+straight warp absorbs the linear part of creep. The nonlinear part distorts the print by about a tenth of the
+creep, and can only be seen in this distortion.
 """
 
 from __future__ import annotations
@@ -20,31 +21,37 @@ from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
 
 Curve = int | Literal["quadratic"] | None
-"""What is fitted besides an affine map: creep along the slow axis (0 = x, 1 = y), a bend, or nothing."""
-# Every how manyth row and column is used. Every second pixel locates the print as well as all pixels do.
+"""What is fitted besides an affine map: the number of the slow axis (0 = x, 1 = y) stands for creep along it,
+``quadratic`` for a bend, and None for nothing.
+"""
+# Only every second row and column is used at full resolution, because they locate the print as accurately as
+# all rows and columns do.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
-# Largest accepted probability that held-out blocks prefer the creep by chance.
+# Creep is accepted if the probability that held-out blocks favour it by chance is below this.
 _CHANCE = 0.01
 _BACKGROUND = 6
 
 
 def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Curve) -> FineFit | None:
-    """Refine a straight warp by adding a curve; return None if the fit fails or held-out blocks reject creep.
+    """Refine a straight warp by adding a bend or creep.
 
-    The displacement by creep, along x and along y, is a polynomial of degree 6 in the slow coordinate. It
-    adds ten numbers to the affine map. Creep must also predict held-out blocks better than the straight warp.
-    For this test, the field is divided into two halves (squares of 64 px in a chequerboard). Both kinds of
-    warp are fitted to each half, and each fit predicts the other half.
+    Return None if the fit fails, or if held-out blocks reject creep.
+
+    The displacement by creep, along x and along y, is a polynomial of degree 6 in the coordinate along the
+    slow axis. It adds ten numbers to the affine map. Creep is accepted only if it predicts held-out blocks
+    better than the straight warp does. For this test, the field is divided into two halves, like the black
+    and white squares of a chequerboard with squares of 64 px. The warps with and without creep are fitted to
+    each half, and each fit predicts the other half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``. Its error at a quarter of the resolution may be as large
-            as the width of the structures.
+        straight: the result of ``refine_pyramid``. The position error of its warp, at a quarter of the
+            resolution, may be as large as the width of the printed structures.
         curve: ``quadratic`` for a bend. For creep, it is the slow axis of the oriented scan (0 = x, 1 = y),
-            which runs across the lines.
+            which runs across the scan's lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -67,7 +74,7 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
 def _from_coarse_to_fine(
     scan: Array, layout_level: Array, found: tuple[Array, Bend], curve: Curve
 ) -> tuple[Array, Bend]:
-    """Refine warp and bend at a quarter and at half resolution."""
+    """Refine the affine map and the bend, first at a quarter of the resolution and then at half of it."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         small = _Images(small_scan, small_topography)
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
@@ -79,11 +86,12 @@ def _from_coarse_to_fine(
 
 
 def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
-    """Subtract from the scan the quadratic surface that the topography does not explain.
+    """Subtract from the scan the quadratic surface in its heights that the topography does not explain.
 
-    Such a surface is quadratic in the scan's frame, but no longer in the layout's frame once the scan is
-    straightened. In the layout's frame, the surface would distort the fit of the bend. A quadratic part of
-    the print that the topography does not explain is subtracted as well.
+    The bow of the scan is quadratic in the scan's frame. In the layout's frame it is not, because the scan is
+    straightened there, so a quadratic background in that frame could not describe it, and the fit of the bend
+    would be distorted. If the print itself contains a quadratic surface that the topography does not explain,
+    this surface is subtracted as well.
     """
     from scipy.ndimage import map_coordinates
 
@@ -116,17 +124,17 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # A rank test is used because creep fades along the scan, so a few blocks gain most.
+    # A rank test is used because creep fades along the scan, so that a few blocks have most of the gain.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
 
 class _Images:
-    """A scan and the topography with which it is compared, for fitting warps to any choice of pixels."""
+    """A scan and the topography with which it is compared. Warps can be fitted to any selection of pixels."""
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """Use only every ``every``-th row and column of the topography. Pixel indices refer to this coarser
-        grid.
+        """Prepare the images. Only one row and one column in ``every`` of the topography is used, and pixel
+        indices refer to this coarser grid.
         """
         from scipy.ndimage import spline_filter
 
@@ -140,7 +148,10 @@ class _Images:
         self.everywhere = interior_of(shape, BORDER_PX // every)
 
     def fit(self, matrix: Array, bend: Bend, curve: Curve, chosen: Array) -> tuple[Array, Bend] | None:
-        """Fit an affine map and a curve by Gauss-Newton steps; return None if the steps do not converge."""
+        """Fit an affine map and a bend or creep to the pixels in the mask ``chosen``, by Gauss-Newton steps.
+
+        Return the matrix and the bend, or None if the steps do not converge.
+        """
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
         points = lattice(y, x)
         for _ in range(_ITERATIONS):
@@ -168,10 +179,10 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Return the squared misfit of every pixel. Gain and background are fitted only to the pixels in
-        ``fitted``.
+        """Return the squared misfit of every pixel for a given warp and bend.
 
-        The misfit is NaN outside the scan.
+        The gain and the background of the heights are fitted to the pixels in the mask ``fitted`` only. The
+        misfit is NaN outside the scan.
         """
         warped, _, inside = self._warped(matrix, bend)
         design = np.stack(self._surface)
@@ -190,8 +201,8 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """Return the terms of the displacement along one axis at points of the scan: 1, u, v and the terms of the
-    curve.
+    """Return the terms of which the displacement along an axis is a sum, at the given points of the scan.
+    They are 1, u, v, and the terms of the bend or the creep.
     """
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]

@@ -1,7 +1,8 @@
-"""Find areas where a scan does not show the print: dust, collapsed or missing parts, lifted film.
+"""Find areas where a scan does not show the print, because of dust, collapsed or missing parts, or lifted
+film.
 
-Such an area can shift a least-squares warp by whole pixels. A defect is a connected area in which no
-prediction based on the layout fits the heights: the misfit is many times the usual one.
+Such an area can shift a warp that is fitted by least squares by whole pixels. A defect is a connected area
+where the heights differ from what the layout predicts by many times the usual difference.
 """
 
 from dataclasses import replace
@@ -15,15 +16,16 @@ from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-# Misfits in units of their robust standard deviation. An area whose misfit exceeds the first value is
-# suspected, and extends to where the misfit falls to the second value. The area is a defect if its misfit
-# reaches the third value after the warp is fitted without the area. Printer effects other than a Gaussian
-# blur stay below the third value; on the measured prints they reach 13.5.
+# Limits of the misfit (heights minus prediction), in units of its robust standard deviation. An area is
+# suspected if its misfit exceeds the first value somewhere. It extends to where the misfit falls to the
+# second value. The area is a defect if its misfit still reaches the third value after the warp has been
+# fitted without the area. Printer effects that a Gaussian blur does not describe stay below the third value:
+# on the measured prints, they reach 13.5.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# If defects cover more than this share of the field, no main surface remains, and the whole print is
-# doubtful.
+# If suspected areas cover more than this share of the field, they cannot be told from the print, and nothing
+# is marked as a defect.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
@@ -32,13 +34,14 @@ _FEWEST_PX = 60
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
-# Pixels at the edge of a mask enter and leave the fit, so its steps do not fall below a thousandth of a
-# pixel.
+# Tolerance of the fit without the masked pixels. From step to step, pixels at the edge of the mask enter and
+# leave the fit, so the steps do not fall below a thousandth of a pixel.
 _TOLERANCE_PX = 0.01
-# A suspected area of at least this share of the field may have distorted the fit so much that the area's own
-# misfit looks small.
+# Suspected areas that cover at least this share of the field may have distorted the fit so much that their
+# own misfit is small. The warp is therefore fitted without them in any case.
 _WORTH_A_FIT = 0.005
-# Below this correlation, the fit of the whole print may be wrong. The measured prints reach 0.945 or more.
+# If the correlation is below this, the fit to the whole print may be wrong. The measured prints reach 0.945
+# or more.
 _SUSPICIOUS = 0.9
 _MAD_PER_SIGMA = 0.6745
 _TUKEY = 4.685
@@ -48,17 +51,19 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """Find defects, and refit the warp without them.
+    """Find defects, and fit the warp again without them.
 
-    Return the fit and a mask of the defects, bool (ny, nx) on the layout's pixels. If there are no defects,
-    return the plain fit and None.
-
-    Every round finds the defects under the last warp and fits a new warp to the other pixels, starting from
-    the robust coarse warp. The rounds end when the corners of the warp no longer move.
+    This is done in several rounds. Each round finds the defects with the warp of the round before, and fits a
+    new warp to all other pixels, starting from the coarse warp ``start``. The rounds end when the positions
+    of the corners no longer change.
 
     Args:
-        plain: ``refine_pyramid(scan, layout_level, start, model)``.
+        plain: the fit to all pixels, ``refine_pyramid(scan, layout_level, start, model)``.
         scan, layout_level, start, model: as in ``refine_pyramid``.
+
+    Returns:
+        The fit without the defects, and a bool mask of the defects on the layout's pixels, of shape (ny, nx).
+        If there are no defects, the plain fit and None.
     """
     fine, defects = plain, None
     for attempt in range(_ROUNDS):
@@ -73,8 +78,9 @@ def refine_around_defects(
         masked = without_defects(scan, found, warp)
         fine = refine_pyramid(masked, layout_level, start, model, tolerance_px=_TOLERANCE_PX)
         defects = found
-        # Without true defects, the remaining pixels must fit better. If the warp shifts every edge, all edges
-        # are suspected, and little more than flat ground remains.
+        # If the areas are true defects, the other pixels now fit better. If the warp is wrong and shifts
+        # every edge, all edges are suspected. Little more than flat ground then remains, and the correlation
+        # falls.
         if not fine.refinement.converged or fine.refinement.correlation < plain.refinement.correlation:
             return plain, None
         ends = corners(layout_level.shape)
@@ -85,19 +91,21 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Return a mask of the places where the scan does not show the print, widened by a margin. Also return
-    the largest misfit.
+    """Find the places where the scan does not show the print, and the largest misfit there.
 
-    The misfit is the scan on the layout's pixels, minus a free function of the predicted topography
-    (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
-    connected area of at least 30 pixels whose misfit exceeds 3 sigma everywhere and 8 sigma somewhere.
+    The misfit is the height of the scan, on the layout's pixels, minus a prediction. The prediction is a free
+    function of the predicted topography (piecewise linear with 8 knots) plus a quadratic background, fitted
+    with Tukey's weights. An area is found if it is connected, has at least 30 pixels, and its misfit exceeds
+    3 sigma everywhere and 8 sigma somewhere.
 
     Args:
-        scan: (ny, nx) smoothed heights, including the defects, in the same frame as ``fine.scan``.
-        fine: the fit of the warp, which may exclude some defects.
+        scan: smoothed heights, including those of defects, shape (ny, nx), in the same frame as
+        ``fine.scan``.
+        fine: the fit of the warp, which may have been made without some defects.
 
     Returns:
-        bool (ny, nx) on the layout's pixels, and the misfit in units of its robust standard deviation.
+        A bool mask of the areas, each widened by a margin, on the layout's pixels, of shape (ny, nx); and the
+        largest misfit in the areas, in units of its robust standard deviation.
     """
     from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
 
@@ -105,8 +113,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     misfit = _misfit(scan, fine)
     if misfit is None:
         return nowhere
-    # Without noise, the whole misfit may come from edges. Sigma therefore has a lower limit, so that a misfit
-    # that is small compared with the print does not count as a defect.
+    # In a scan without noise, only edges may have a misfit, and the robust standard deviation would be tiny.
+    # Sigma therefore has a lower limit, so that a misfit that is small compared with the print is no defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
     if size.max() <= SUSPECT_SIGMA:
@@ -118,13 +126,18 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
         return nowhere
-    # Inside a missing part, some ground may have the right height by chance. Such pixels are marked too.
+    # Inside an area where the print is missing, some pixels may have the right height by chance. They are
+    # marked as well.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 
 
 def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array:
-    """Return a copy of the scan (ny, nx) with NaN at the defects, which are given on the layout's pixels."""
+    """Return a copy of the scan with NaN at the defects.
+
+    ``scan`` has shape (ny, nx), ``defects`` is a mask on the layout's pixels, and ``layout_to_scan`` is the
+    3×3 matrix between their pixel indices.
+    """
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
     inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
@@ -132,10 +145,10 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Return the scan minus the part that the layout explains, (ny, nx), on the layout's pixels.
+    """Return the heights of the scan minus those that the layout explains, on the layout's pixels.
 
-    The result is NaN at the border and where nothing was measured. It is None if the scan shows almost
-    nothing of the layout.
+    The result has the shape of the layout, and is NaN at its border and where nothing was measured. It is
+    None if the scan covers almost nothing of the layout.
     """
     from scipy.ndimage import map_coordinates
 
@@ -160,7 +173,11 @@ def _misfit(scan: Array, fine: FineFit) -> Array | None:
 
 
 def _robust(design: Array, values: Array) -> Array:
-    """Fit coefficients with Tukey's weights, after some passes with weights that fall off slowly."""
+    """Return coefficients fitted robustly, by least squares with repeatedly updated weights.
+
+    In the first half of the passes, the weights fall slowly with the residual. In the second half, they are
+    Tukey's weights, which ignore large residuals.
+    """
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])
     for step in range(_PASSES):

@@ -1,4 +1,6 @@
-"""Estimate the uncertainty of a registration from held-out blocks, a bootstrap and a correlation."""
+"""Estimate the uncertainty of a registration, from blocks held out of the fit, a bootstrap and a
+correlation.
+"""
 
 from dataclasses import dataclass
 
@@ -13,18 +15,20 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# On straight scans, the mean shifts of blocks differ by no more than the first value, in pixels, and by at
-# most 4 standard errors.
+# The shifts of the blocks along an axis count as a curve if their means at different positions differ by
+# more than the first value, in pixels, and by more than the second value, in standard errors. On straight
+# scans they differ by no more than 0.2 px and 4 standard errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """Shifts of single blocks of the field relative to the warp. All arrays are (n, 2) and contain (x, y) in
-    layout pixels.
+    """The shifts of the blocks of the field relative to the warp. All arrays have shape (n, 2), with columns
+    x and y, in layout pixels.
 
-    ``shift_px`` is the displacement of a block's content from the position that the warp predicts.
-    ``held_out_px`` is the same for a warp fitted without the block.
+    ``middle_px`` contains the centres of the blocks. ``shift_px`` is the displacement of a block's content
+    from the position that the warp predicts. ``held_out_px`` is the displacement from the position that a
+    warp predicts which was fitted without the block.
     """
 
     middle_px: Array
@@ -32,24 +36,31 @@ class BlockShifts:
     held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
-        """Return the requested percentiles of the target registration error, or NaN if there are no
-        blocks.
+        """Return percentiles of the target registration error, which is the length of ``held_out_px``. They
+        are NaN if there are no blocks.
         """
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Return the peak-to-valley range of the mean shift of the blocks as a function of their position.
+        """Return how much the mean shift of the blocks varies with their position, from its lowest to its
+        highest value.
 
-        ``axis`` is the axis of the shifts, and ``along`` is the axis of the positions (0 = x, 1 = y). With a
-        straight scanner and a sufficient model, the range is only noise. A larger range means that the
-        scanner's axis is not linear or that the scanner creeps, which no warp of the ladder describes.
+        Args:
+            axis: the axis of the shifts (0 = x, 1 = y).
+            along: the axis of the positions. The shifts of all blocks at the same position are averaged.
+
+        With a linear scanner and a sufficient kind of warp, the shifts vary only by noise. A larger variation
+        means that the scanner's axis is not linear or that the scanner creeps, which no warp of ``LADDER``
+        describes.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Return whether the curve along this axis is large and clearly exceeds the scatter of the blocks."""
+        """Return whether the shifts of the blocks vary with the position along this axis by a relevant
+        amount, and clearly more than by their scatter.
+        """
         for axis in (0, 1):
             groups = self._by_place(axis, along)
             if len(groups) < 3 or min(len(group) for group in groups) < 3:
@@ -69,17 +80,19 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """Return two shifts of every block: relative to the warp, and relative to a warp fitted without the
-    block.
+    """Measure the shift of every block relative to the warp, and relative to a warp fitted without the block.
 
     Args:
-        registered: (ny, nx) smoothed scan on the layout's pixels, with background removed and gaps filled.
-        measured: (ny, nx) mask of the pixels that were measured.
-        topography: (ny, nx) topography with the blur of the scan.
+        refinement: the fit of the warp.
+        registered: the smoothed scan on the layout's pixels, with the background removed and gaps filled,
+            shape (ny, nx).
+        measured: mask of the pixels that were measured, shape (ny, nx).
+        topography: predicted topography with the blur of the scan, shape (ny, nx).
 
-    Blocks are square windows with sides of four cells; neighbours overlap by half. A block must lie away
-    from the layout's border, contain structure, and have gaps in at most a tenth of its area. Its shift is
-    the peak of the normalised cross-correlation, refined by a parabola through the neighbouring values.
+    Blocks are windows with sides of four cells. Adjacent blocks overlap by half. A block is used if it
+    contains structure and at least nine tenths of its area were measured. The border of the layout is left
+    out. The shift of a block is the position of the highest normalised cross-correlation, refined by a
+    parabola through the adjacent values.
     """
     import cv2
 
@@ -105,7 +118,8 @@ def match_blocks_of_field(
             shift = _peak(cv2.matchTemplate(window, block, cv2.TM_CCOEFF_NORMED)) - WINDOW_SEARCH_PX
             others = total - gram[i : i + size, j : j + size].sum(axis=(0, 1))
             middle = np.array([(left + right - 1) / 2, (top + bottom - 1) / 2])
-            # The scan at x shows the topography at x - shift; the refitted warp accounts for x + motion.
+            # The scan at x shows what the topography predicts at x - shift. The warp fitted without the block
+            # moves the topography from x to x + motion.
             motion = corner_motion_px(solve_gram(others), shape, middle[None])[0]
             middles.append(middle)
             shifts.append(shift)
@@ -114,7 +128,9 @@ def match_blocks_of_field(
 
 
 def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> float:
-    """Return the largest standard deviation of a corner's position, in px, over a bootstrap of the blocks."""
+    """Return the standard deviation of the position, in px, of the corner that is most uncertain. It is
+    computed by a bootstrap over the blocks, and is NaN if there are fewer than four blocks.
+    """
     blocks = refinement.blocks()
     blocks = blocks.reshape(-1, *blocks.shape[2:])
     if len(blocks) < 4:
@@ -127,9 +143,10 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 
 
 def height_correlation(height: Array, layout_level: Array) -> float:
-    """Return the Pearson correlation between heights smoothed with sigma = 1 px and the unblurred layout.
+    """Return the Pearson correlation of the layout with the heights, which are smoothed with sigma = 1 px.
 
-    Only valid pixels at least 8 px from the layout's border are used. The heights (ny, nx) may contain NaN.
+    Both have shape (ny, nx), and heights may be NaN. Only pixels with a height that lie at least 8 px from
+    the layout's border are used.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:
@@ -138,8 +155,8 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Return the position (x, y) of the maximum. It is refined to a fraction of a pixel unless it lies on the
-    border.
+    """Return the position (x, y) of the largest score. Unless it lies on the border, it is refined to a
+    fraction of a pixel.
     """
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)

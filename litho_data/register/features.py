@@ -1,4 +1,6 @@
-"""Register coarsely, without an initial position, by matching keypoints and fitting a robust affine map."""
+"""Find the approximate position of a scan, without an initial guess, by matching keypoints and fitting a
+robust affine map to the matches.
+"""
 
 from dataclasses import dataclass
 
@@ -19,11 +21,12 @@ _FEWEST_MATCHES = 6
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Matched points, and the affine map with which most of them agree.
+    """Matched keypoints of layout and scan, and the affine map with which most of them agree.
 
-    ``layout_points`` and ``scan_points`` are (n, 2) index coordinates (x, y) of the matches. ``inlier`` says
-    which matches agree with ``layout_to_scan`` within ``INLIER_PX``. ``hull_px2`` is the area of the layout
-    inside the convex hull of the inliers. ``keypoints`` is the smaller of the two images' keypoint counts.
+    ``layout_points`` and ``scan_points`` contain the pixel indices (x, y) of the matched keypoints, in arrays
+    of shape (n, 2). ``inlier`` says which matches agree with ``layout_to_scan`` within ``INLIER_PX``.
+    ``hull_px2`` is the area, in layout pixels, of the convex hull of these inliers. ``keypoints`` is the
+    number of keypoints found in the layout or in the scan, whichever is smaller.
     """
 
     keypoints: int
@@ -34,13 +37,17 @@ class Correspondence:
     hull_px2: float
 
     def coverage(self, overlap: Array) -> float:
-        """Return the area spanned by the inliers, as a share of the overlap of scan and layout."""
+        """Return the area of the inliers' convex hull, as a share of the overlap of scan and layout.
+
+        ``overlap`` is the bool mask of the overlap on the layout's pixels.
+        """
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
     def reprojection_px(self, layout_to_scan: Array, bend: Bend | None = None) -> float:
-        """Return the root mean square distance of the inliers from the warp, in scan pixels.
+        """Return the root mean square distance, in scan pixels, between the inliers in the scan and the
+        positions to which the warp maps the inliers in the layout.
 
-        If a bend is given, the distances are those in the straightened scan.
+        If a bend is given, the distances are measured in the straightened scan.
         """
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
         found = self.scan_points[self.inlier]
@@ -52,15 +59,15 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
     """Find ORB keypoints in both images, match them with a cross-check, and fit an affine map by MAGSAC++.
 
     Args:
-        scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
-        layout_level: (ny, nx) integer levels.
+        scan: heights at the layout's pitch, shape (ny, nx), NaN where not measured.
+        layout_level: integer levels, shape (ny, nx).
         seed: seed of the robust estimator.
 
     Returns:
-        The correspondence, or None if there are too few matches or no affine map fits them.
+        The matched keypoints, or None if there are too few of them or no affine map fits them.
 
-    ORB: E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544. MAGSAC++: D. Barath et al., CVPR 2020,
-    doi:10.1109/CVPR42600.2020.00138.
+    Sources: ORB: E. Rublee et al., ICCV 2011, doi:10.1109/ICCV.2011.6126544. MAGSAC++: D. Barath et al., CVPR
+    2020, doi:10.1109/CVPR42600.2020.00138.
     """
     import cv2
 
@@ -94,7 +101,7 @@ def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondenc
 
 
 def _contrast_image(image: Array) -> Array:
-    """Return an 8-bit copy with equalised local contrast, used only to find keypoints."""
+    """Return an 8-bit copy of an image with equalised local contrast. It is used only to find keypoints."""
     import cv2
 
     low, high = np.percentile(image, (0.5, 99.5))

@@ -1,4 +1,4 @@
-"""Compute the quality figures of one registration from the fit and the images that it compared."""
+"""Compute the quality figures of a registration from its fit and from the images that the fit compared."""
 
 from typing import Any
 
@@ -14,7 +14,9 @@ from litho_data.register.topography import quadratic_basis
 
 
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    """Return figures that say how the warp was found and how well it explains the matches and heights."""
+    """Return the figures that say how the warp was found, and how well it explains the matched keypoints and
+    the heights.
+    """
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
     return {
@@ -34,10 +36,10 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
-    """Return the shift, scale and rotation of the warp at the layout's centre. If the scan is bent, these are
-    the values of the affine part of the warp.
+    """Return the shift, the scales and the rotation of the warp at the layout's centre. For a bent scan,
+    these figures describe the affine part of the warp.
 
-    The shift is the position of the centre in the scan minus its position in the layout.
+    The shift is the position of the layout's centre in the scan minus its position in the layout.
     """
     middle_um = (centre(layout_shape) + 0.5) * pitch_um
     linear = np.linalg.inv(linear_part(layout_to_scan, middle_um))
@@ -54,10 +56,10 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
-    """Return figures of the warp's uncertainty, and the shifts of the blocks.
+    """Return the figures that say how certain the warp is, and the shifts of the field's blocks.
 
-    The figures come from held-out blocks, from a bootstrap, and from the correlation at other shifts and in
-    other orientations of the scan.
+    The figures are computed from blocks held out of the fit, from a bootstrap over the blocks, and from the
+    correlation of scan and layout at other shifts and in other orientations.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))

@@ -1,4 +1,7 @@
-"""Define the generators of the warps on every rung of the ladder, and the quadratic flows."""
+"""Define the generators of every kind of warp, and the velocities (flows) of points under them.
+
+The kinds of warp form a ladder, on which each kind contains all simpler ones.
+"""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -8,8 +11,8 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# The number of generators that each rung of the ladder uses. Each rung starts from the first generator, so it
-# contains all lower rungs.
+# The number of generators of each kind of warp. Every kind uses the first generators of the list below, so it
+# contains all kinds before it.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0
@@ -18,20 +21,24 @@ GENERATORS[3, 0, 0] = GENERATORS[3, 1, 1] = 1.0
 GENERATORS[4, 0, 0], GENERATORS[4, 1, 1] = 1.0, -1.0
 GENERATORS[5, 0, 1] = GENERATORS[5, 1, 0] = 1.0
 GENERATORS[6, 2, 0] = GENERATORS[7, 2, 1] = 1.0
-# Number of flows of an affine map and a bend together. Two combinations of the six quadratic flows are the
-# generators of perspective.
+# Number of flows of an affine map together with a bend: six affine and six quadratic flows. The two
+# generators of perspective are combinations of the quadratic flows, so only four further flows are needed.
 BENT_COUNT = 12
 
 
 def normalisation(shape: Shape) -> Array:
-    """Return the matrix from indices to centred coordinates of order one, with equal scales on both axes."""
+    """Return the 3×3 matrix from pixel indices to normalised coordinates. These are zero at the centre, have
+    the same scale on both axes, and run from -1 to 1 along the longer side.
+    """
     scale = 2.0 / (max(shape) - 1)
     ny, nx = shape
     return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
 
 
 def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return the velocity (along x, along y) of normalised points under a generator, broadcasting x and y."""
+    """Return the velocities along x and along y of the points (x, y) under a generator. The points are in
+    normalised coordinates, and x and y are broadcast.
+    """
     coordinates = (x, y, np.ones(1, dtype=x.dtype))
     zero = np.zeros(1, dtype=x.dtype)
     moved_x, moved_y, weight = (
@@ -41,9 +48,9 @@ def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield the velocities of the first ``count`` generators.
+    """Yield the velocities along x and along y of the points (x, y) under the first ``count`` generators.
 
-    If ``count`` is ``BENT_COUNT``, yield those of all affine and quadratic flows.
+    If ``count`` is ``BENT_COUNT``, yield those under all affine and quadratic flows.
     """
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)

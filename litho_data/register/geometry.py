@@ -1,7 +1,7 @@
-"""Convert between pixel indices, micrometres, and rotated or mirrored images.
+"""Convert positions between pixel indices, micrometres, and rotated or mirrored images.
 
-Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. In an *index* frame, pixel centres lie
-at 0, 1, 2 …; in the micrometre frame of the same image, they lie at ``(i + 0.5) * pitch_um``.
+Points are rows ``(x, y)`` of an array. Matrices are 3×3 and act on ``(x, y, 1)``. In the *index* frame of an
+image, pixel centres lie at 0, 1, 2, … In its micrometre frame, they lie at ``(i + 0.5) * pitch_um``.
 """
 
 import numpy as np
@@ -10,8 +10,9 @@ from litho_data.foundation import YX, Array, Shape
 from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
-# Each name tells whether to transpose the scan, then flip its rows, then flip its columns. After the
-# operation, the scan has the orientation of the layout.
+# For each name, three flags tell whether to transpose the scan, then whether to reverse the order of its
+# rows, then whether to reverse the order of its columns. The operation gives the scan the layout's
+# orientation.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -25,13 +26,13 @@ ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
 
 
 def index_to_um(pitch_um: YX) -> Array:
-    """Return the matrix that maps pixel indices (x, y) to µm for a (y, x) pitch."""
+    """Return the matrix that maps pixel indices (x, y) to µm. The pitch is given as (y, x)."""
     pitch_y, pitch_x = pitch_um
     return np.array([[pitch_x, 0.0, pitch_x / 2], [0.0, pitch_y, pitch_y / 2], [0.0, 0.0, 1.0]])
 
 
 def orient(image: Array, orientation: str) -> Array:
-    """Return a view of the image after one of the eight operations of ``ORIENTATIONS``."""
+    """Return a view of the image, rotated or mirrored by one of the eight operations in ``ORIENTATIONS``."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     turned = image.T if transpose else image
     turned = turned[::-1] if flip_y else turned
@@ -39,9 +40,9 @@ def orient(image: Array, orientation: str) -> Array:
 
 
 def orientation_matrix(orientation: str, shape: Shape) -> Array:
-    """Return the matrix that maps indices of an image to indices of ``orient(image, orientation)``.
+    """Return the matrix that maps pixel indices of an image to those of ``orient(image, orientation)``.
 
-    ``shape`` is the (y, x) shape of the image.
+    ``shape`` is the shape (ny, nx) of the image.
     """
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
@@ -56,16 +57,18 @@ def orientation_matrix(orientation: str, shape: Shape) -> Array:
 
 
 def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
-    """Return the slow axis (0 = x, 1 = y) of an oriented scan: the axis across its lines.
+    """Return the slow axis (0 = x, 1 = y) of an oriented scan, which is the axis across its scan lines.
 
-    ``fast_axis`` is the direction of the lines in the scan as it was read; None counts as x.
+    ``fast_axis`` is the direction of the lines in the scan as it was read. None counts as x.
     """
     transposed = ORIENTATIONS[orientation][0]
     return int((fast_axis == "y") == transposed)
 
 
 def nearest_orientation(linear: Array) -> str:
-    """Return the orientation whose linear part is closest, in the Frobenius norm, to a 2×2 matrix."""
+    """Return the orientation whose matrix is closest to a 2×2 matrix, in the Frobenius norm. The 2×2 matrix
+    is first scaled to a determinant of ±1.
+    """
     unit = linear / np.sqrt(abs(np.linalg.det(linear)))
 
     def distance(name: str) -> float:
@@ -75,16 +78,17 @@ def nearest_orientation(linear: Array) -> str:
 
 
 def apply_transform(matrix: Array, points: Array) -> Array:
-    """Map points (x, y), shape (n, 2), by a 3×3 matrix."""
+    """Return the images of points (x, y) under a 3×3 matrix. Points and images have shape (n, 2)."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
-    """Return the positions (rows, columns) to which a 3×3 index matrix maps the pixels of an image.
+    """Return the positions in a target image to which a 3×3 matrix maps the pixels of an image of this shape.
 
-    If the target image is bent, the matrix gives true positions. The function then returns the points of the
-    bent image that have these true positions.
+    The matrix acts on pixel indices. The result is a pair of arrays: the rows and the columns of the
+    positions. If ``bend`` is given, the target image is bent, and the matrix gives the true positions of its
+    points. The function then returns their nominal positions, where they appear in the bent image.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]
@@ -97,7 +101,9 @@ def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[
 def overlap_of(
     layout_to_scan: Array, layout_shape: Shape, measured: Array, bend: Bend | None = None
 ) -> Array:
-    """Return a bool mask (ny, nx) of the layout pixels whose centres fall on measured pixels of the scan."""
+    """Return a bool mask of the layout pixels whose centres fall on measured pixels of the scan. Its shape is
+    ``layout_shape``.
+    """
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
@@ -105,18 +111,22 @@ def overlap_of(
 
 
 def nearest(image: Array, rows: Array, columns: Array) -> Array:
-    """Return the values of the pixels of an image (ny, nx) nearest to these positions."""
+    """Return the values of an image at the pixels nearest to the given positions."""
     clipped = (np.clip(np.rint(k), 0, n - 1) for k, n in zip((rows, columns), image.shape, strict=True))
     return image[tuple(k.astype(int) for k in clipped)]
 
 
 def lattice(y: Array, x: Array) -> Array:
-    """Return the points (x, y) of the grid with these y and x coordinates, row by row, as an array (n, 2)."""
+    """Return the points of the grid with the given y and x coordinates, row by row. The result has shape (n,
+    2) with columns x and y.
+    """
     return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
 
 
 def linear_part(matrix: Array, point: Array) -> Array:
-    """Return the 2×2 Jacobian of the map at a point (x, y): its local scale, rotation and shear."""
+    """Return the 2×2 Jacobian of a 3×3 map at a point (x, y). It describes the local scale, rotation and
+    shear.
+    """
     mapped = apply_transform(matrix, point[None])[0]
     weight = matrix[2, :2] @ point + matrix[2, 2]
     return (matrix[:2, :2] - np.outer(mapped, matrix[2, :2])) / weight

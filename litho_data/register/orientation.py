@@ -1,4 +1,6 @@
-"""Find orientation, polarity and rough position by masked normalised cross-correlation over all shifts."""
+"""Find the orientation, polarity and approximate position of a scan in its layout, by masked normalised
+cross-correlation over all shifts.
+"""
 
 from dataclasses import dataclass
 
@@ -14,10 +16,10 @@ TIE = 0.02
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One orientation and polarity of the scan, with the shift that correlates best.
+    """One possible orientation and polarity of the scan, with the shift at which it correlates best.
 
-    ``layout_to_oriented`` maps layout indices to indices of the oriented scan. ``ncc`` is the correlation at
-    this shift, already multiplied by the polarity.
+    ``layout_to_oriented`` is the 3×3 matrix of this shift, from pixel indices of the layout to those of the
+    oriented scan. ``ncc`` is the correlation at this shift, multiplied by the polarity.
     """
 
     orientation: str
@@ -27,15 +29,15 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """Correlate low-resolution copies, and return one hypothesis per orientation and polarity, the best
-    first.
+    """Correlate low-resolution copies of scan and layout in every orientation and polarity.
 
     Args:
-        scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
-        topography: (ny, nx) predicted topography.
+        scan: heights at the layout's pitch, shape (ny, nx), NaN where not measured.
+        topography: topography predicted from the layout, shape (ny, nx).
 
     Returns:
-        The list of hypotheses, which is empty if the scan or the layout shows no structure at all.
+        One hypothesis per orientation and polarity, the best first. The list is empty if the scan or the
+        layout shows no structure at all.
     """
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
@@ -45,7 +47,8 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
         correlation, overlap = masked_correlation(small_topography, moving)
         if np.isnan(correlation).all():
             continue
-        # This term only breaks ties. On a repeating layout, the shift with more overlap is the better guess.
+        # Among shifts with nearly equal correlation, as on a repeating layout, this term prefers the shift
+        # with the larger overlap.
         handicap = TIE * (1 - overlap / overlap.max())
         # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the size is
         # not a multiple of the factor, rotating a scan moves the remainder to the other side.
@@ -64,10 +67,11 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Return the largest correlation at a rival shift, divided by the correlation of the registration itself.
+    """Return the largest correlation at a competing shift, divided by the correlation without a shift.
 
-    A rival is a local maximum of the correlation at a shift of at least a sixteenth of the field. If the
-    topography is passed in place of the registered scan, the result says how strongly the layout repeats.
+    A competing shift is a local maximum of the correlation, at a distance of at least a sixteenth of the
+    field. If the topography is passed in place of the registered scan, the result says how strongly the
+    layout repeats itself.
     """
     from scipy.ndimage import maximum_filter
 
@@ -84,9 +88,8 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Correlate rotated, mirrored and inverted copies of the registered scan with the topography.
-
-    Return the largest correlation over all shifts.
+    """Return the largest correlation with the topography, over all shifts, of the registered scan in any
+    other orientation or polarity.
     """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
@@ -101,9 +104,10 @@ def rival_orientation(registered: Array, topography: Array) -> float:
 
 
 def reduce_image(image: Array, factor: int) -> Array:
-    """Average blocks of ``factor`` × ``factor`` pixels; a block of which half or more is missing gives NaN.
+    """Return the means of an image over blocks of ``factor`` × ``factor`` pixels.
 
-    Rows and columns at the end that do not fill a block are cropped.
+    A block is NaN if half of its pixels or more are missing. Rows and columns at the end that do not fill a
+    block are cropped.
     """
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
@@ -114,15 +118,17 @@ def reduce_image(image: Array, factor: int) -> Array:
 
 
 def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
-    """Return the Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
+    """Return the Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` for every shift (sy,
+    sx), over the pixels where both are measured.
 
     D. Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Process. 21 (2012),
     doi:10.1109/TIP.2011.2181402, eq. 11.
 
     Returns:
-        Correlation and number of overlapping pixels, both indexed by the shift modulo the shape. The
-        correlation is NaN if less than ``MIN_OVERLAP`` of the smaller image overlaps or one image is constant
-        in the overlap.
+        Two arrays: the correlation, and the number of overlapping pixels. Both are indexed by the shift
+        modulo
+        their shape. The correlation is NaN if less than the share ``MIN_OVERLAP`` of the smaller image
+        overlaps, or if one image is constant in the overlap.
     """
     from scipy.fft import irfft2, next_fast_len
 
@@ -139,15 +145,16 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     variance2 = summed(mask1, square2) - total2**2 / overlap
     covariance = summed(height1, height2) - total1 * total2 / overlap
     least = MIN_OVERLAP * min(np.isfinite(one).sum() for one in (fixed, moving))
-    # Rounding errors are 1e-12 of the energy. An image with less than 1e-6 of the energy has no structure.
+    # Rounding errors are about 1e-12 of the energy of the whole image. An overlap that contains less than
+    # 1e-6 of this energy per pixel is taken as having no structure.
     usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
     product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
     return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
 
 
 def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Return three spectra: of the mask of measured pixels, of the heights at unit energy, and of the squares
-    of these heights.
+    """Return the spectra of three images: the mask of measured pixels, the heights, and their squares. The
+    heights are centred and scaled to a mean square of one.
     """
     from scipy.fft import rfft2
 

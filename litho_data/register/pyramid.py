@@ -1,4 +1,4 @@
-"""Refine a registration from coarse to fine resolution, and estimate the blur of the print in the process."""
+"""Refine a registration from coarse to fine resolution, and estimate the blur of the print."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,7 +25,9 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """The refinement and the two images that it compared: the smoothed scan and the blurred topography."""
+    """A refinement, with the two images that it compared. These are the smoothed scan and the topography that
+    is predicted from the layout with a blur of sigma ``blur_px``.
+    """
 
     refinement: Refinement
     scan: Array
@@ -41,16 +43,17 @@ def refine_pyramid(
     *,
     tolerance_px: float = TOLERANCE_PX,
 ) -> FineFit:
-    """Refine a coarse warp at a quarter, half and full resolution.
+    """Refine a coarse warp at a quarter of the resolution, then at half of it, then at full resolution.
 
     Args:
-        scan: (ny, nx) oriented heights without bow at the layout's pitch, NaN where not measured.
-        layout_level: (ny, nx) integer levels.
-        start: 3×3 index matrix from the layout to the scan.
-        model: rung of the ladder; at reduced resolution, a homography is replaced by an affine map.
-        tolerance_px: tolerance at full resolution.
+        scan: oriented heights at the layout's pitch, with the bow removed, shape (ny, nx), NaN where not
+            measured.
+        layout_level: integer levels, shape (ny, nx).
+        start: the coarse warp, a 3×3 matrix from pixel indices of the layout to those of the scan.
+        model: the kind of warp. At reduced resolution, an affine map is fitted in place of a homography.
+        tolerance_px: tolerance of the refinement at full resolution.
 
-    If the fit at full resolution does not converge, the coarse warp is returned, marked as not converged.
+    If the fit at full resolution does not converge, the coarse warp is returned and marked as not converged.
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, layout_level.shape)
@@ -65,7 +68,7 @@ def refine_pyramid(
 
 
 def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model: Model) -> Array:
-    """Refine the warp at a quarter and at half resolution."""
+    """Refine the warp, first at a quarter of the resolution and then at half of it."""
     for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
         start = scale @ matrix @ np.linalg.inv(scale)
@@ -76,14 +79,16 @@ def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model:
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield factor, scan and predicted topography at a quarter and at half resolution.
+    """Yield (factor, scan, predicted topography) with both images at a quarter of the resolution, and then at
+    half of it.
 
-    A resolution at which the images would be too small is skipped.
+    ``factor`` is 4 or 2. A resolution at which the images would be too small is skipped.
     """
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
-        # A coarse fit may be off by a few pixels. The extra blur lets the refinement converge from there.
+        # A coarse fit may be wrong by a few pixels. The refinement still converges, because of the extra
+        # blur.
         small_scan = _smooth(scan, factor)[::factor, ::factor]
         yield factor, small_scan, predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
 
@@ -97,7 +102,7 @@ def match_blur(
     from scipy.ndimage import map_coordinates
 
     grid = warped_grid(layout_to_scan, layout_level.shape, bend)
-    # Every second pixel is enough to rank blurs of half a pixel and more.
+    # Every second row and column is enough to compare blurs of half a pixel and more.
     rows, columns = grid[0][::2, ::2], grid[1][::2, ::2]
     warped = map_coordinates(fill_gaps(smooth_scan), (rows, columns), order=1, cval=np.nan)
     valid = np.isfinite(warped)
@@ -113,10 +118,10 @@ def match_blur(
 
 
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
-    """Return the warp of this model that approximates a given warp best.
+    """Return the warp of the kind ``model`` that approximates a given warp best.
 
-    An affine map matches the given warp to first order at the centre of the field. Simpler models fit the
-    positions of the corners.
+    An affine map agrees with the given warp to first order at the centre of the field. A simpler warp is
+    fitted to the positions to which the given warp maps the corners.
     """
     if model == "homography":
         return matrix
@@ -136,7 +141,7 @@ def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
 
 
 def _about(linear: Array, point: Array, image: Array) -> Array:
-    """Return the affine map that has a given linear part and maps one point to its image."""
+    """Return the affine map that has the given linear part and maps ``point`` to ``image``."""
     matrix = np.eye(3)
     matrix[:2, :2] = linear
     matrix[:2, 2] = image - linear @ point
@@ -144,7 +149,7 @@ def _about(linear: Array, point: Array, image: Array) -> Array:
 
 
 def _smooth(scan: Array, sigma_px: float) -> Array:
-    """Smooth the scan where it was measured, and keep NaN in the gaps, where nothing is known."""
+    """Smooth the scan where it was measured, and keep NaN in its gaps."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)
 
 
@@ -152,12 +157,15 @@ STANDARD_ERRORS = 3.0
 
 
 def climb(fine: FineFit) -> FineFit:
-    """Return the fit on the lowest rung of the ladder for which no higher rung is better on held-out blocks.
+    """Fit every kind of warp, and return the fit of the simplest kind for which no more general kind is
+    better on held-out blocks.
 
     Args:
-        fine: a converged affine fit; the fit on every rung starts from this warp, projected to the rung.
+        fine: a converged affine fit. Every other fit starts from the warp of its kind that approximates this
+            fit best.
 
-    A higher rung is better if its mean gain on held-out blocks exceeds three standard errors of this mean.
+    A more general kind is better if its residual energy in held-out blocks is lower, on average over the
+    blocks, by more than three standard errors of this average.
     """
     shape = fine.topography.shape
     start = fine.refinement.layout_to_scan
@@ -172,10 +180,11 @@ def climb(fine: FineFit) -> FineFit:
 
 
 def held_out_energy(refinement: Refinement) -> Array:
-    """Return an array (n,) with the residual energy of every block, under a fit to the blocks of the other
-    folds.
+    """Return the residual energy of every block under a fit that did not use the block. The result has shape
+    (blocks,).
 
-    The folds interleave, so each fold is spread over the whole field.
+    The blocks are divided into four folds, each spread over the whole field. A block's residual energy is
+    that of a fit to the blocks of the other three folds.
     """
     blocks = refinement.blocks()
     rows, columns = np.indices(blocks.shape[:2])

@@ -1,4 +1,4 @@
-"""Define the quality record of a registration, and the limits within which a registration passes."""
+"""Define the record of a registration's quality, and the limits that a registration must meet to pass."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -8,18 +8,19 @@ from litho_data.register.bend import Bend
 
 @dataclass(frozen=True)
 class RegistrationQuality:
-    """The quality figures of one registration; a figure that could not be computed is NaN.
+    """The quality figures of one registration. A figure that could not be computed is NaN.
 
-    Lengths in px are in layout pixels; figures in nm are the same lengths times the pitch.
+    Lengths in px count layout pixels. The figures in nm are the same lengths, converted with the layout's
+    pitch.
     """
 
     passed: bool
     reason: str  # why the registration failed; empty if it passed
     warning: str  # what the user should know about the registration, even if it passed
     model: str
-    method: str  # how the coarse fit was found: orb | correlation
-    dihedral: str  # the operation that gives the scan the orientation of the layout
-    polarity: int  # -1 if the scan shows the layout's negative
+    method: str  # how the coarse fit was found: by keypoints (orb) or by correlation (correlation)
+    dihedral: str  # the rotation or reflection that gives the scan the orientation of the layout
+    polarity: int  # -1 if heights fall where the layout's levels rise, otherwise 1
     converged: bool
     keypoints: int
     matches: int
@@ -57,21 +58,24 @@ class RegistrationQuality:
 # A registration must meet these limits to pass; docs/registration.md gives the reason for each.
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
-# If the sigma of the print's blur exceeds this, MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX grow with the blur.
+# If the sigma of the print's blur exceeds this, the limits MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX are
+# multiplied by the ratio of the two.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
-# If the slope of a bend is 1 or more, two points of the scan may show the same position.
+# If the slope of a bend is 1 or more, two points of the scan may show the same place of the print.
 MAX_BEND_SLOPE = 1.0
 
 
 def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) -> tuple[bool, str, str]:
-    """Return (passed, reason, warning) for the figures of one registration; the reason names every failure.
+    """Compare the figures of one registration with the limits, and return (passed, reason, warning).
+
+    The reason names every limit that is not met.
 
     Args:
-        figures: figures of the fit, the warp and the evidence.
+        figures: the quality figures of the registration, by the names in ``RegistrationQuality``.
         blur_px: sigma, in layout pixels, of the blur that makes the layout most similar to the scan.
-        bend_um: the bend of the scan in its own frame, if one was fitted.
+        bend_um: the bend of the scan in its own frame, or None if none was fitted.
     """
     smallest, largest = figures["singular_min"], figures["singular_max"]
     scale = f"scale {smallest:.3f} to {largest:.3f}"
@@ -88,14 +92,14 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     how = "a quadratic distortion was fitted"
     if bend_um is not None and bend_um.kind == "creep":
         how = "its lines creep along the slow axis, and the creep was corrected"
-    # Some tests are written as "not >=", so that a figure that could not be computed (NaN) fails.
+    # Some conditions are written as "not >=", so that a figure that could not be computed (NaN) fails them.
     failures = {
         f"the correlation of scan and layout is {ecc:.2f}, but must be at least {MIN_ECC}": not fits,
         f"ambiguous: the layout repeats itself (correlation {repeats:.2f} with a shifted copy)": repeating,
         f"ambiguous: at another shift, the correlation is {second:.2f} times that of the fit": fits
         and not repeating
         and second > MAX_SECOND_ALIGNMENT,
-        f"ambiguous: the correlation in another orientation or polarity is only {margin:.2f} lower": tied
+        f"ambiguous: the correlation in another orientation or polarity is lower by only {margin:.2f}": tied
         and not upright,
         f"the overlap of scan and layout is {overlap:.2f}, but must be at least {MIN_OVERLAP}": not (
             overlap >= MIN_OVERLAP
@@ -115,10 +119,11 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
         f"scan bent by up to {bent_um:.2f} µm: {how}": bend_um is not None,
         f"{defects:.1%} of the field does not show the print and was excluded": defects > 0,
         f"{scale}; check the pitch": not warning_low <= smallest <= largest <= warning_high,
-        "the layout looks the same in another orientation, so upright was assumed": tied and upright,
+        "the layout looks the same in another orientation, so the scan was assumed to be upright": tied
+        and upright,
         f"the target registration error is {tre_px:.2f} px": tre_px > TRE_MEDIAN_WARNING_PX,
         "the contrast of the scan is inverted": figures["polarity"] == -1,
-        "coarse fit by correlation only, without matched features": figures["method"] != "orb",
+        "the coarse fit used only correlation and no matched keypoints": figures["method"] != "orb",
         "the refinement did not converge": not figures["converged"],
     }
     reasons, said = ("; ".join(text for text, so in one.items() if so) for one in (failures, warnings))
@@ -126,7 +131,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
-    """Make the quality record of a scan that could not be fitted at all; every figure is missing."""
+    """Return the record of a scan that could not be fitted at all. It contains the reason but no figures."""
     empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
     figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
     return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

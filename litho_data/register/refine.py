@@ -1,9 +1,10 @@
-"""Refine a registration to sub-pixel accuracy by maximising the correlation of heights and topography.
+"""Refine a registration to sub-pixel accuracy, by maximising the correlation of the scan with the predicted
+topography.
 
-Gauss-Newton steps in the inverse compositional form maximise the correlation between the scan and the
-predicted topography. A warp, a gain and a quadratic background are fitted at the same time. G. D.
-Evangelidis, E. Z. Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113; S. Baker, I. Matthews, IJCV 56
-(2004), doi:10.1023/B:VISI.0000011205.11775.fd.
+The correlation is maximised by Gauss-Newton steps in the inverse compositional form. A warp, a gain and a
+quadratic background are fitted at the same time. Sources: G. D. Evangelidis, E. Z. Psarakis, IEEE TPAMI 30
+(2008), doi:10.1109/TPAMI.2008.113; S. Baker, I. Matthews, IJCV 56 (2004),
+doi:10.1023/B:VISI.0000011205.11775.fd.
 """
 
 from collections.abc import Sequence
@@ -18,24 +19,27 @@ from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flo
 from litho_data.register.geometry import apply_transform, corners, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-NUISANCES = 7  # gain of the topography, then the six quadratic terms
+NUISANCES = 7  # coefficients before those of the warp: the gain of the topography and six quadratic terms
 _BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
 CELL_PX = 32
-# Within this distance of the border, the blurred heights depend on the unknown surroundings of the print,
-# such as bare ground or a neighbouring print.
+# Pixels closer than this to the layout's border are not used, because their blurred heights depend on the
+# unknown surroundings of the print, such as bare ground or another print beside it.
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """A refined warp, whether it converged, and the data that determine its uncertainty.
+    """A refined warp, with the sums from which its uncertainty is computed.
 
-    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend``, it maps to the straightened scan.
-    ``warped`` (ny, nx) float32 is the scan on the layout's pixels, with gaps filled. ``gram`` (cells_y,
-    cells_x, k, k) contains inner products for every cell, whose sides are about ``CELL_PX`` pixels long.
-    Their factors are the regressors (gain, background, warp) and, as the last one, the scan. These sums
-    suffice to refit any part of the field.
+    ``layout_to_scan`` is the 3×3 matrix from pixel indices of the layout to pixel indices of the scan. For a
+    scan with a ``bend``, the latter refer to the straightened scan. ``warped`` is the scan on the layout's
+    pixels with gaps filled, a float32 array of shape (ny, nx).
+
+    For every cell of the field, with sides of about ``CELL_PX`` pixels, ``gram`` contains the matrix of inner
+    products of the regressors with each other and with the scan. Its shape is (cells_y, cells_x, k, k). The
+    regressors are ordered gain, background, warp, and the scan comes last. These sums suffice to fit the warp
+    again to any part of the field.
     """
 
     model: Model
@@ -46,19 +50,18 @@ class Refinement:
     bend: Bend | None = None
 
     def blocks(self) -> Array:
-        """Return ``gram``, summed over blocks by ``in_blocks``."""
+        """Return the inner products in ``gram``, summed over blocks of cells by ``in_blocks``."""
         return in_blocks(self.gram)
 
     @property
     def background(self) -> Array:
-        """Return the coefficients (6,) of the quadratic surface fitted along with the warp."""
+        """Return the six coefficients of the quadratic surface that was fitted together with the warp."""
         return solve_gram(self.gram.sum(axis=(0, 1)))[1:NUISANCES]
 
     @property
     def correlation(self) -> float:
-        """Return the partial correlation of scan and topography, given the background.
-
-        The correlation is 0 if the fitted gain is not positive.
+        """Return the correlation of scan and topography after the quadratic background has been removed from
+        both (their partial correlation). It is 0 if the fitted gain is not positive.
         """
         total = self.gram.sum(axis=(0, 1))
         background = total[np.ix_(_BACKGROUND_AND_SCAN, _BACKGROUND_AND_SCAN)]
@@ -79,17 +82,20 @@ def refine(
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
-    """Find the warp of this model that maximises the correlation of scan and topography.
+    """Find the warp of the kind ``model`` that maximises the correlation of scan and topography.
 
     Args:
-        scan: (ny, nx) smoothed heights, NaN where not measured.
-        topography: (ny, nx) predicted topography.
-        start: 3×3 index matrix from the layout to the scan; it must be a warp of the kind ``model``. Its
-            error may be as large as the width of the structures.
-        bend: bend of the scan. If it is given, ``start`` must be an affine map, and the warp and the bend are
-            evaluated but not refined.
-        max_iterations: largest number of Gauss-Newton steps; with 0, the start is only evaluated.
-        tolerance_px: the iteration ends when a step moves every corner by less than this.
+        scan: smoothed heights, shape (ny, nx), NaN where not measured.
+        topography: topography predicted from the layout, shape (ny, nx).
+        start: the warp at which the search starts, a 3×3 matrix from pixel indices of the layout to those of
+            the scan. It must be of the kind ``model``. Its position error may be as large as the width of
+            the printed structures.
+        model: the kind of warp.
+        bend: bend of the scan. If it is given, ``start`` must be an affine map, and warp and bend are
+            evaluated without being refined.
+        max_iterations: largest number of Gauss-Newton steps. With 0, ``start`` is evaluated without being
+            refined.
+        tolerance_px: the search ends when a step moves no corner of the layout by this many pixels or more.
     """
     from scipy.linalg import expm
     from scipy.ndimage import map_coordinates, spline_filter
@@ -129,10 +135,14 @@ def refine(
 
 
 def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequence[Array] = ()) -> Array:
-    """Return ``gram``, as in ``Refinement``, for a scan that is already aligned with the topography.
+    """Return the inner products ``gram`` of ``Refinement`` for a scan that is already aligned with the
+    topography.
 
-    Both are (ny, nx); the scan is NaN where not measured. ``count`` is the number of flows of the warp, see
-    ``LADDER`` and ``BENT_COUNT``. ``further`` are additional regressors (ny, nx).
+    Args:
+        aligned: the scan on the layout's pixels, shape (ny, nx), NaN where not measured.
+        topography: topography predicted from the layout, shape (ny, nx).
+        count: number of generators of the warp, from ``LADDER`` or ``BENT_COUNT``.
+        further: additional regressors, each of shape (ny, nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)
@@ -141,39 +151,48 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
 
 
 def in_blocks(gram: Array) -> Array:
-    """Sum the inner products over blocks of two by two cells; the result is (blocks_y, blocks_x, k, k).
+    """Sum the inner products over blocks of two by two cells. The result has shape (blocks_y, blocks_x, k,
+    k).
 
-    Errors of the topography extend over one or two features. A block is therefore the smallest area that
-    counts as independent.
+    An error of the predicted topography extends over one or two printed features. Therefore, a block is taken
+    as the smallest area whose errors are independent of those elsewhere.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
 
 
 def solve_gram(gram: Array) -> Array:
-    """Return the coefficients of the least-squares fit of the regressors to the scan, from inner products.
+    """Return the coefficients of the least-squares fit of the regressors to the scan, shape (…, k - 1).
 
-    The inner products have the shape (…, k, k).
+    ``gram`` contains the inner products of the regressors and, last, the scan. Its shape is (…, k, k).
     """
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge at the float32 precision of the regressors sets coefficients to zero that the layout does not
-    # determine.
+    # A ridge as small as the float32 precision of the regressors keeps coefficients near zero that the layout
+    # does not determine.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
 
 def residual_energy(gram: Array, coefficients: Array) -> Array:
-    """Return the sum of squared residuals for given coefficients and inner products (…, k, k)."""
+    """Return the sum of squared residuals of a fit, from its inner products of shape (…, k, k) and its
+    coefficients of shape (…, k - 1).
+    """
     extended = np.concatenate([coefficients, -np.ones((*coefficients.shape[:-1], 1))], axis=-1)
     return np.einsum("...i,...ij,...j->...", extended, gram, extended)
 
 
 def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
-    """Return the displacements (…, n, 2) of points, in layout pixels, under the warp of fitted coefficients
-    (…, k).
+    """Return the displacements of points under a fitted warp, in layout pixels.
 
-    The points are (n, 2). The result is not finite where the fitted gain of the topography is 0.
+    Args:
+        coefficients: coefficients from ``solve_gram``, shape (…, k).
+        shape: shape (ny, nx) of the layout.
+        points: positions (x, y) in layout pixels, shape (n, 2).
+
+    Returns:
+        Displacements along x and y, shape (…, n, 2). They are not finite where the fitted gain of the
+        topography is 0.
     """
     normalise = normalisation(shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -184,16 +203,19 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
 
 
 def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
-    """Return a mask (ny, nx) of the pixels that do not lie in the border."""
+    """Return a bool mask of shape (ny, nx) that is true for all pixels except those in the border.
+
+    The border is ``border_px`` wide, but not wider than a sixteenth of the shorter side.
+    """
     border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
 def _regressors(topography: Array, count: int) -> Array:
-    """Return the regressors: the topography, the quadratic background, and the change of the topography under
-    each generator of the warp.
+    """Return the regressors as an array of shape (7 + count, ny, nx).
 
-    The shape is (7 + count, ny, nx).
+    They are the topography, the six terms of the quadratic background, and the change of the topography under
+    each of the ``count`` generators of the warp.
     """
     shape = topography.shape
     scale = normalisation(shape)[0, 0]
@@ -216,7 +238,7 @@ def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:
     gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
     for i, (top, bottom) in enumerate(pairwise(rows)):
         for j, (left, right) in enumerate(pairwise(columns)):
-            # The sums use float64, because the result must not depend on the order in which BLAS adds.
+            # The sums use float64, so that the order in which BLAS adds does not matter for the result.
             cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(float)
             gram[i, j] = cell @ cell.T
     return gram

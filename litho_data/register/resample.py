@@ -1,4 +1,4 @@
-"""Resample a scan onto the layout's pixels in a single step. Heights remain floats, and gaps remain gaps."""
+"""Resample a scan onto the layout's pixels in a single step. Missing pixels of the scan remain missing."""
 
 from functools import lru_cache
 
@@ -10,7 +10,8 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# Sub-pixel positions, and pixels that the spline reaches, used to compute how resampling changes noise.
+# The sub-pixel positions over which effects of resampling are averaged, and the scan pixels, relative to such
+# a position, whose weights are computed.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -26,24 +27,25 @@ def resample_to_layout(
 ) -> tuple[Array, Array]:
     """Interpolate the heights of a scan at the layout's pixel centres by a cubic spline.
 
+    If the scan is sampled more finely than the layout, its heights are first averaged by a Gaussian over
+    about the size of a layout pixel. Without this average, interpolation would alias the noise of the scan.
+
     Args:
-        height_um: (ny, nx) in the scan's own frame, NaN where not measured.
-        scan_to_layout: 3×3 matrix that maps (x_um, y_um, 1) of the scan to the layout.
-        layout_shape: (ny, nx) of the result.
-        scan_pitch_um: (y, x) pitch of the scan.
-        layout_pitch_um: pitch of the layout.
-        bend_um: bend of the scan, in µm in the scan's frame; it changes where the heights are interpolated.
+        height_um: heights in µm in the scan's own frame, shape (ny, nx), NaN where not measured.
+        scan_to_layout: 3×3 matrix that maps positions (x_um, y_um, 1) of the scan to positions in the layout.
+        layout_shape: shape (ny, nx) of the result.
+        scan_pitch_um: pitch (y, x) of the scan in µm.
+        layout_pitch_um: pitch of the layout in µm.
+        bend_um: bend of the scan, in µm in the scan's frame. It changes the positions at which the heights
+            are interpolated.
 
     Returns:
-        ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
-        valid if it falls between the scan's pixel centres and if no gap lies within two pixels of it. Two
-        pixels are the reach of the spline's kernel.
+        ``height_um``, the heights in µm as float32, NaN where not valid; and ``valid``, a bool mask. Both
+        have the shape ``layout_shape``. A pixel is valid if it lies between pixel centres of the scan, and if
+        no missing pixel of the scan lies within two pixels of it, which is the reach of the spline's kernel.
 
     Raises:
-        InputError: the transform is not an invertible 3×3 matrix, or the scan has no measured pixel.
-
-    If the scan is sampled more finely than the layout, a Gaussian first averages it over the size of a layout
-    pixel, because plain interpolation would alias the scan's noise.
+        InputError: ``scan_to_layout`` is not an invertible 3×3 matrix, or the scan has no measured pixel.
     """
     from scipy.ndimage import binary_dilation, map_coordinates, spline_filter
 
@@ -69,7 +71,7 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Return the share of the variance of white pixel noise that remains after resampling.
+    """Return the share of its variance that noise, independent from pixel to pixel, keeps in resampling.
 
     The share is a mean over sub-pixel positions.
     """
@@ -78,20 +80,22 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the share of the variance of white line offsets that remains after resampling across
-    the lines.
+    """Return the share of their variance that line offsets, independent from line to line, keep in
+    resampling.
+
+    ``pitch_um`` is the pitch of the scan across its lines.
     """
     return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
 
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Return frequencies (n,) and the squared errors (n,) that resampling causes in waves of these
+    """Return spatial frequencies, and the squared errors that resampling causes in waves of these
     frequencies.
 
-    The frequencies run up to the Nyquist frequency, in cycles/µm. The error is relative to the wave's squared
-    amplitude and averaged over sub-pixel positions. Averaging a finely sampled scan over the layout's pixel
-    does not count as an error.
+    Both have shape (n,). The frequencies, in cycles/µm, run up to the Nyquist frequency of the scan. The
+    squared error of a wave is relative to its squared amplitude, and averaged over sub-pixel positions. The
+    average of a finely sampled scan over a layout pixel is intended and does not count as an error.
     """
     frequency = np.linspace(0, 0.5, 129)
     lags = _LAGS[None, :] + _PHASES[:, None]
@@ -103,9 +107,11 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return the weights (phases, lags) that the pixels of a scan have in one pixel of the layout.
+    """Return the weights with which the pixels of a scan contribute to one pixel of the layout, along one
+    axis.
 
-    The distance of each scan pixel from the layout pixel is lag + phase, in pixels.
+    The weights have shape (phases, lags). The distance of a scan pixel from the layout pixel is lag + phase,
+    in scan pixels.
     """
     from scipy.ndimage import map_coordinates
 
@@ -124,7 +130,9 @@ def _average_over_layout_pixel(height: Array, scan_pitch_um: YX, layout_pitch_um
 
 
 def _average_px(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the sigma, in scan pixels, of the Gaussian that averages a scan over the layout's pixel."""
+    """Return the sigma, in scan pixels, of the Gaussian that averages a scan over the size of a layout
+    pixel.
+    """
     # A box of r pixels has the variance (r² - 1) / 12. Pitches that differ by less than 10 % count as equal.
     ratio = layout_pitch_um / pitch_um
     return ((ratio**2 - 1) / 12) ** 0.5 if ratio > 1.1 else 0.0

@@ -33,10 +33,11 @@ from litho_data.scan import Axis, Scan
 MIN_SIZE_PX = 32
 # One picometre is below the resolution of any instrument, but above rounding errors.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend is fitted together with an affine map. If the caller chose a stiffer model, no bend is fitted.
+# The models with which a bend may be fitted. A bend is fitted together with an affine map, so no bend is
+# fitted if the caller chose a model with fewer parameters than an affine map.
 BENDABLE = ("affine", "homography", "ladder")
-# A bend is accepted if it reduces the error on held-out blocks to this share or less. A real bend removes
-# nearly all of the error, so the limit clearly separates real bends from spurious ones.
+# A bend is accepted if the error on held-out blocks is at most this share of the error without the bend. A
+# real bend removes nearly all of the error, so the limit separates real bends from spurious ones.
 BENT_SHARE = 0.5
 
 
@@ -44,16 +45,18 @@ BENT_SHARE = 0.5
 class Registration:
     """The registration of a scan onto its layout.
 
-    ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's. In both frames,
-    pixel centres lie at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, the matrix is the best guess,
-    or the centred placement if there was no guess.
+    ``scan_to_layout`` is a 3×3 matrix that maps positions (x_um, y_um, 1) in the scan's frame to positions in
+    the layout's frame. In both frames, pixel centres lie at ``(i + 0.5) * pitch``. If ``quality.passed`` is
+    false, the matrix is the best fit that was found. If nothing could be fitted, it places the centre of the
+    scan on the centre of the layout.
 
-    ``bend_um`` is set if the scanner bent the scan. ``bend_um.straighten`` then gives the true position of a
-    point (x_um, y_um), and ``scan_to_layout`` acts on this position. It is the affine map closest to the
-    whole mapping.
+    ``bend_um`` describes how the scanner bent the scan, and is None for a scan that is not bent. For a bent
+    scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` acts
+    on these. This matrix is the affine map closest to the whole mapping from scan to layout.
 
-    ``defects`` (ny, nx) bool, on the layout's pixels, marks where the scan shows something other than the
-    print (dust, collapsed or lifted parts). It is None if nothing is marked.
+    ``defects`` is a bool array of shape (ny, nx) on the layout's pixels. It marks where the scan shows
+    something other than the print, such as dust, or collapsed or lifted parts. It is None if nothing is
+    marked.
     """
 
     scan_to_layout: Array
@@ -72,26 +75,34 @@ def register_scan(
     fast_axis: Axis | None = None,
     seed: int = 0,
 ) -> Registration:
-    """Find the warp from a scan, in any orientation and polarity, to its layout, and assess its quality.
+    """Find the warp that maps a scan onto its layout, and assess the quality of the warp.
+
+    The scan may be rotated or mirrored, and its heights may be inverted.
 
     Args:
-        scan: a ``Scan``, whose pitch is used, or heights (ny, nx) in µm, NaN where not measured.
-        layout_level: (ny, nx) integer levels.
-        layout_pitch_um: pitch of the layout.
-        scan_pitch_um: (y, x) pitch, needed if ``scan`` is an array of heights.
-        model: a rung of the ladder, or ``ladder`` to let held-out blocks choose the rung.
+        scan: a ``Scan`` with a known pitch, or heights in µm as an array of shape (ny, nx), NaN where not
+            measured.
+        layout_level: integer levels of the layout, shape (ny, nx).
+        layout_pitch_um: pitch of the layout in µm.
+        scan_pitch_um: pitch (y, x) of the scan in µm. It is needed if ``scan`` is an array.
+        model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or
+            ``homography``, each of which contains the one before it. With ``ladder``, the simplest kind is
+            used for which no later kind is better on held-out blocks.
         fast_axis: axis along which the tip moved fast, if the scan does not state it; None counts as ``x``.
-        seed: seed of the robust estimator and the bootstrap.
+        seed: seed of the robust estimator and of the bootstrap.
 
     Raises:
-        InputError: an array is not 2-D or has fewer than 32 pixels on a side, or a pitch is missing or not
-            positive. A fit that fails does not raise; ``quality.passed`` and ``quality.reason`` report it.
+        InputError: an array is not two-dimensional or has fewer than 32 pixels on a side, or a pitch is
+            missing or not positive. A fit that fails raises no error; ``quality.passed`` and
+            ``quality.reason`` report it.
     """
     if isinstance(scan, Scan):
         scan_pitch_um, fast_axis, scan = scan.require_pitch(), scan.fast_axis or fast_axis, scan.height_um
     if scan_pitch_um is None:
         raise InputError(
-            "registration of an array of heights", got="no scan_pitch_um", wanted="its pitch (y, x) in µm"
+            "registration of an array of heights",
+            got="no scan_pitch_um",
+            wanted="the pitch (y, x) of the scan in µm",
         )
     height = np.asarray(scan, dtype=float)
     layout = np.asarray(layout_level)
@@ -148,13 +159,15 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Return whether the bent fit is accepted and has at most half the held-out error of the straight fit."""
+    """Return whether the fit with a bend passed and its error on held-out blocks is at most half of that of
+    the straight fit.
+    """
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan and its layout; ``known`` contains the quality figures that do not depend on the warp."""
+    """One scan with its layout. ``known`` contains the quality figures that are the same for every warp."""
 
     height_um: Array
     layout: Array
@@ -165,7 +178,10 @@ class _Case:
     known: Mapping[str, float]
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
-        """Return the registration in µm, with its figures and verdict, and the shifts of its blocks."""
+        """Convert a fit to µm, and compute its quality figures and verdict.
+
+        Return the registration, and the shifts of the field's blocks relative to the warp.
+        """
         height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
@@ -186,7 +202,9 @@ class _Case:
         return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
     def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[Array, Bend | None]:
-        """Return the matrix from layout to straightened scan, in µm, and the bend in the scan's own frame."""
+        """Return the matrix that maps the layout to the straightened scan, and the bend of the scan. Both are
+        in µm, in the frame of the scan as it was read.
+        """
         frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
         ny, nx = self.height_um.shape
         size_um = np.array([nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]])
@@ -195,7 +213,8 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # A bend rotated by 90° is again a bend. It is fitted to points and their images.
+        # In the frame of the scan as it was read, which may be rotated or mirrored, the bend has other
+        # coefficients. They are fitted to a grid of points and the images of these points in the layout.
         points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
@@ -203,7 +222,7 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # Like the matrix, the bend is rounded to digits with physical meaning.
+        # As for the matrix, only the digits of the bend that have a physical meaning are kept.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -214,7 +233,7 @@ def centred_placement(
     layout_shape: Shape,
     layout_pitch_um: float,
 ) -> Array:
-    """Return the ``scan_to_layout`` that places the centre of the scan on the centre of the layout."""
+    """Return the matrix ``scan_to_layout`` (3×3, µm) that places the scan's centre on the layout's centre."""
     matrix = np.eye(3)
     matrix[0, 2] = (layout_shape[1] * layout_pitch_um - scan_shape[1] * scan_pitch_um[1]) / 2
     matrix[1, 2] = (layout_shape[0] * layout_pitch_um - scan_shape[0] * scan_pitch_um[0]) / 2
@@ -231,9 +250,10 @@ def _check(height: Array, layout: Array, scan_pitch_um: YX, layout_pitch_um: flo
 
 
 def at_layout_pitch(height: Array, scan_pitch_um: YX, layout_pitch_um: float) -> Array:
-    """Resample a copy of the scan to the layout's pitch, only for finding the warp.
+    """Return the heights of the scan resampled to the layout's pitch, shape (ny, nx).
 
-    The stored heights are resampled once, from the original scan.
+    This copy is used only to find the warp. The heights of the dataset are resampled from the original scan,
+    so that they are interpolated only once.
     """
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
@@ -260,14 +280,14 @@ def _on_layout(
 
 
 def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> tuple[int, int]:
-    """Return the shape (ny, nx) of a scan at the layout's pitch, in whole pixels."""
+    """Return the shape (ny, nx) that a scan has after resampling to the layout's pitch."""
     ny, nx = (max(1, round(n * p / layout_pitch_um)) for n, p in zip(scan_shape, scan_pitch_um, strict=True))
     return ny, nx
 
 
 def _rounded(matrix: Array) -> Array:
-    """Round the matrix to the digits that have a physical meaning; further digits may differ between
-    machines.
+    """Round the matrix to the digits that have a physical meaning, because further digits may differ from
+    computer to computer.
     """
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)

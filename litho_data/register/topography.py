@@ -1,4 +1,6 @@
-"""Prepare layout and scan for comparison: predict a topography, smooth heights, fill gaps and remove bow."""
+"""Prepare layout and scan for their comparison: predict a topography from the layout, and smooth the heights
+of the scan, fill their gaps and remove their bow.
+"""
 
 from functools import lru_cache
 
@@ -11,11 +13,12 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
     """Predict the printed topography to first order, by blurring the layout's levels with a Gaussian.
 
     Args:
-        layout_level: (ny, nx) integer levels.
-        blur_px: sigma of the Gaussian that stands for the process, in layout pixels.
+        layout_level: integer levels, shape (ny, nx).
+        blur_px: sigma, in layout pixels, of the Gaussian that stands for the printing process.
 
     Returns:
-        (ny, nx) float32 in levels; the gain and offset that turn levels into heights remain free.
+        The topography as float32 of shape (ny, nx), in units of levels. The gain and the offset that convert
+        it to heights are unknown.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -23,15 +26,15 @@ def predicted_topography(layout_level: Array, blur_px: float) -> Array:
 
 
 def smooth_measured(height: Array, sigma_px: float) -> Array:
-    """Smooth heights with a Gaussian by normalised convolution, so that gaps neither bias the mean nor grow.
+    """Smooth heights with a Gaussian by normalised convolution, which averages over the measured pixels only.
 
     Args:
-        height: (ny, nx), NaN where not measured.
+        height: heights, shape (ny, nx), NaN where not measured.
         sigma_px: sigma of the Gaussian, in pixels.
 
     Returns:
-        (ny, nx) float64; gaps are filled from their surroundings. Pixels are NaN only where no measured
-        pixel lies within 4 sigma.
+        The smoothed heights as float64 of shape (ny, nx). Gaps are filled from their surroundings. A pixel is
+        NaN only if no measured pixel lies within 4 sigma.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -40,17 +43,17 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         return gaussian_filter(height.astype(float), sigma_px)
     weight = gaussian_filter(measured.astype(float), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(float), sigma_px)
-    # If the weight exceeds 1e-9, at least a few distant measured pixels lie within reach. A smaller weight is
-    # only rounding error.
+    # If the weight exceeds 1e-9, at least a few distant measured pixels contribute to the mean. A smaller
+    # weight is only rounding error.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: Array) -> Array:
-    """Replace every NaN in the heights by extrapolating for three pixels and then holding a constant.
+    """Replace every NaN in the heights by a value extrapolated from the measured heights.
 
-    In the first three pixels of a gap, the heights are the measured heights after point reflection about the
-    nearest measured pixel. Slopes therefore continue, and an interpolating spline does not ring at the
-    border.
+    In the first three pixels of a gap, the measured heights are continued by point reflection about the
+    nearest measured pixel. Slopes therefore continue into the gap, and an interpolating spline does not ring
+    at its border. Farther inside the gap, a pixel has the height of the nearest measured pixel.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -68,10 +71,13 @@ def fill_gaps(height: Array) -> Array:
 
 
 def remove_bow(height: Array) -> Array:
-    """Subtract the least-squares quadratic surface from heights; used only on copies for comparison."""
+    """Return the heights minus the quadratic surface that fits them best (least squares).
+
+    This is done only to copies of the heights that are compared with the layout.
+    """
     basis = quadratic_basis(height.shape)
     measured = np.isfinite(height)
-    # A third of the rows and columns determines six coefficients as well as all of them do.
+    # Every third row and column determines the six coefficients as well as all rows and columns do.
     sparse = np.zeros_like(measured)
     sparse[::3, ::3] = measured[::3, ::3]
     chosen = sparse if sparse.sum() >= 60 else measured
@@ -81,8 +87,9 @@ def remove_bow(height: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def quadratic_basis(shape: Shape) -> Array:
-    """Return the terms 1, x, y, x², xy and y² on every pixel, as a read-only array (6, ny, nx). The
-    coordinates x and y run from -1 to 1.
+    """Return the terms 1, x, y, x², xy and y² of a quadratic surface at every pixel of an image.
+
+    The coordinates x and y run from -1 to 1. The result is a read-only array of shape (6, ny, nx).
     """
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
@@ -93,10 +100,9 @@ def quadratic_basis(shape: Shape) -> Array:
 
 
 def pearson(a: Array, b: Array) -> float:
-    """Return the Pearson correlation of two equally long vectors, or 0 if one of them is constant.
+    """Return the Pearson correlation of two vectors of equal length, or 0 if one of them is constant.
 
-    Sums are used instead of a matrix product, so that the result does not depend on the number of BLAS
-    threads.
+    Sums are used in place of a matrix product, whose result could depend on the number of BLAS threads.
     """
     a, b = (values - values.mean(dtype=float) for values in (a, b))
     energy = float((a * a).sum()) * float((b * b).sum())

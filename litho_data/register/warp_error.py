@@ -1,8 +1,9 @@
-"""Estimate the error of a registration's warp, and the surface that the heights contain besides the print.
+"""Estimate the error of a registration's warp, and the quadratic surface that the heights contain in addition
+to the print.
 
-Gain, quadratic surface and warp are refitted with each block of the field left out in turn (jackknife). The
-spread of these fits also includes effects that the topography does not explain, provided that these effects
-differ between blocks.
+Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
+The spread of these fits includes the influence of effects that the topography does not explain, as far as
+these effects differ from block to block.
 """
 
 from dataclasses import dataclass
@@ -16,31 +17,32 @@ from litho_data.register.pyramid import SCAN_BLUR_PX
 from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
 from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
 
-# A surface is significant if the root mean square of its terms, each divided by its standard error, exceeds
-# this value. On virtual prints without tilt and bow, the root mean square is at most 1.9.
+# A surface is significant if the root mean square of its coefficients, each divided by its standard error,
+# exceeds this value. On virtual prints without tilt and bow, the root mean square is at most 1.9.
 _CLEAR = 6.0**0.5
-# Distances, in layout pixels, over which the surrounding print affects the height (proximity, shrinkage). A
-# fit that ignores this effect mistakes it for a surface. The surface is similar in neighbouring blocks, so
-# the jackknife does not reveal the error.
+# Distances, in layout pixels, over which the surroundings of a point affect its height (proximity,
+# shrinkage). A fit that ignores this effect mistakes part of it for a surface. As this part is similar in
+# adjacent blocks, the jackknife would not show the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
-# Within a cell's width of the layout's border, a print has other surroundings than in the interior. Their
-# effect is the same on all four sides and in all blocks there, and changes the magnification by more than
-# the jackknife states. Without its outermost cells, a field of this many cells keeps two thirds of its area.
+# Near the layout's border, a print has other surroundings than in the interior. Their effect is the same in
+# all blocks at the border, so it changes the fitted magnification by more than the jackknife says. The
+# change is found by a fit without the outermost cells. This requires at least so many cells along each side
+# that two thirds of the area remain.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
 
 @dataclass(frozen=True)
 class WarpError:
-    """The errors of the warp between a scan and its layout, and of the surface that the heights contain
-    besides the print.
+    """The error of the warp between a scan and its layout, and the quadratic surface that the heights contain
+    in addition to the print, with its error.
 
     Attributes:
-        covariance: covariance (k, k) of the amounts of the flows in ``register.flows``, in the normalised
-            layout frame.
-        surface_rms: root mean square, over the field, of the quadratic surface that the fit finds in
-            addition to the print. It excludes the offset and has the unit of the heights.
-        surface_error_rms: root mean square of the error of that surface.
+        covariance: covariance matrix, of shape (k, k), of the coefficients of the warp's generators (see
+            ``register.flows``), in the normalised frame of the layout.
+        surface_rms: root mean square, over the field, of the quadratic surface without its offset, in the
+            unit of the heights.
+        surface_error_rms: root mean square, over the field, of the error of that surface.
         is_clear: whether the surface is significant.
     """
 
@@ -50,19 +52,26 @@ class WarpError:
     is_clear: bool
 
     def surface_variance(self, levelled: bool) -> float:
-        """Return the mean square of the surface that the heights contain in addition to the print.
+        """Return an estimate of the mean square of the surface by which the heights differ from the print.
 
-        The mean square of a fitted surface exceeds that of the true surface by the variance of the fit.
-        Levelling also removes a quadratic surface that belongs to the print and its roughness. The error of
-        the fit is an estimate of this missing surface. For levelled heights, the two mean squares are
-        therefore added.
+        Args:
+            levelled: whether the heights were levelled.
+
+        On average, the mean square of a fitted surface exceeds that of the true surface by the variance of
+        the fit. For heights that were not levelled, this variance is therefore subtracted, and the result is
+        0 if the surface is not significant. Levelling also removes a quadratic surface that belongs to the
+        print and its roughness, and the error of the fit is an estimate of this missing surface. For levelled
+        heights, the two mean squares are therefore added.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
         return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
     def warp_variance(self, height: Array) -> Array:
-        """Return the variance (ny, nx) that the error of the warp causes in the heights, mainly on slopes."""
+        """Return the variance that the error of the warp causes in the heights, mainly on slopes.
+
+        ``height`` and the result have shape (ny, nx).
+        """
         shape = height.shape
         normalise = normalisation(shape)
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
@@ -80,14 +89,14 @@ class WarpError:
 
 
 def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -> WarpError:
-    """Return the errors of a registration's warp, and of the surface that the heights contain besides the
-    print.
+    """Estimate the error of a registration's warp, and the quadratic surface that the heights contain in
+    addition to the print.
 
     Args:
-        height: (ny, nx) registered heights, NaN where not valid.
-        layout_level: (ny, nx) integer levels.
-        blur_px: sigma of the Gaussian blur of the topography, in layout pixels.
-        model: the model in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
+        height: registered heights, shape (ny, nx), NaN where not valid.
+        layout_level: integer levels, shape (ny, nx).
+        blur_px: sigma, in layout pixels, of the Gaussian blur with which the topography is predicted.
+        model: the kind of warp in the quality record: a key of ``LADDER``, ``quadratic`` or ``creep``.
     """
     shape = height.shape
     smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
@@ -96,7 +105,8 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
     around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
     cells = aligned_gram(smooth, topography, count, around)
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
-    # The registration ignores the surroundings, so its error is that of a fit without their terms.
+    # The registration does not fit the effect of the surroundings, so its error is that of a fit without the
+    # regressors in ``around``.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
     _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:
@@ -116,7 +126,9 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
 
 
 def _around(topography: Array, reach_px: float) -> Array:
-    """Return the Gaussian mean of the topography around each pixel, with reflection at the border."""
+    """Return the mean of the topography around each pixel, weighted by a Gaussian of sigma ``reach_px``.
+    Beyond the border, the topography is continued by reflection.
+    """
     import cv2
 
     width_px = 2 * round(3 * reach_px) + 1
@@ -125,12 +137,18 @@ def _around(topography: Array, reach_px: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _products(shape: Shape) -> Array:
-    """Return the covariance matrix (5, 5), over the field, of the terms of a quadratic surface."""
+    """Return the covariances, over the field, of the five terms x, y, x², xy and y² of a quadratic surface.
+    The result has shape (5, 5).
+    """
     return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
 
 
 def _without_each(blocks: Array) -> tuple[Array, Array]:
-    """Return the mean and jackknife covariance of the coefficients, from inner products (blocks, k, k)."""
+    """Return the mean and the jackknife (leave-one-block-out) covariance of the fitted coefficients, computed
+    from per-block inner products of shape (blocks, k, k).
+
+    The coefficients of the warp are divided by the gain.
+    """
     without = solve_gram(blocks.sum(axis=0) - blocks)
     without[:, NUISANCES:] /= without[:, :1]
     middle = without.mean(axis=0)
