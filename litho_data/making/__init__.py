@@ -1,1 +1,1 @@
-"""Build a dataset from a card: run operations and jobs, and finish the store."""
+"""Build a dataset from a dataset card: process every scan, and write the store and its report."""

@@ -1,4 +1,4 @@
-"""Assemble a store from finished scans: arrays, tables, manifest, attributes and hashes."""
+"""Complete a store whose scans are finished: write the samples, tables, manifest, attributes and hashes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,13 @@ IMAGES = "o"
 
 @dataclass(frozen=True)
 class Source:
-    """Everything from which a store is made, including the raw files that the manifest lists.
+    """Everything from which a store is made.
 
-    ``files`` maps each id to its raw files, keyed by their names in the record, and ``standards`` contains
-    the raw files of the calibration. ``unpaired`` and ``refused`` map ids to reasons.
+    ``files`` maps each id to its raw files, and ``standards`` contains the raw files of the calibration. Both
+    map the names of the files in the record to their paths. ``recipe`` is the levelling recipe in canonical
+    form. ``assumptions`` lists what was assumed because the card does not state it. ``unpaired`` maps the ids
+    that lack a scan or a layout to the reasons, and ``refused`` maps the ids of unusable files to the
+    reasons.
     """
 
     card: Card
@@ -53,16 +56,17 @@ def assemble(
     skipped: Mapping[str, str],
     build: Facts,
 ) -> str:
-    """Write everything except the groups ``scans/<id>``, which already exist; return the dataset's hash.
+    """Write everything in a store except the groups ``scans/<id>``, which already exist. Return the hash of
+    the dataset.
 
     Args:
-        root: the group of the store that is being written.
-        records: records of the finished scans, sorted by id, including references (``use`` other than
-            dataset).
-        load: returns the arrays of an id on the layout grid.
-        source: what the records were made from.
-        skipped: ids that are not in the store, each with the reason.
-        build: facts that must not be part of a hash: time, folder, software.
+        root: root group of the store.
+        records: records of the finished scans, sorted by id, including reference scans (those whose ``use``
+            is not "dataset").
+        load: function that takes the id of a scan and returns its arrays on the layout's grid, by name.
+        source: everything from which the records were made.
+        skipped: reasons why scans are not in the store, by id.
+        build: facts that are not part of any hash, such as time, folder and software.
     """
     scans = [_row(record) for record in records_of_use(records)]
     write_samples(root, scans, load, source.card.layout.pitch_um)
@@ -84,20 +88,20 @@ def assemble(
 
 
 def records_of_use(records: Sequence[Facts]) -> list[Facts]:
-    """Return the records of the dataset's own scans in order, without references."""
+    """Return the records of the dataset's scans without those of reference scans, in the given order."""
     return [record for record in records if record["use"] == "dataset"]
 
 
 def facts_of_card(card: Card) -> dict[str, Any]:
-    """Return what a card says about all scans; these facts are part of the dataset's hash."""
+    """Return what a card states about all scans together. These facts are part of the dataset's hash."""
     write = card.write.model_dump(exclude_none=True) if card.write else None
     return dataset_facts(card.layout, card.scan.instrument, write)
 
 
 def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """Return the attributes of the root group. Except for the two hashes, all follow from the manifest.
+    """Return the attributes of the root group: those that follow from the manifest, and the two hashes.
 
-    The attributes are only numbers and words, which any format can store.
+    All attributes are numbers or texts, which any format can store.
     """
     card = Card.model_validate(manifest["card"])
     facts = facts_of_card(card)
@@ -113,7 +117,7 @@ def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> d
         "citation": card.citation,
         **facts,
         **written,
-        # Tools for OME-Zarr look for images under the names in this list.
+        # Programs for OME-Zarr look here for the group that lists the images.
         "labels": IMAGES,
         "assumptions": "; ".join(manifest["assumptions"]),
         "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
@@ -123,7 +127,9 @@ def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> d
 
 
 def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.DataFrame) -> dict[str, Any]:
-    """Return the manifest without its table of files: the card as it was parsed, and hashes of the tables."""
+    """Return the manifest without its table of files. It contains the card as it was parsed, the recipe, the
+    seed, the assumptions, and the hashes of the tables.
+    """
     content = {
         "card": source.card.model_dump(mode="json", exclude_none=True),
         "recipe": dict(source.recipe),
@@ -136,7 +142,9 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return one row per scan of the dataset; a value that could not be computed is NaN."""
+    """Return the table of quality, with one row per scan of the dataset. A value that could not be computed
+    is NaN.
+    """
     import pandas as pd
 
     rows = []
@@ -151,7 +159,9 @@ def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
 
 
 def provenance_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return one row per step of every scan: the step's id, its record as JSON, and the software used."""
+    """Return the table of provenance, with one row per processing step of every scan. A row contains the
+    step's id, its record as JSON, and the software that ran it.
+    """
     import pandas as pd
 
     rows = [
@@ -169,8 +179,8 @@ def provenance_table(records: Sequence[Facts]) -> pd.DataFrame:
 
 
 def table_sha256(table: pd.DataFrame) -> str:
-    """Return the hash of a table: column names and values, in order, without the software column, which
-    varies.
+    """Return the hash of a table's column names and values. The column ``software`` is left out, because it
+    differs between installations.
     """
     columns = {}
     for name in sorted(str(column) for column in table.columns if column != "software"):
@@ -201,18 +211,19 @@ def _shape_of(record: Facts, *names: str) -> tuple[int, int]:
 
 
 def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[str, str]) -> pd.DataFrame:
-    """Return one row per raw file, sorted by id.
+    """Return the table of files, with one row per raw file, sorted by id.
 
     Args:
-        source: the files by id and recorded name, and the ids without a partner.
+        source: everything from which the records were made, including the raw files and the ids that lack a
+            scan or a layout.
         records: records of the finished scans, by id.
-        skipped: ids that are not in the store, each with the reason.
+        skipped: reasons why scans are not in the store, by id.
 
     Returns:
-        The columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256``,
-        ``size_bytes`` and ``read``. ``sha256`` is the hash of the bytes that were used; it is empty if the
-        file cannot be read. ``read`` is JSON with the reader, the unit, the channel, the pitch and the
-        vendor's full header.
+        A table with the columns ``path``, ``scan``, ``status`` (ok, skipped or unpaired), ``reason``,
+        ``use``, ``sha256``, ``size_bytes`` and ``read``. ``sha256`` is the hash of the bytes that were used,
+        or empty if the file cannot be read. ``read`` is JSON with the reader, the unit, the channel, the
+        pitch and the complete header of the instrument's file.
     """
     import pandas as pd
 
@@ -249,7 +260,7 @@ def _used_sha256(record: Facts, name: str) -> str:
 
 
 def _facts(record: Facts | None, name: str) -> dict[str, Any]:
-    """Return what the reader says about a scan file; return an empty dict for a layout."""
+    """Return what the reader states about a scan's file, or an empty dictionary for a layout's file."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

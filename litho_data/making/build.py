@@ -1,4 +1,4 @@
-"""Make a dataset store and a report from raw files and a card (``build_dataset``)."""
+"""Build a dataset store and its report from raw files and a dataset card (``build_dataset``)."""
 
 import functools
 import os
@@ -29,9 +29,10 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# If the aspect ratio of a scan's pixels differs by more than this from that of most scans, rows or columns
-# are missing.
+# If the aspect ratio of a scan's pixels differs by more than this share from that of most scans, the scan's
+# file lacks rows or columns.
 _ASPECT_TOLERANCE = 1e-3
+# Largest number of pairs of an unregistered scan and a layout that are compared.
 _MOST_SEARCHES = 2000
 
 
@@ -46,28 +47,30 @@ def build_dataset(
     seed: int = 0,
     tip: float | str | None = None,
 ) -> BuildResult:
-    """Build a dataset store from a card.
+    """Build a dataset store from a dataset card (the TOML file that describes the raw files).
 
-    Each scan is read, levelled by the card's recipe, registered and resampled once onto its layout's grid. A
-    scan that cannot be used is skipped, with a line on stderr and a reason in the manifest. The store appears
-    completely or not at all; an interrupted build resumes. The report goes to ``<name>-report`` beside the
-    store.
+    Each scan is read, levelled by the card's recipe, registered, and resampled once onto the grid of its
+    layout. A scan that cannot be used is skipped. A line on stderr and an entry in the manifest give the
+    reason. The store is put in place only when it is complete, and an interrupted build continues when it is
+    run again. The report is written to ``<name>-report`` beside the store.
 
     Args:
-        card_path: the dataset card.
-        out: folder of the store; an older store there is replaced.
-        data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
-            user cache, whichever has the files.
+        card_path: path of the dataset card.
+        out: folder of the store. An older store there is replaced.
+        data_dir: folder of the raw files. By default, it is the card's folder, ``$LITHO_DATA_DIR/<name>`` or
+            the user cache, whichever contains the files.
         workers: number of local processes.
-        dask: address of a Dask scheduler that is used instead of local processes. The result is the same.
-        strict: refuse to build if any scan has to be skipped, or if a scan or layout has no partner.
-        seed: seed of the robust registration.
-        tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans; it replaces the
-            card's value. Pixels that the tip may not have touched become invalid.
+        dask: address of a Dask scheduler, which is used in place of local processes. The result is the same.
+        strict: if true, nothing is built if any scan has to be skipped, or if a scan has no layout or a
+            layout has no scan.
+        seed: seed of the robust estimator in the registration.
+        tip: radius of the microscope's tip in µm, or ``blind`` to estimate it from the scans. It replaces the
+            value in the card. Pixels that the tip may not have touched become invalid.
 
     Raises:
-        InputError: the card is bad, no scan is usable, an id is skipped or unpaired under ``strict``, ``tip``
-            is not a radius, or ``out`` is something other than a store.
+        InputError: the card is bad; no scan is usable; ``strict`` is true, and a scan has to be skipped or an
+            id lacks its scan or its layout; ``tip`` is neither a radius nor ``blind``; or ``out`` contains
+            something other than a store.
     """
     listing = list_fields(card_path, data_dir)
     if tip is not None:
@@ -89,7 +92,8 @@ def _recipe(listing: Listing) -> dict[str, Any]:
 def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> Source:
     standards = standards_of(listing)
     if standards.described:
-        # A bad standard spoils every scan, so it is reported once, before any scan is processed.
+        # A bad calibration standard would spoil every scan. It is measured here, so that its error is
+        # reported once and before any scan is processed.
         measure_scales(standards.described, list(standards.files.values()))
     return Source(
         card=listing.card,
@@ -106,7 +110,7 @@ def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> 
 
 
 def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
-    """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
+    """Run the jobs of a source, and write the store and its report, as ``build_dataset`` describes."""
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
         root = partial.open()
@@ -123,14 +127,15 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             what = f"building {source.card.name}"
             for job, outcome in progress(finished, what, total=len(todo), at_once=workers.processes):
                 if isinstance(outcome, str):
-                    # Names are written as recorded, because the manifest must not depend on where the raw
-                    # files are.
+                    # The data folder is removed from paths, because the manifest must not depend on where the
+                    # raw files are stored.
                     skipped[job.id] = outcome.replace(f"{source.data_dir}{os.sep}", "")
                     _report_skipped(job.id, skipped[job.id])
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
-            # This is an error of the cluster: finished scans are kept for the next run.
+            # A scan with bad input raises no error here, so this error comes from the cluster. Scans that are
+            # finished are kept for the next run.
             if not records:
                 partial.discard()
             raise
@@ -184,25 +189,28 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
 
 
 def _relative(folder: Path, start: Path) -> str:
-    """Return the path of the raw files relative to the store's folder, so that both can be moved together."""
+    """Return the path of a folder relative to another one. With such a path, raw files and store can be moved
+    together.
+    """
     try:
         return Path(os.path.relpath(folder, start)).as_posix()
-    except ValueError:  # another drive
+    except ValueError:  # on Windows, the folders may be on different drives
         return str(folder)
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """For every unregistered scan, find out which other layout of the set it shows, and add the answer to its
-    reason in ``skipped``.
+    """For every scan that could not be registered, find out whether it shows another layout of the set.
+
+    If it does, this is added to the scan's reason in ``skipped``, and also returned, by the id of the scan.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    # Several ids may share a layout, namely if it was printed or its print was scanned more than once. The
-    # layout gets the name of its first id.
+    # Several ids have the same layout if it was printed more than once, or if its print was scanned more than
+    # once. The layout is then named after the first of these ids.
     distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
-    # One search takes a twentieth of a second.
+    # Comparing a scan with one layout takes about a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
         chain = fields[key].begin()
         if "raw_height_um" not in chain.arrays:
@@ -218,11 +226,11 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
-    """If the card states the size of the scans, find the scans whose pixels do not have the same aspect ratio
-    as the pixels of most scans.
+    """Find the scans whose pixels have another aspect ratio than those of most scans, and return the reasons
+    for leaving them out, by id. The result is empty if the card does not state the size of the scans.
 
-    A text file that lacks its last rows can still be read as a matrix, but its pixels then become too long,
-    because the stated size is divided by too few rows.
+    A text file that lacks its last rows can still be read as a matrix. However, its pixels then seem too long
+    along y, because the stated size is divided by too few rows.
     """
     if card.scan.size_um is None:
         return {}
@@ -259,7 +267,7 @@ def _require_enough(
         raise InputError(
             f"{out} was not built: {len(left_out)} ids cannot be used",
             got=shown,
-            wanted="all ids to be usable, because of --strict",
+            wanted="a usable scan and layout for every id, because of --strict",
         )
     if not records_of_use(list(records.values())):
         raise InputError(

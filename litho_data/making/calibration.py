@@ -1,4 +1,6 @@
-"""Determine the scale factors of a microscope from the card's scans of gratings and of a step."""
+"""Determine the scale factors of a microscope from the scans of gratings and of a step that a dataset card
+names.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -16,16 +18,17 @@ from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
 SCALES = ("y", "x", "z")
-# If a measured height is further from the known height than this factor, a unit or a file is wrong.
+# If the measured and the known height of the step differ by more than this factor, a unit or a file is wrong.
 _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """Return the scales that a build of the card would apply, by axis (``y``, ``x`` or ``z``). Axes that the
-    card does not calibrate are left out.
+    """Return the scales with which a build of the card would correct lengths and heights, by axis (``y``,
+    ``x`` or ``z``). Axes for which the card names no calibration standard are left out.
 
     Raises:
-        InputError: the card has no ``[calibration]``, a file is missing, or a scan shows no grating or step.
+        InputError: the card has no table ``[calibration]``, a file is missing, or a scan does not show its
+            grating or step.
     """
     listing = list_fields(card_path, data_dir)
     standards = standards_of(listing)
@@ -40,13 +43,14 @@ def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict
 
 @dataclass(frozen=True)
 class Standards:
-    """The calibration standards of a card; empty without ``[calibration]``.
+    """The calibration standards that a card names. There are none if the card has no table ``[calibration]``.
 
     Attributes:
-        described: for every standard, a mapping with ``scale`` (x, y or z), ``file`` (index into ``files``),
-            ``known_um``, ``uncertainty_um``, ``across`` (axis of the profiles) and ``read`` (the options of
-            ``read_scan``).
-        files: paths of the files, by their recorded names.
+        described: for every standard, a mapping with the keys ``scale`` (the axis x, y or z that it
+            calibrates), ``file`` (the position of its scan in ``files``), ``known_um`` (the known period or
+            height), ``uncertainty_um`` (the uncertainty of this value), ``across`` (the axis along which
+            profiles are taken) and ``read`` (the arguments of ``read_scan``).
+        files: paths of the scans, by their recorded names.
     """
 
     described: tuple[Facts, ...] = ()
@@ -54,7 +58,7 @@ class Standards:
 
     @property
     def scales(self) -> set[str]:
-        """Return the names of the scales that have a standard."""
+        """Return the axes for which there is a standard."""
         return {one["scale"] for one in self.described}
 
 
@@ -62,10 +66,10 @@ NO_STANDARDS = Standards()
 
 
 def standards_of(listing: Listing) -> Standards:
-    """Return the standards of a card.
+    """Return the calibration standards that a card names.
 
     Raises:
-        InputError: a file is missing, or is a link that leads out of the data folder.
+        InputError: the file of a standard is missing, or is a link that leads out of the data folder.
     """
     card = listing.card
     standards: list[dict[str, Any]] = []
@@ -104,13 +108,15 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
-    """Return the factor and the standard uncertainty of every scale as an array (3, 2), in the order of
-    ``SCALES``. A scale without a standard has the factor 1 and the uncertainty 0.
+    """Return the scale factor of every axis and its standard uncertainty, in an array of shape (3, 2).
+
+    The rows are in the order of ``SCALES``. An axis without a standard has the factor 1 and the uncertainty
+    0.
 
     Raises:
-        InputError: a scan shows no grating or step of about the known size.
+        InputError: a scan does not show a grating or step of about the known size.
     """
-    # The result is cached, because every scan of a build asks for it.
+    # The result is cached, because it is needed for every scan of a build.
     times = tuple(file.stat().st_mtime_ns for file in files)
     return _measured(json.dumps(list(standards)), tuple(files), times).copy()
 

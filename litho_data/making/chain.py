@@ -1,4 +1,4 @@
-"""Run the operations on one scan in turn, and collect the part of the store that they make."""
+"""Run operations on one scan, one after another, and collect the part of the store that they make."""
 
 import json
 from collections.abc import Mapping
@@ -15,8 +15,10 @@ from litho_data.store.partial import Piece
 
 @dataclass
 class Chain:
-    """The results of the operations that have run so far: recorded steps, arrays by name, and facts by
-    operation.
+    """The results of the operations that have run on a scan so far.
+
+    ``steps`` contains the records of the operations in order. ``arrays`` contains the arrays that they made,
+    by name. ``facts`` contains the facts that each operation found, by the name of the operation.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -24,7 +26,12 @@ class Chain:
     facts: dict[str, Facts] = field(default_factory=dict)
 
     def run(self, op: str, params: Facts, files: Mapping[str, Path] | None = None) -> Facts:
-        """Run an operation on these files and on earlier arrays; raise InputError if that is impossible."""
+        """Run an operation on the given files and on the arrays that earlier operations made, and return the
+        facts that it found.
+
+        Raises:
+            InputError: the operation cannot be run on this input.
+        """
         step, arrays, self.facts[op] = OPERATIONS[op].run(params, files or {}, self.arrays)
         self.steps.append(step)
         self.arrays |= arrays
@@ -32,24 +39,26 @@ class Chain:
 
     @property
     def read(self) -> Facts:
-        """Return what the reader says about the scan."""
+        """Return the facts that the reader found in the scan's file."""
         return next(self.facts[op] for op in READERS if op in self.facts)
 
     @property
     def scales(self) -> Facts:
-        """Return the scales of the microscope; empty without standards."""
+        """Return the calibrated scales of the microscope, or an empty mapping without calibration standards."""
         return self.facts.get("calibrate", {})
 
     @property
     def pitch_um(self) -> list[float]:
-        """Return the (y, x) pitch that the scan states, multiplied by the scales of its axes if they are
-        known.
+        """Return the pitch (y, x) of the scan in µm. It is the pitch that the file or the card states,
+        multiplied by the calibrated scale of the axis if there is one.
         """
         axes = zip("yx", self.read["pitch_um"], strict=True)
         return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
 
     def piece(self, **said: Any) -> Piece:
-        """Return the part of the store that these steps made, with the facts ``said`` in its record."""
+        """Return the part of the store that the operations made. ``said`` contains further entries for its
+        record.
+        """
         steps = [step.to_record() for step in self.steps]
         record = {**said, "steps": steps, "software": software_record()}
         return Piece(json.loads(json.dumps(record)), self.arrays)

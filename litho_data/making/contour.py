@@ -1,8 +1,9 @@
-"""Find the edges of a film in an electron micrograph as signed distances, and convert them to heights.
+"""Find the edges of a film in an electron micrograph, and convert the signed distances from them to heights.
 
-The film is bright, its rim is brightest, and charging distorts both. The edge is placed half way between the
-local brightness of the ground and that of the rim. This position is a convention: the wall of the film may
-lie at another point on the flank of the rim, and a micrograph cannot show where.
+In a micrograph, the film is brighter than the ground, and its rim is brightest. Charging changes the
+brightness from place to place. The edge is therefore placed where the brightness is half way between those of
+the ground and the rim nearby. This position is a convention: the wall of the film may lie at another point on
+the flank of the rim, and a micrograph cannot show where.
 """
 
 from typing import NamedTuple
@@ -12,24 +13,28 @@ import numpy as np
 from litho_data.foundation import Array, InputError
 
 REACH_PX = 8.0
-"""Distances are clipped to this many pixels of the micrograph."""
+"""Distances from an edge that are larger than this many pixels of the micrograph are set to this value."""
 _NOISE_PX = 1.0
-# Distances from the first edge, px, that count as rim and as ground, and the sigma of their local means.
+# Pixels at these distances from the first edge, in px, count as rim on the film side and as ground on the
+# other. The last value is the sigma over which their brightness is averaged.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
-# Largest distance from the first edge; this edge comes from one threshold for the whole picture.
+# Largest distance, in px, of the final edge from the first edge, which is found with a single threshold for
+# the whole picture.
 _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# A part of the layout counts as lost if at most this share of it was printed.
+# An island or gap of the layout counts as lost if at most this share of it was printed as wanted.
 _LOST = 0.1
 
 
 class Edges(NamedTuple):
-    """``distance_px`` (ny, nx) is the distance from the nearest edge, positive on the film; ``sigma_px`` is
-    its standard deviation at a pixel.
+    """The edges of a film in a micrograph.
 
-    ``specks``, bool (ny, nx), marks dots and pinholes of at most 40 px, which are ignored.
+    ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the distance of each pixel from the
+    nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots and
+    pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of the position
+    of an edge, as measured at a single pixel.
     """
 
     distance_px: Array
@@ -38,10 +43,13 @@ class Edges(NamedTuple):
 
 
 def find_edges(grey: Array) -> Edges:
-    """Find the edges of the film in a micrograph (ny, nx), to a fraction of a pixel.
+    """Find the edges of the film in a micrograph, to a fraction of a pixel.
+
+    Args:
+        grey: grey values of the micrograph, shape (ny, nx).
 
     Raises:
-        InputError: the picture has no edges.
+        InputError: the micrograph shows no edges.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
     from scipy.spatial import cKDTree
@@ -50,7 +58,8 @@ def find_edges(grey: Array) -> Edges:
     from skimage.morphology import remove_small_holes, remove_small_objects
 
     smooth = gaussian_filter(np.asarray(grey, dtype=float), _NOISE_PX)
-    # The threshold is applied to logarithms, so that bright rims and charging count for less.
+    # The threshold is found from logarithms of the brightness, so that bright rims and charging affect it
+    # less.
     logarithm = np.log(smooth + _DARKEST)
     first = logarithm > threshold_otsu(logarithm)
     film = remove_small_holes(remove_small_objects(first, max_size=_SPECK_PX), max_size=_SPECK_PX)
@@ -80,30 +89,31 @@ def find_edges(grey: Array) -> Edges:
 
 
 def _dense(line: Array) -> Array:
-    """Return evenly spaced points along a contour (n, 2)."""
+    """Return evenly spaced points along a contour. Contour and result have shape (n, 2) with columns y and x."""
     along = np.r_[0.0, np.hypot(*np.diff(line, axis=0).T).cumsum()]
     places = np.arange(0.0, along[-1], _STEP_PX)
     return np.stack([np.interp(places, along, line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def coverage(distance_um: Array, pitch_um: float) -> Array:
-    """Return the fraction of each pixel (0 to 1) that is covered by film, given the signed distance from the
-    centre of the pixel to an edge.
+    """Return the share of each pixel, from 0 to 1, that film covers. ``distance_um`` is the signed distance
+    from the nearest edge to the centre of the pixel.
     """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 
 
 def edge_shift_px(level: Array, distance_px: Array) -> float:
-    """Return how far outwards the edges of a film lie from those of its layout: the median over the film's
-    edges.
+    """Return by how many pixels the edges of a film lie outside those of its layout, as the median over the
+    edges of the film.
 
-    If the edges of small islands and gaps move, a registration takes part of the shift for a change of scale,
-    so it needs a layout whose edges have moved too. A shift of less than one pixel is negligible and becomes
-    0, and so does that of a film or layout without edges.
+    In a layout of small islands and gaps, a registration would take part of such a shift for a change of
+    scale. It must therefore be given a layout whose edges are shifted in the same way. A shift of less than
+    one pixel is negligible, and the result is then 0. It is also 0 if the film or the layout has no edges.
 
     Args:
-        level: (ny, nx) levels of the layout.
-        distance_px: distance from the edge of the film at each pixel of the layout, NaN where not seen.
+        level: levels of the layout, shape (ny, nx).
+        distance_px: signed distance of each pixel of the layout from the nearest edge of the film, positive
+            on the film, NaN where not measured.
     """
     from_layout, at_edge = _distance_px(level), np.abs(distance_px) < 0.5
     if not at_edge.any() or not np.isfinite(from_layout).all():
@@ -113,13 +123,15 @@ def edge_shift_px(level: Array, distance_px: Array) -> float:
 
 
 def with_moved_edges(level: Array, outwards_px: float) -> Array:
-    """Return the layout, float (ny, nx), with its edges moved; pixels at an edge have levels in between."""
+    """Return the levels of the layout, as float of shape (ny, nx), with all edges moved outwards by
+    ``outwards_px``. Pixels that an edge crosses have levels in between.
+    """
     return level.max() * coverage(_distance_px(level) + outwards_px, 1.0)
 
 
 def _distance_px(level: Array) -> Array:
-    """Return the distance of each pixel from the nearest edge of a layout, positive on the film; infinite if
-    there is no edge.
+    """Return the distance of each pixel from the nearest edge of a layout, positive on the film. It is
+    infinite if the layout has no edge.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -130,16 +142,17 @@ def _distance_px(level: Array) -> Array:
 
 
 def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
-    """Mark defects in a micrograph: film far inside a gap of the layout, or a pit in the film.
+    """Return a bool mask of the defects in a print: film (dirt) far inside a gap of the layout, or bare
+    ground (a pit) far inside the layout's film.
 
-    A gap that is completely closed, or an island that is completely lost, is part of the print and not a
-    defect.
+    A gap that is completely closed, or an island that is completely missing, belongs to the print and is not
+    a defect.
 
     Args:
-        covered: measured coverage by film (ny, nx), NaN where not seen.
-        layout_share: coverage by film according to the layout.
-        depth_px: deviations within this distance of an edge of the layout may belong to the print and are not
-            defects. The marked defects are widened by the same distance.
+        covered: measured share of each pixel that film covers, shape (ny, nx), NaN where not measured.
+        layout_share: the share that film should cover according to the layout, shape (ny, nx).
+        depth_px: deviations closer than this to an edge of the layout may belong to the print and are not
+            marked. The marked defects are widened by the same distance.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

@@ -1,4 +1,4 @@
-"""Estimate the radius of the tip from all scans of a card, before the scans are built."""
+"""Estimate the radius of the microscope's tip from all scans of a dataset card, before the dataset is built."""
 
 import sys
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs with the estimated radius of the tip in place of ``blind``. If the scans set no limit
-    on the radius, return the jobs without a tip.
+    """Return the jobs with an estimated radius of the tip, if their card asks for one by ``tip = "blind"``.
 
-    The result is also printed on stderr. Scans that cannot be read are left out; their jobs report why.
+    If the scans set no limit on the radius, the jobs are returned without a tip. The estimate is also printed
+    on stderr. Scans that cannot be read are not used here; the build reports later why.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)
@@ -28,8 +28,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:
         print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
-    # The radius is rounded far below its uncertainty, so that the order in which scans finish does not
-    # matter.
+    # The radius is rounded, by far less than its uncertainty, so that it does not depend on the order in
+    # which the scans finish.
     rounded = None if radius_um is None else float(f"{radius_um:.9g}")
     card = jobs[0].card
     process = card.process.model_copy(update={"tip": rounded})
@@ -37,8 +37,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """Estimate the tip from one scan, in calibrated lengths if there are standards; return None if the scan
-    cannot be read.
+    """Estimate the radius of the tip from one scan, or return None if the scan cannot be read. If there are
+    calibration standards, calibrated lengths are used.
     """
     try:
         chain = job.begin()

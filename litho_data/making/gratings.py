@@ -1,4 +1,4 @@
-"""Measure scales, unevenness and tip of a microscope in scans of a grating of known size."""
+"""Measure the scales, the nonlinearity and the tip of a microscope in scans of a grating of known period."""
 
 from typing import Any
 
@@ -13,15 +13,18 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """One scan of a grating. Values that cannot be measured in the scan are None, and ``problem`` says why.
+    """What was measured in one scan of a grating. Values that could not be measured are None, and ``problem``
+    says why.
 
     Args:
-        scale_x, scale_y: factors by which stated lengths must be multiplied. ``scale_x_sd`` and
-            ``scale_y_sd`` are their standard uncertainties.
-        bow_um: how far the middle of a line is displaced along x relative to its ends.
-        line_um: length of a line.
-        tip_at_most_um: upper bound on the radius of the tip. A tip so blunt that it bridges the gaps between
-            bars looks sharper than it is.
+        period_um: known period of the grating.
+        line_um: length of a scan line.
+        scale_x, scale_y: factors by which lengths in the scan, along x and y, are multiplied to give true
+            lengths. ``scale_x_sd`` and ``scale_y_sd`` are their standard uncertainties.
+        bow_um: displacement along x of the middle of a scan line relative to its ends. ``bow_sd_um`` is its
+            standard uncertainty.
+        tip_at_most_um: upper bound on the radius of the tip. It fails for a tip that is too blunt to enter
+            the gaps between bars, because such a tip seems sharper than it is.
     """
 
     id: str
@@ -38,8 +41,9 @@ class GratingScan(Record):
 
 
 def grating_scans(store: Store) -> list[GratingScan]:
-    """Measure the gratings among the references of a store. The scans are used as they were read, with x as
-    the fast axis.
+    """Measure all scans of gratings among the reference scans of a store.
+
+    The scans are used as they were read, without levelling, and x is taken as the fast axis.
     """
     known = store.manifest.get("card", {}).get("grating")
     if known is None:
@@ -55,13 +59,20 @@ def grating_scans(store: Store) -> list[GratingScan]:
 
 
 def grating_scan(scan_id: str, height_um: Array, pitch_um: YX, known: KnownGrating) -> GratingScan:
-    """Measure one scan: heights (ny, nx) in µm at a stated (y, x) pitch."""
+    """Measure one scan of a grating.
+
+    Args:
+        scan_id: id of the scan.
+        height_um: heights in µm, shape (ny, nx).
+        pitch_um: pitch (y, x) of the scan in µm, as stated.
+        known: known period of the grating and its uncertainty.
+    """
     height_um = height_um.astype(float)
     found = GratingScan(id=scan_id, period_um=known.period_um, line_um=height_um.shape[1] * pitch_um[1])
     tip = peak_radius(height_um, pitch_um)
     figures: dict[str, Any] = {}
     if tip.radius_um is not None:
-        # A bound already includes the uncertainty.
+        # If the estimate is itself only an upper bound, it already includes the uncertainty.
         figures["tip_at_most_um"] = tip.radius_um + (0.0 if tip.reason else _BOUND_SIGMA * tip.sd_um)
     try:
         waves = [find_wave(height_um, pitch_um, known.period_um, axis) for axis in ("x", "y")]

@@ -1,4 +1,4 @@
-"""Compute the standard uncertainty of every registered height, and the parts of this uncertainty."""
+"""Compute the standard uncertainty of every registered height, and the parts of which it consists."""
 
 from collections.abc import Mapping
 
@@ -27,29 +27,32 @@ def height_sigma(
 ) -> tuple[Array, Mapping[str, float]]:
     """Return the standard uncertainty of registered heights, without the uncertainty of the scan's offset.
 
-    The variance is a sum of six parts, which have these causes:
+    The variance is the sum of six parts. Their causes are:
 
-    - ``pixel``: white noise of pixels, after resampling;
-    - ``line``: white noise of lines, after resampling;
-    - ``resampling``: the fine structure that interpolation loses;
+    - ``pixel``: noise that is independent from pixel to pixel, as far as it remains after resampling;
+    - ``line``: offsets that are independent from scan line to scan line, as far as they remain after
+      resampling;
+    - ``resampling``: the fine structure of the print that interpolation loses;
     - ``registration``: the uncertainty of the warp, multiplied by the slope of the heights;
-    - ``levelling``: the surface that levelling left or wrongly removed;
+    - ``levelling``: the tilt and bow that levelling failed to remove or wrongly removed;
     - ``calibration``: the uncertainty of the z scale, multiplied by the height above the scan's mean.
 
     Args:
-        levelled_um: heights (ny, nx) in the scan's own frame, NaN where not measured.
-        height_um: heights on the layout's grid, NaN where not valid.
-        layout_level: levels on that grid.
-        blur_px, model: blur and model of the registration, see ``warp_error``.
-        levelled: whether a recipe was applied. If so, the uncertainty includes an estimate of the part of the
-            print that the recipe removed. If not, it includes a surface that does not belong to the print,
-            but only if this surface is significant.
-        fast_axis: the axis along which the tip moved.
-        z_uncertainty: relative uncertainty of the z scale; 0 if it was not calibrated.
+        levelled_um: heights in µm in the scan's own frame, shape (ny, nx), NaN where not measured.
+        height_um: heights in µm on the layout's grid, NaN where not valid.
+        layout_level: levels of the layout on the same grid.
+        scan_pitch_um: pitch (y, x) of the scan in µm.
+        layout_pitch_um: pitch of the layout in µm.
+        blur_px, model: blur and kind of warp that the registration found, as in ``warp_error``.
+        levelled: whether a levelling recipe was applied. If so, the part ``levelling`` includes an estimate
+            of the surface that the recipe removed from the print. If not, it is the surface that does not
+            belong to the print, provided that this surface is significant.
+        fast_axis: the axis along which the tip moved fast.
+        z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 
     Returns:
-        The uncertainty in µm as float32 on the layout's grid, NaN where not valid, and a mapping of root mean
-        squares: ``sigma_<part>_nm`` for each part and ``sigma_nm`` for the whole.
+        The uncertainty in µm as float32 on the layout's grid, NaN where not valid, and a mapping with its
+        root mean square over the scan: ``sigma_<part>_nm`` for each part, and ``sigma_nm`` for the total.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape
@@ -82,9 +85,10 @@ def _resampling_nm2(
     line_nm: float,
     fast_axis: Axis,
 ) -> float:
-    """Return the variance, in nm², of the fine structure that interpolation loses. At each frequency, the
-    noise-free spectrum of the print is multiplied by the relative loss; the variance is the integral of this
-    product.
+    """Return the variance, in nm², of the fine structure that interpolation loses.
+
+    It is the integral, over all spatial frequencies, of the power spectrum of the print without noise,
+    multiplied by the share that interpolation loses at this frequency.
     """
     filled = fill_gaps(levelled_um)
     lost = 0.0
@@ -93,7 +97,8 @@ def _resampling_nm2(
         spectrum = psd_along(filled, pitch_um, axis)
         white_nm2 = pixel_nm**2 + (line_nm**2 if axis != fast_axis else 0.0)
         error = np.interp(spectrum.frequency_per_um, *transfer_error(pitch_um, layout_pitch_um))
-        # The density is one-sided, so the density of white noise with variance s² is 2 s² times the pitch.
+        # The spectral density is one-sided, so white noise with variance s² has the density 2 s² times the
+        # pitch.
         lost += float(((spectrum.density - 2 * pitch_um * white_nm2) * error).sum()) * float(
             spectrum.frequency_per_um[0]
         )

@@ -1,7 +1,7 @@
-"""One unit of work of a build, which turns a field's files into a finished part of the store or into a reason
-for skipping the field.
+"""Define the jobs of a build. A job makes one finished scan of the store from the files of a printed field,
+or gives a reason for skipping it.
 
-Jobs are sent to other processes and machines, so they contain only paths and plain parameters.
+Jobs are sent to other processes and computers, so they contain only paths and plain parameters.
 """
 
 from dataclasses import asdict, dataclass
@@ -19,32 +19,39 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
-# Width, in pixels, of the rim of level 0 around a field that is alone on the substrate. Models extend the
-# outermost levels of a layout, so the rim makes them extend level 0.
+# Width, in pixels, of the rim of level 0 that is added around the layout of a field that stands alone on the
+# substrate. Models continue a layout with its outermost levels, and with the rim they continue it with level
+# 0.
 _BARE_PX = 2
-# Film in a gap of the layout is dirt if it is farther than this (px) from the layout's edges. Bare ground
-# that far inside the layout's film is a pit.
+# Film in a gap of the layout counts as dirt if it lies farther than this, in px, from the edges of the
+# layout. Bare ground at such a distance inside the layout's film counts as a pit.
 _DIRT_PX = 5
 
 
 class Job(Protocol):
-    """The interface of a unit of work."""
+    """The interface of a job, which makes one scan of the store."""
 
     @property
     def id(self) -> str:
         """Return the id of the scan."""
 
     def key(self) -> str:
-        """Return the hash of everything that determines the result: files, parameters, code."""
+        """Return the hash of everything that determines the result: files, parameters and code."""
 
     def run(self) -> Piece:
-        """Make this part of the store; raise InputError if the files do not allow it."""
+        """Make the scan's part of the store.
+
+        Raises:
+            InputError: the scan cannot be made from its files.
+        """
 
 
 def finish(job: Job, unfinished: PartialStore) -> Facts | str:
-    """Run a job and store its arrays from within the process that made them; return only the record.
+    """Run a job, add its arrays to the unfinished store, and return the record of the scan.
 
-    For bad input, return the reason why the scan is skipped, so that one bad file never stops a build.
+    The process that makes the arrays also stores them, so that only the record is sent to the main process.
+    If the input is bad, the result is the reason why the scan is skipped, so that a bad file never stops a
+    build.
     """
     try:
         piece = job.run()
@@ -56,9 +63,10 @@ def finish(job: Job, unfinished: PartialStore) -> Facts | str:
 
 @dataclass(frozen=True)
 class FieldJob:
-    """Read, level, register and resample one printed field.
+    """The job that reads, levels, registers and resamples the scan of one printed field.
 
-    ``scan_name`` and ``layout_name`` are the recorded names of its files, relative to the data folder.
+    ``scan_name`` and ``layout_name`` are the names of the field's files in the record, which are their paths
+    relative to the data folder.
     """
 
     field: PrintedField
@@ -84,7 +92,7 @@ class FieldJob:
         return record_sha256([*plan, files, code])
 
     def layout(self) -> Array | None:
-        """Return the levels of the layout; return None if the field has no readable layout."""
+        """Return the levels of the field's layout, or None if the field has no readable layout."""
         chain = Chain()
         try:
             self._read_layout(chain)
@@ -93,7 +101,11 @@ class FieldJob:
         return chain.arrays.get("mask_level")
 
     def begin(self) -> Chain:
-        """Read layout, scan and scales; raise InputError if one of them is unusable."""
+        """Read the layout and the scan, and measure the scales of the microscope if there are standards.
+
+        Raises:
+            InputError: a file is unusable.
+        """
         chain = Chain()
         self._read_layout(chain)
         file = {self.scan_name: self.field.scan}
@@ -109,12 +121,16 @@ class FieldJob:
     def register_params(self, chain: Chain) -> dict[str, Any]:
         """Return the parameters with which the scan is registered."""
         pitches = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
-        # If the fast axis is unknown, the lines are assumed to be rows.
+        # If the fast axis is unknown, it is assumed to be x.
         lines = {"fast_axis": "y"} if chain.read["fast_axis"] == "y" else {}
         return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
 
     def run(self) -> Piece:
-        """Make the finished scan; raise InputError if its files do not allow it."""
+        """Make the scan's part of the store.
+
+        Raises:
+            InputError: the scan cannot be made from its files.
+        """
         chain = self.begin()
         (self._cover if self._is_micrograph else self._level)(chain)
         arrays, facts = chain.arrays, chain.facts
@@ -143,8 +159,8 @@ class FieldJob:
         )
 
     def _cover(self, chain: Chain) -> None:
-        """Run the rest of the chain for a micrograph: find the edges, register, and compute the coverage on
-        the layout's grid.
+        """Run the operations on a micrograph after reading: find the edges of the film, register them, and
+        compute the heights and their uncertainty on the layout's grid.
         """
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
@@ -154,14 +170,14 @@ class FieldJob:
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
     def _level(self, chain: Chain) -> None:
-        """Run the rest of the chain for heights: level the scan, and register and resample it if it belongs
-        to the dataset.
+        """Run the operations on heights after reading: level the scan and, unless it is a reference, register
+        and resample it and compute its uncertainty.
         """
         of_dataset = self.field.use == "dataset"
         pitch = {"scan_pitch_um": chain.pitch_um}
         recipe = dict(self.recipe)
         if "mask_level" not in chain.arrays or not (of_dataset or np.ptp(chain.arrays["mask_level"])):
-            # A reference has no layout, or a flat layout that cannot be located.
+            # A reference scan has no layout, or a flat layout that cannot be located in the scan.
             recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             chain.run("locate", self.register_params(chain))
@@ -177,9 +193,8 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """Return the layout's grid, and the number of its outermost pixels to ignore.
-
-        The height of these pixels depends on the unknown surroundings of the field.
+        """Return the parameters that describe the grid of the layout, and how many of its outermost pixels
+        become invalid. The heights of these pixels depend on the unknown surroundings of the field.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
@@ -212,13 +227,14 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        # Facts from the table must agree with the file; facts from the card are only defaults.
+        # If the card's table states unit or size, the file must agree with it. If only the card itself states
+        # them, they are used for files that do not state their own.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 
 
 def field_jobs(listing: Listing, recipe: Facts, seed: int = 0) -> list[FieldJob]:
-    """Return the jobs of a card, in the order of its ids."""
+    """Return one job for every printed field that a card describes, in the order of the ids."""
     standards = standards_of(listing)
     return [
         FieldJob(

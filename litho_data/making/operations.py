@@ -1,6 +1,8 @@
-"""The operations that turn raw files into a dataset: pure functions of recorded parameters and inputs.
+"""Define the operations that make a dataset from raw files. They are pure functions of recorded parameters
+and inputs.
 
-A build runs these operations, and ``replay`` repeats them from the record. No other code makes stored arrays.
+A build runs these operations, and ``replay`` repeats them from the record. No other code makes arrays of a
+store.
 """
 
 from __future__ import annotations
@@ -20,19 +22,23 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# If the aspect ratio of the pixels differs from 1 by more than this, the message of a failed registration
+# If the aspect ratio of the pixels differs from 1 by more than this and the registration fails, the message
 # asks whether rows are missing.
 _OBLONG = 0.01
 
 
 OPERATIONS: dict[str, Operation] = {}
 READERS = ("read-scan", "read-micrograph")
-"""The operations that read what the microscope wrote."""
+"""The names of the operations that read the microscope's files."""
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
-    """Register a function as the operation ``name``. ``code`` names the source files and folders, apart from
-    this file, on which the result depends.
+    """Return a decorator that adds a function to ``OPERATIONS``.
+
+    Args:
+        name: name of the operation.
+        takes: names of the arrays that the operation takes, separated by blanks.
+        code: the source files and folders, apart from this file, on which the result depends.
     """
 
     def made(function: Function) -> Function:
@@ -45,8 +51,10 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """Read a levelling recipe in canonical form. Without a file, return the layout-aware plane, which does
-    not remove the print.
+    """Read a levelling recipe from a file, and return it in canonical form.
+
+    Without a file, return the recipe that subtracts a plane, fitted together with the layout so that no part
+    of the print is removed.
     """
     from litho_data.level import Recipe
 
@@ -54,7 +62,7 @@ def load_recipe(path: Path | None) -> dict[str, Any]:
 
 
 def no_recipe() -> dict[str, Any]:
-    """Return the empty recipe, which leaves heights as they are."""
+    """Return a levelling recipe without steps, which leaves the heights unchanged."""
     from litho_data.level import Recipe
 
     return Recipe().canonical()
@@ -107,7 +115,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, and convert them into the height map that will be registered."""
+    """Find the edges of the film, and convert them to a height map, which is then registered."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -121,8 +129,10 @@ def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     "cover", "mask_level edge_distance_um scan_to_layout bend_um defect", "register", "making/contour.py"
 )
 def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Compute the height map of the film on the layout's grid: the height of the film times the fraction of
-    each pixel that it covers. Pixels with dirt are invalid.
+    """Compute the height map of the film on the layout's grid, and its uncertainty.
+
+    The height of a pixel is the thickness of the film times the share of the pixel that the film covers.
+    Pixels with dirt or pits are invalid.
     """
     from litho_data.making.contour import coverage, edge_shift_px, foreign, with_moved_edges
     from litho_data.register.refine import interior_of
@@ -135,7 +145,8 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     covered = coverage(np.where(valid, distance, np.nan), pitch_um)
     dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
     if shift_px := edge_shift_px(level, np.where(valid, distance / pitch_um, np.nan)):
-        # The edges may have moved further than `dirt_px`.
+        # The edges may have moved farther than `dirt_px`, so that whole edges are marked as dirt. Only what
+        # is also marked relative to the moved edges is dirt.
         moved = with_moved_edges(level, shift_px) / params["full_level"]
         dirt &= foreign(covered, moved, params["dirt_px"])
     valid &= ~dirt
@@ -160,8 +171,8 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
 
 
 def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
-    """Return the factor of the heights and its relative uncertainty. Without a calibration, these are 1 and
-    0.
+    """Return the calibrated scale factor of the heights and its relative uncertainty. Without a calibration,
+    they are 1 and 0.
     """
     if "calibration" not in arrays:
         return 1.0, 0.0
@@ -171,7 +182,7 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 
 @_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find where the layout lies in the scan before levelling, for layout-aware levelling."""
+    """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs them."""
     from litho_data.level import layout_in_scan_frame
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
@@ -227,7 +238,7 @@ def _register(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _as_arrays(found: Registration) -> dict[str, Array]:
-    """Return the arrays that place a scan on its layout."""
+    """Return the arrays of a registration by their names in the store: matrix, bend and mask of defects."""
     made = {"scan_to_layout": found.scan_to_layout}
     if found.bend_um is not None:
         made["bend_um"] = found.bend_um.amount
@@ -287,7 +298,9 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _on_layout(scan_map: Array, params: Params, arrays: Inputs) -> tuple[Array, Array]:
-    """Resample a map from the scan's frame to the layout's pixels; also return where the map is known."""
+    """Resample a map from the scan's frame onto the layout's pixels. Return the resampled map, and a bool
+    mask of the pixels where it is valid.
+    """
     from litho_data.register import Bend, resample_to_layout
 
     pitch_um = tuple(params["scan_pitch_um"])

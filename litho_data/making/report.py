@@ -1,4 +1,4 @@
-"""Write the report of a build: inputs, results, and pictures of every scan."""
+"""Write the report of a build, with its inputs, its results and pictures of the scans."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from litho_data.making.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
-# Blur of the layout in pictures of the residual, about the width of the printer's line; no model uses it.
+# Sigma of the blur of the layout in pictures of the residual, about the width of the printer's line. It is
+# used only for these pictures.
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",
@@ -29,16 +30,18 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
-# The columns of each table in order, each with its title and meaning.
+# The columns of each table of the report, in order, each with its title and its meaning.
 _COLUMNS = table_beside(__file__, "columns.toml")
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
-    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; return the page's path."""
+    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``. Return the path of
+    ``report.html``.
+    """
     store = open_store(store_path)
     page = Page(
         f"Dataset {store.name}",
-        "Raw scans were read, levelled, registered onto their layouts and stored.",
+        "The raw scans were read, levelled, registered onto their layouts and stored.",
         facts={"dataset": store.sha256},
         words={key: words for table in _COLUMNS.values() for key, words in table.items()},
     )
@@ -66,8 +69,8 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
     page.tiles(tiles)
     page.paragraph(
         f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
-        "The hash of the dataset (below) covers layouts, heights, validity and transforms of all scans; "
-        "building the dataset again gives the same hash."
+        "The hash of the dataset (below) is computed from the layouts, heights, masks of valid pixels and "
+        "transforms of all scans. Building the dataset again gives the same hash."
     )
     assumed = store.manifest["assumptions"]
     page.note(*(f"Assumed, because the card does not say: {assumption}." for assumption in assumed))
@@ -77,7 +80,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
     if result.findings:
         page.heading("To do")
         table = [{"scan": one.scan, "what": one.text} for one in result.findings]
-        page.table(table, "Problems of the dataset, worst first", "findings.csv")
+        page.table(table, "What to check or fix in the dataset, worst first", "findings.csv")
     apart = {"skipped": result.skipped, "unpaired": result.unpaired}
     rows = [
         {"id": key, "status": how, "reason": reason}
@@ -86,7 +89,9 @@ def _left_out(page: Page, result: BuildResult) -> None:
     ]
     if rows:
         page.heading("Not in the store")
-        caption = "Ids that are not in the store, and the reasons. With --strict, any such id stops the build"
+        caption = (
+            "Ids that are not in the store, and the reasons. With --strict, a single such id stops the build"
+        )
         page.table(rows, caption, "left_out.csv")
 
 
@@ -94,24 +99,27 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
     if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
         page.heading("Passed with a note", folded=True)
         alike = quality[warned].groupby("warning", sort=False)["scan"].agg(", ".join).reset_index()
-        page.table(alike, "Notes on these scans", "warnings.csv")
+        page.table(alike, "Scans that are in the store, with a note on each", "warnings.csv")
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
     if len(shown.columns) == 1:
-        # For pairs that come without their scans, the table has only the column of ids.
+        # Datasets in the pair format come without their scans, so their table would contain only ids.
         return
     page.heading("Quality of every scan, in numbers", folded=True)
     page.table(
-        shown, "Registration and noise of every scan; quality.csv has all values", "summary.csv", digits=3
+        shown,
+        "Registration of every scan. The file quality.csv contains further values",
+        "summary.csv",
+        digits=3,
     )
     if "sigma_nm" in quality:
         page.table(
             quality[list(_COLUMNS["uncertainty"])],
-            "Parts of the uncertainty of the heights, each as root mean square over a scan. The "
-            "uncertainty of the scan's offset is not included. If the card has no z calibration, the "
-            "part from the calibration is 0, and the total lacks the error of the z scale",
+            "Parts of the uncertainty of the heights, each as the root mean square over a scan. The "
+            "uncertainty of the scan's offset is not included. If the card has no z calibration, that part "
+            "is 0, and the total does not include the error of the z scale",
             "uncertainty.csv",
             digits=2,
         )
@@ -122,8 +130,8 @@ def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
         page.heading("Properties of the microscope from the grating")
         page.table(
             [{name: getattr(one, name) for name in _COLUMNS["grating"]} for one in scans],
-            "Scales, bow of a line and tip, measured with the known period of the grating; they are not "
-            "used to correct other scans",
+            "Scale factors, bow of a scan line and radius of the tip, measured with the known period of the "
+            "grating. They are not used to correct other scans",
             "gratings.csv",
             digits=4,
         )
@@ -142,9 +150,9 @@ def _pictures(page: Page, store: Store) -> None:
         columns.append((f"{title.format(unit=unit)}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
         pictures.append([coloured_png(image, colours, low, high) for image in images])
     caption = (
-        "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
-        "Residual: registered height minus the blurred layout, whose gain and offset are fitted. "
-        "One colour scale per column."
+        "Raw: the scan in its own frame. Registered: the scan on the layout's grid, empty where not "
+        "measured. Residual: the registered heights minus the blurred layout, whose gain and offset are "
+        "fitted. All pictures in a column have the same colour scale."
     )
     page.gallery(columns, list(zip(ids, zip(*pictures, strict=True), strict=True)), caption)
 
@@ -157,14 +165,14 @@ def _shown_ids(store: Store) -> list[str]:
 
 
 def _stages(store: Store, scan_id: str) -> list[Array]:
-    """Return the thumbnails of a scan, in the order of ``_STAGES``."""
+    """Return the small pictures of a scan, in the order of ``_STAGES``."""
     scan = store.scan(scan_id)
     images = [scan.mask_level, _raw(store, scan_id), scan.height_um * 1e3, _residual_nm(scan)]
     return [thumbnail(image) for image in images]
 
 
 def _raw(store: Store, scan_id: str) -> Array:
-    """Return heights in nm, or the grey values of a micrograph."""
+    """Return the raw heights of a scan in nm, or the grey values of a micrograph."""
     if store.instrument == "sem":
         return store.scan_frame(scan_id, "micrograph").astype(float)
     return store.scan_frame(scan_id, "raw_height_um") * 1e3

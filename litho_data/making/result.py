@@ -1,4 +1,4 @@
-"""The record of a build, ``build.json``."""
+"""Define the record of a build, the file ``build.json``."""
 
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,10 +9,11 @@ from litho_data.store.schema import DatasetId
 
 
 class BuildResult(Result):
-    """The scans that a build made or left out; ``reused`` counts those that an earlier build had finished.
+    """The record of a build: which scans are in the store, which are not, and what should be fixed.
 
-    ``skipped`` and ``unpaired`` map ids that are not in the store to the reasons. ``findings`` lists what to
-    fix, worst first.
+    ``n_scans`` and ``n_references`` are the numbers of scans and of reference scans in the store. ``reused``
+    is the number of those that an earlier, interrupted build had finished. ``skipped`` and ``unpaired`` map
+    the ids that are not in the store to the reasons. ``findings`` lists what to fix, worst first.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"
@@ -32,5 +33,5 @@ class BuildResult(Result):
 
 
 def report_folder(out: str | Path) -> Path:
-    """Return the folder of a store's report: ``<name>-report`` beside the store."""
+    """Return the folder of a store's report, which is ``<name>-report`` beside the store."""
     return Path(out).parent / f"{Path(out).stem}-report"

@@ -1,7 +1,7 @@
-"""Find scans that do not show their own layout, because ids, files or doses were mixed up.
+"""Find scans that do not show the layout with the same id, because ids, files or doses were mixed up.
 
-A scan that registers may still show a similar layout, a mirrored one, or its own layout at another dose. A
-scan that does not register may show another layout of the set.
+A scan that could be registered may still show a similar layout, a mirror image of its layout, or its layout
+printed at another dose. A scan that could not be registered may show another layout of the set.
 """
 
 from collections import Counter
@@ -19,26 +19,30 @@ from litho_data.register.topography import predicted_topography, remove_bow
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
-# Number of outermost pixels that the surroundings of a field affect.
+# Number of outermost pixels whose heights are compared with those of the inner pixels.
 _EDGE_PX = 2
 # The correlation of a scan with another layout must exceed that with its own layout by this much.
 _BETTER = 0.02
-# At the best shift, the correlation of a print with another layout is 0.3 to 0.5, and with its own layout
-# 0.9.
+# A scan shows another layout if it correlates with it by at least the first value, and with every further
+# layout by less, by at least the second value. At the best shift, the correlation of a print with its own
+# layout is about 0.9, and with another layout 0.3 to 0.5.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
-# Scatter of the log gain at one dose among prints of one layout, and among prints of different layouts.
+# Standard deviation of the logarithm of the height per level at one dose, first among prints of the same
+# layout, then among prints of different layouts.
 _SCATTER_SAME, _SCATTER_OTHER = 0.01, 0.03
 _CLEAR_SIGMA = 4.0
 
 
 @dataclass(frozen=True)
 class Print:
-    """One registered scan: its heights and its blurred layout at a few points, its orientation and its group.
+    """One registered scan, with its heights and its blurred layout sampled at a few points.
 
-    ``turned`` says whether the card states that the print was rotated under the microscope. Scans of one
-    ``group`` should share a gain. The group is the dose, if the card gives it, or the printed block.
-    ``response`` and ``edge_times`` come from ``_response`` and ``_edge_times``.
+    ``response`` contains the height per level in µm and its relative growth with the dose. ``edge_times``
+    says how many times more the outermost pixels deviate from the layout than the inner ones. ``dihedral`` is
+    the orientation that the registration found, and ``turned`` is true if the card states that the print was
+    rotated under the microscope. Scans in the same ``group`` should have the same height per level. The group
+    is the dose if the card states it, and the print otherwise.
     """
 
     id: str
@@ -54,18 +58,20 @@ class Print:
 
 
 def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array]]) -> list[Print]:
-    """Sample the registered scans among the records at a few points.
+    """Return the registered scans among the records, sampled at a few points.
 
     Args:
-        records: records of the scans of a dataset.
-        load: function that takes the id of a scan and returns its arrays ``mask_level`` and ``height_um``.
+        records: the records of the scans of a dataset.
+        load: function that takes the id of a scan and returns its arrays ``mask_level`` and ``height_um`` by
+            name.
     """
     return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Return, by id, the reasons to suspect that a scan does not show its own layout. In most sets, there are
-    no such scans.
+    """Return the reasons to suspect that a scan does not show its own layout, by the id of the scan.
+
+    Scans that are not suspected are left out.
     """
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
@@ -79,13 +85,13 @@ def fitting_layout(
     layouts: Mapping[str, Array],
     pitch_um: float,
 ) -> str:
-    """Find the layout whose topography a scan shows, in any orientation; return "" if none stands out.
+    """Return the id of the layout that a scan shows in any orientation, or "" if no layout clearly fits best.
 
     Args:
-        height_um: (ny, nx), NaN where not measured.
-        scan_pitch_um: (y, x).
-        layouts: levels (ny, nx) by id.
-        pitch_um: pitch of the layouts.
+        height_um: heights of the scan in µm, shape (ny, nx), NaN where not measured.
+        scan_pitch_um: pitch (y, x) of the scan in µm.
+        layouts: levels of every layout, by id, each of shape (ny, nx).
+        pitch_um: pitch of the layouts in µm.
     """
     flat = remove_bow(at_layout_pitch(height_um, scan_pitch_um, pitch_um))
     scores = [(0.0, ""), (0.0, "")]
@@ -106,7 +112,7 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
     response = _response(topography, height)
     return Print(
         id=record["id"],
-        # These are copies, because views would keep the whole arrays in memory.
+        # The sampled arrays are copied, because views would keep the whole arrays in memory.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
         response=response,
@@ -120,12 +126,12 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose heights fit another layout of the set better, even though the scans were
-    registered onto their own layout.
+    """Yield the scans whose heights fit another layout of the set better than the layout onto which they were
+    registered. Each is yielded as its id and the reason.
     """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
-        # A layout that was printed more than once gets the name of its first id.
+        # A layout that was printed more than once is named after the first of its ids.
         distinct = list({one.layout: one for one in reversed(alike)}.values())
         layouts = np.stack([one.topography.ravel() for one in distinct])
         for one in alike:
@@ -138,8 +144,10 @@ def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _correlations(height: Array, layouts: Array) -> Array:
-    """Return the correlations of heights (pixels,) with layouts (n, pixels). NaN heights are ignored; flat
-    arrays have the correlation 0.
+    """Return the correlation of the heights with each of n layouts. The result has shape (n,).
+
+    ``height`` has shape (pixels,), and ``layouts`` has shape (n, pixels). Heights that are NaN are ignored.
+    The correlation is 0 for a flat layout and for flat heights.
     """
     seen = np.isfinite(height)
     own, others = (one - one.mean(axis=-1, keepdims=True) for one in (height[seen], layouts[:, seen]))
@@ -149,8 +157,9 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield scans that are mirrored or rotated relative to their layout, unlike the other scans or contrary
-    to the card.
+    """Yield the scans that are mirrored relative to their layout, and those that are rotated in another way
+    than most scans. Each is yielded as its id and the reason. Scans of prints that the card states to be
+    rotated are left out.
     """
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
     for one in (one for one in prints if not one.turned):
@@ -159,12 +168,12 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
             what = "a mirror image of its layout" if mirrored else f"rotated ({one.dihedral})"
             yield one.id, f"{what}, unlike the other scans: is its layout file the right one?"
         elif one.dihedral in MIRRORED:
-            yield one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"
+            yield one.id, f"a mirror image of its layout ({one.dihedral}): is its file mirrored?"
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose height per level suggests that they belong to another group, and the scans whose
-    doses are out of order.
+    """Yield the scans whose height per level is that of another group, and the scans whose doses seem to be
+    swapped. Each is yielded as its id and the reason.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
@@ -200,12 +209,12 @@ def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
-    relative growth of that slope with the dose, d ln slope / d ln dose.
+    relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    Exposure is level times dose. The curve g of the heights against the blurred levels T therefore also shows
-    how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). If g is a parabola, the
-    growth is one plus the fraction of the slope that comes from the square term. In a saturated print, the
-    growth is negative.
+    The exposure is the level times the dose. Therefore, the curve g of heights against blurred levels T also
+    shows how a larger dose would change the slope, and the growth is cov(T, T g') / cov(T, g). Here, g is a
+    parabola, and the growth is one plus the share of the slope that comes from its quadratic term. In a
+    saturated print, the growth is negative.
     """
     seen = np.isfinite(height)
     level, height = topography[seen].astype(float), height[seen].astype(float)
@@ -217,10 +226,10 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
 
 
 def _edge_times(topography: Array, height: Array, slope: float) -> float:
-    """Return the rms deviation of the outermost pixels from the layout, divided by that of the inner pixels;
-    0 if unknown.
+    """Return the rms deviation of the outermost pixels from the layout, divided by that of the inner pixels.
 
-    ``slope``: height per blurred level, µm.
+    The deviation is the height minus ``slope`` (in µm per level) times the blurred level. The result is 0 if
+    no outermost or no inner pixel was measured.
     """
     seen = np.isfinite(height)
     inner = seen & interior_of(height.shape, _EDGE_PX)
@@ -233,13 +242,13 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Return messages for the doses that are out of order. There are no messages unless the height per level
-    clearly falls from one dose to a larger one.
+    """Return messages for the doses that seem to be swapped, by dose. The result is empty unless the height
+    per level clearly falls from one dose to a larger one.
 
     Args:
-        rising: the log of the height per level and the number of scans, by dose. Only doses at which a larger
-            dose should raise the height are included.
-        scatter: standard deviation of that log for one scan.
+        rising: for each dose, the logarithm of the height per level and the number of scans. It contains only
+            doses at which a larger dose should raise the height.
+        scatter: standard deviation of this logarithm for one scan.
     """
     doses = sorted(rising)
     values = np.array([rising[dose][0] for dose in doses])
@@ -247,8 +256,8 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     falls = values[:, None] - values - _CLEAR_SIGMA * np.hypot.outer(error, error)
     if not (np.triu(falls, 1) > 0).any():
         return {}
-    # In the right order, values rise with the dose. The rank of a value is therefore the position of its true
-    # dose.
+    # The values should rise with the dose. Therefore, the rank of a value among the values is the position of
+    # its true dose among the doses.
     pairs = {k: sorted((k, int(rank))) for k, rank in enumerate(np.argsort(np.argsort(values)))}
     return {
         doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"

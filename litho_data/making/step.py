@@ -1,4 +1,4 @@
-"""One step of a build: an operation that is run and recorded, so that its arrays can be traced and
+"""Run and record a single step of a build, so that the origin of its arrays is known and they can be
 reproduced.
 """
 
@@ -27,11 +27,12 @@ Function = Callable[[Params, Files, Inputs], Made]
 
 @dataclass(frozen=True)
 class Step:
-    """One operation on one scan, with inputs, parameters and outputs.
+    """The record of one operation on one scan, with its parameters, inputs and outputs.
 
-    ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), and ``outputs``
-    are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source code
-    that ran. It is recorded but is not part of the id, because moving a comment does not change a result.
+    Each input is a mapping with the keys ``name`` and ``sha256``. The name of a file is its path below the
+    data folder. Each output has the keys ``name``, ``sha256``, ``dtype``, ``shape``, ``unit`` and ``dims``.
+    ``code_sha256`` identifies the source code that ran. It is not part of the step's id, because some changes
+    of the code, such as moving a comment, do not change a result.
     """
 
     op: str
@@ -43,20 +44,20 @@ class Step:
 
     @property
     def id(self) -> str:
-        """Return the hash of operation, version, parameters and input hashes: equal ids must give equal
-        outputs.
+        """Return the hash of the operation's name and version, its parameters and its inputs. Steps with
+        equal ids must have equal outputs.
         """
         inputs = [[one["name"], one["sha256"]] for one in self.inputs]
         return record_sha256([self.op, self.op_version, self.params, inputs])
 
     def to_record(self) -> dict[str, Any]:
-        """Return the step as plain data, with its id."""
+        """Return the step and its id as plain data, for storing."""
         return {"id": self.id, **asdict(self)}
 
     @classmethod
     def from_record(cls, record: Facts) -> Step:
-        """Make the step from a record. The recorded id is not used, so that it can be compared with the
-        computed id.
+        """Make the step from its stored record. The id in the record is ignored, so that it can be compared
+        with the id that is computed from the step.
         """
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
@@ -64,15 +65,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Operation:
-    """A pure function of recorded parameters and inputs.
+    """A processing operation, which is a pure function of recorded parameters and inputs.
 
     Args:
-        name: as in the records.
-        version: changed whenever the function may give different results.
-        function: ``function(params, files, arrays) -> (arrays, facts)``.
-        takes: names of the input arrays, in the order in which they are recorded; those that a scan lacks are
-            left out.
-        code: files and folders of this package that the result depends on.
+        name: name of the operation in the records.
+        version: version of the operation. It is changed whenever the function may give different results.
+        function: function ``function(params, files, arrays)`` that returns arrays by name, and facts.
+        takes: names of the input arrays, in the order in which they are recorded. Arrays that a scan does not
+            have are left out.
+        code: files and folders of this package on which the result depends.
     """
 
     name: str
@@ -89,12 +90,12 @@ class Operation:
     def run(
         self, params: Facts, files: Mapping[str, Path], arrays: Mapping[str, Array]
     ) -> tuple[Step, Arrays, Facts]:
-        """Run the operation; return its record and its arrays.
+        """Run the operation. Return the record of the step, the arrays it made, and the facts it found.
 
         Args:
-            params: explicit parameters, plain data.
-            files: raw files by their recorded name, in the order that the operation expects.
-            arrays: arrays by their name in the store; the operation uses only those that it takes.
+            params: all parameters of the operation, as plain data.
+            files: paths of raw files by their recorded name, in the order that the operation expects.
+            arrays: arrays by their name in the store. Only those named in ``takes`` are used.
 
         Raises:
             InputError: something is wrong with the input, for example a file is missing or unreadable.
@@ -122,11 +123,11 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit numerical libraries to one thread. Sums then do not depend on the number of cores, and workers do
-    not compete for cores.
+    """Limit the numerical libraries to one thread in a block. The results then do not depend on the number of
+    cores, and parallel workers do not compete for cores.
     """
     import cv2
-    import scipy.linalg  # noqa: F401 - has its own BLAS, which can be limited only once it is loaded
+    import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded
     from threadpoolctl import threadpool_limits
 
     threads = cv2.getNumThreads()

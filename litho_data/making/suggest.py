@@ -1,5 +1,5 @@
-"""Compare levelling recipes on three scans of a card, and suggest the recipe after which the layout explains
-the heights best.
+"""Compare levelling recipes on three scans of a dataset card. The recipe is suggested after which the layout
+explains the heights best.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ op = "align-rows"
 method = "median-of-differences"
 """,
 }
-"""The recipes that are compared, the simplest first."""
+"""The recipes that are compared, from the simplest to the most complex."""
 _SCANS = 3
-# A recipe is better than a simpler one only if its residual is below this share of the simpler one's
-# residual.
+# A recipe is preferred to a simpler one only if its residual is less than this share of that of the simpler
+# one.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
 _LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
@@ -64,10 +64,11 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The recipe that leaves the smallest residual, and the residuals of all recipes and scans in nm.
+    """The suggested recipe, and the residuals of all recipes in nm.
 
-    ``left_nm[recipe][scan]`` is the root mean square residual of the fit to the layout, in blocks that were
-    held out of the fit. ``card`` is the written card, and ``warned`` maps recipes to the warnings about them.
+    ``left_nm[recipe][scan]`` is the root mean square part of the levelled heights that the layout does not
+    explain, in blocks that were held out of the fit. ``warned`` maps recipes to the warnings about them.
+    ``card`` is the path of the card that was written.
     """
 
     recipe: str
@@ -79,26 +80,30 @@ class Suggestion:
 def suggest_recipe(
     card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None
 ) -> Suggestion:
-    """Compare recipes on three scans of a card; write the best recipe, a card that uses it, and a page.
+    """Compare recipes on three scans of a card. Write the best recipe, a card that uses it, and a page with
+    pictures.
 
-    In half of the 16 px blocks, a free function of the blurred layout is fitted to the levelled heights.
-    The recipes are compared by the residual in the other half, because this residual contains both the tilt
-    that a recipe fails to remove and the part of the print that it wrongly removes. A recipe is not suggested
-    if it shifts lines that already agree with their neighbours in many pixels.
+    The field is divided into blocks of 16 px. In half of the blocks, a free function of the blurred layout is
+    fitted to the levelled heights. The recipes are compared by the residual in the other half. It contains
+    both the tilt that a recipe fails to remove and the part of the print that it wrongly removes. A recipe is
+    not suggested if a step of it gives a warning, for example because it shifts lines that already agree with
+    adjacent lines in many pixels.
 
     Args:
-        card_path: the card; ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside it.
-        out: folder of the page with pictures.
+        card_path: path of the card. ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside
+            it.
+        out: folder of the page.
         data_dir: folder of the raw files, as for ``build_dataset``.
 
     Raises:
-        InputError: the card is bad or describes micrographs, or no scan can be read and registered.
+        InputError: the card is bad or describes micrographs, no scan can be read and registered, or no recipe
+            can be applied.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
         raise InputError("scans for comparing recipes", got="micrographs", wanted="scans of heights")
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
-    # The three scans are far apart in the list; if one of them cannot be used, another takes its place.
+    # Three scans far apart in the list are tried first. If one of them cannot be used, another scan is tried.
     places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()
     places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
@@ -134,23 +139,25 @@ def suggest_recipe(
 
 
 def _best(left_nm: Mapping[str, float]) -> str:
-    """Return the recipe with the smallest residual, or a simpler one (listed earlier) with nearly the same
-    residual.
+    """Return the recipe with the smallest residual. If simpler recipes have nearly the same residual, return
+    the simplest of them, which is listed first.
     """
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
 def _located(job: FieldJob) -> tuple[Array, Array]:
-    """Return the raw heights (ny, nx) µm, and the layout in the scan's frame, NaN outside it."""
+    """Return the raw heights in µm, and the levels of the layout in the frame of the scan, NaN outside the
+    layout. Both have the shape (ny, nx) of the scan.
+    """
     chain = job.begin()
     chain.run("locate", job.register_params(chain))
     return chain.arrays["raw_height_um"].astype(float), chain.arrays["layout_in_scan"]
 
 
 def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
-    """Return the heights and any warnings about the recipe; if the recipe cannot be applied, the heights are
-    unchanged.
+    """Return the levelled heights, and a text with any warnings about the recipe. If the recipe cannot be
+    applied, return the raw heights and the reason.
     """
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
@@ -161,12 +168,14 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Fit the heights by a free function of the layout, and return the rms residual in µm, in blocks that
-    were held out of the fit.
+    """Return the root mean square part, in µm, of the heights that the layout does not explain.
+
+    A free function of the layout is fitted to the heights in half of the blocks of the field. The result is
+    computed from the residuals in the other half.
 
     Args:
-        height_um: (ny, nx), NaN where not measured.
-        layout: levels in the scan's frame, NaN outside the layout.
+        height_um: levelled heights in µm, shape (ny, nx), NaN where not measured.
+        layout: levels of the layout in the frame of the scan, shape (ny, nx), NaN outside the layout.
     """
     known = np.isfinite(layout)
     inner = known & np.isfinite(height_um) & (ndimage.distance_transform_edt(known) > _BORDER_PX)
@@ -181,7 +190,9 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
 
 
 def _write_card(card: Path, best: str) -> Path:
-    """Write the card with the recipe as its ``process.level``; the rest of its text is unchanged."""
+    """Write the recipe, and a copy of the card whose ``process.level`` names it. The other text of the card
+    stays unchanged. Return the path of the copy.
+    """
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))
     line = f'level = "{recipe.name}"'
@@ -202,12 +213,14 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], fold
         "Which levelling recipe",
         "Recipes are compared on scans of the card: how much of the heights does the layout not explain?",
     )
-    page.verdict(f"Level by the recipe \u201c{found.recipe}\u201d: build {found.card.name}.")
+    page.verdict(
+        f"Level with the recipe \u201c{found.recipe}\u201d: build the dataset from {found.card.name}."
+    )
     rows = [
         {"recipe": name, **of} | ({"warning": found.warned.get(name, "")} if found.warned else {})
         for name, of in found.left_nm.items()
     ]
-    caption = "Part of the levelled heights that the layout does not explain (rms), nm"
+    caption = "Part of the levelled heights that the layout does not explain (rms), in nm, by scan"
     page.table(rows, caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)
@@ -223,4 +236,8 @@ def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
             shown.append(coloured_png(thumbnail(image), "cividis", *limits(image)))
         rows.append((name, shown))
     columns = [(title, bar) for title in ("raw", *RECIPES)]
-    page.gallery(columns, rows, "Heights before and after each recipe, each picture on its own scale.")
+    page.gallery(
+        columns,
+        rows,
+        "Heights before levelling and after each recipe. Each picture has its own colour scale.",
+    )

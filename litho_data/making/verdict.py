@@ -1,4 +1,4 @@
-"""Judge a dataset: compare the numbers of its card with the heights, and list what to fix."""
+"""Judge a dataset: compare the numbers in its card with the measured heights, and list what to fix."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -11,10 +11,13 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# A number of the card is wrong if heights differ by more than these factors from the heights that the layout
-# states, or from those of the other prints.
+# Limits of the height per level. If that of the prints differs from that of the card by more than the first
+# factor, this is reported; by more than the second factor, nothing is built. A scan is left out if its height
+# per level differs from that of the other scans by more than the third factor.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
-# If the scales of the scans agree with each other but not with 1, the pitch of the card is wrong.
+# Limits of the scale of a scan on its layout. If the scales differ from 1 by more than the first value but
+# from each other by less than the second, the pitch in the card is wrong. If the scale of a single scan
+# differs from that of the others by more than the third value, the size of this scan is wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 # Largest accepted value of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints
@@ -27,7 +30,7 @@ _SHOWN = 12
 
 
 class Weight(IntEnum):
-    """The rank of a finding: findings of the lowest rank are listed first."""
+    """The rank of a finding. Findings with a lower number are worse and are listed first."""
 
     LAYOUT = 0
     PITCH = 1
@@ -39,7 +42,7 @@ class Weight(IntEnum):
 
 
 class Finding(Record):
-    """One thing to fix, with the scan that it concerns, or all scans."""
+    """One thing to fix. ``scan`` is the id of the scan that it concerns, or "all scans"."""
 
     scan: str
     text: str
@@ -50,7 +53,9 @@ class Finding(Record):
 
 
 def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
-    """Find scans whose height per level is far from that of the others; return the reasons by id."""
+    """Find scans whose height per level differs greatly from that of the others, and return the reasons for
+    leaving them out, by id.
+    """
     gains = {one.id: abs(one.response[0]) for one in prints}
     if len(gains) < 3:
         return {}
@@ -64,10 +69,11 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def require_heights(prints: Sequence[Print], card: Card) -> None:
-    """Refuse a level height that has nothing to do with the prints, such as a wavelength in nm.
+    """Reject a card whose level height has nothing to do with the prints, such as a wavelength in nm.
 
     Raises:
-        InputError: the prints are a hundred times higher or lower than their layouts say.
+        InputError: the height per level of the prints is more than 100 times that of the card, or less than a
+            hundredth of it.
     """
     times = _height_times(prints, card)
     if times and not 1 / _IMPOSSIBLE < times < _IMPOSSIBLE:
@@ -87,14 +93,14 @@ def findings(
     skipped: Mapping[str, str],
     card: Card,
 ) -> list[Finding]:
-    """List things to fix, worst first; the list is empty for a good dataset.
+    """Return the list of things to fix, worst first. The list is empty for a good dataset.
 
     Args:
-        records: records of the dataset's scans.
-        prints: the heights of these scans at a few points.
-        doubts: reasons to suspect that a scan does not show its own layout, by id.
-        skipped: the reason why a scan is not in the store, by id.
-        card: the card whose numbers are compared with the heights.
+        records: the records of the dataset's scans.
+        prints: the registered scans, sampled at a few points (see ``prints_of``).
+        doubts: reasons to suspect that a scan does not show its own layout, by the id of the scan.
+        skipped: reasons why scans are not in the store, by the id of the scan.
+        card: the dataset card whose numbers are compared with the heights.
     """
     named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
     named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
@@ -109,8 +115,9 @@ def findings(
 
 
 def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
-    """Yield what is wrong with one scan. ``spread_nm`` maps the ids of the scans to the standard deviations
-    of their heights.
+    """Yield what is wrong with one scan, each as a text and a weight.
+
+    ``spread_nm`` maps the ids of the scans to the standard deviations of their heights, in nm.
     """
     quality = record["quality"]
     for note in record.get("notes", ()):
@@ -118,21 +125,24 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
     if quality.get("polarity") == -1:
         yield "its heights fall where the levels rise: is the layout or the scan inverted?", Weight.LAYOUT
     if (off := quality.get("tre_median_px", 0.0)) > _MOST_TRE_PX:
-        text = f"details lie {off:.1f} px from their places in the layout: are layout and pitch right?"
+        text = f"details lie {off:.1f} px away from their places in the layout: are layout and pitch right?"
         yield text, Weight.PLACE
     if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
         yield f"heights are valid in only {valid:.0%} of its layout: is process.tip too large?", Weight.PLACE
     left = quality.get("sigma_levelling_nm", 0.0)
     if left > _LEFT * spread_nm.get(record["id"], np.inf):
-        text = f"a tilt or bow of {left:.0f} nm remains in its heights: compare recipes with build --suggest"
+        text = (
+            f"a tilt or bow of {left:.0f} nm may remain in its heights: compare recipes with build --suggest"
+        )
         yield text, Weight.LEVEL
 
 
 def _of_the_card(
     records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Yield contradictions between the scans as a whole and the numbers of the card, each as the id of the
-    scan concerned (or "all scans"), a text and a weight.
+    """Yield contradictions between the scans and the numbers in the card.
+
+    Each contradiction consists of the id of the scan that it concerns (or "all scans"), a text and a weight.
     """
     layout = card.layout
     times = _height_times(prints, card)
@@ -159,8 +169,8 @@ def _of_the_card(
     edge_times = float(np.median([one.edge_times for one in prints])) if prints else 0.0
     if edge_times > _EDGE_TIMES:
         text = (
-            f"their outermost pixels deviate {edge_times:.0f} times as much from the layouts as the others: "
-            "if level 0 continues around a field, set write.surround to substrate; otherwise, set it to "
+            f"their outermost pixels deviate {edge_times:.0f} times as much from the layouts as the inner "
+            "ones: if level 0 continues around a field, set write.surround to substrate; otherwise, set it to "
             "unknown, which excludes these pixels"
         )
         yield ALL, text, Weight.LEVEL
@@ -171,14 +181,14 @@ def _of_the_card(
 
 
 def _scale(record: Facts) -> float:
-    """Return the scale factor of a scan onto its layout; 0 if it was not registered."""
+    """Return the scale factor from a scan to its layout, or 0 if the scan was not registered."""
     low, high = (record["quality"].get(f"singular_{end}", np.nan) for end in ("min", "max"))
     return float(low * high) ** 0.5 if low * high > 0 else 0.0
 
 
 def _height_times(prints: Sequence[Print], card: Card) -> float:
-    """Return the height per level of the prints divided by the level height of the card. It is 0 if
-    unknown.
+    """Return the height per level of the prints (their median) divided by the level height in the card. The
+    result is 0 if there are no prints.
     """
     gains = [abs(one.response[0]) for one in prints]
     return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0
@@ -189,7 +199,9 @@ def _shown(times: float) -> str:
 
 
 def verdict_of(found: Sequence[Finding], n_scans: int) -> str:
-    """Return the first words of the report: good, or a list of things to fix, worst first."""
+    """Return the verdict at the top of the report. It says that the dataset is good, or lists what to fix,
+    worst first.
+    """
     if not found:
         return f"Good: all {n_scans} scans are in the store, and no problem was found."
     shown = " · ".join(str(one) for one in found[:_SHOWN])
