@@ -44,7 +44,9 @@ class Chain:
 
     @property
     def scales(self) -> Facts:
-        """Return the calibrated scales of the microscope, or an empty mapping without calibration standards."""
+        """Return the calibrated scales of the microscope, or an empty mapping without calibration
+        standards.
+        """
         return self.facts.get("calibrate", {})
 
     @property

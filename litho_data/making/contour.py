@@ -89,7 +89,9 @@ def find_edges(grey: Array) -> Edges:
 
 
 def _dense(line: Array) -> Array:
-    """Return evenly spaced points along a contour. Contour and result have shape (n, 2) with columns y and x."""
+    """Return evenly spaced points along a contour. Contour and result have shape (n, 2) with columns y and
+    x.
+    """
     along = np.r_[0.0, np.hypot(*np.diff(line, axis=0).T).cumsum()]
     places = np.arange(0.0, along[-1], _STEP_PX)
     return np.stack([np.interp(places, along, line[:, axis]) for axis in (0, 1)], axis=1)

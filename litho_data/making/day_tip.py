@@ -1,4 +1,6 @@
-"""Estimate the radius of the microscope's tip from all scans of a dataset card, before the dataset is built."""
+"""Estimate the radius of the microscope's tip from all scans of a dataset card, before the dataset is
+built.
+"""
 
 import sys
 from collections.abc import Sequence

@@ -170,8 +170,8 @@ def _of_the_card(
     if edge_times > _EDGE_TIMES:
         text = (
             f"their outermost pixels deviate {edge_times:.0f} times as much from the layouts as the inner "
-            "ones: if level 0 continues around a field, set write.surround to substrate; otherwise, set it to "
-            "unknown, which excludes these pixels"
+            "ones: if level 0 continues around a field, set write.surround to substrate; otherwise, set "
+            "it to unknown, which excludes these pixels"
         )
         yield ALL, text, Weight.LEVEL
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)
