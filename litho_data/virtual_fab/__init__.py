@@ -1,5 +1,5 @@
-"""Simulate a printer and an AFM from physics. The simulation shares no code with the models that are tested
-on it.
+"""Simulate a printer and an AFM from the physics of printing and scanning. The simulation shares no code with
+the models that are tested on it.
 """
 
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job

@@ -1,4 +1,4 @@
-"""Simulate the microscope: tip, feedback, drift, line offsets, tilt, bow, datum and quantisation."""
+"""Simulate the microscope with its tip, feedback, drift, line offsets, tilt, bow, datum and quantisation."""
 
 import numpy as np
 import scipy.ndimage
@@ -21,15 +21,18 @@ def scan_surface(
     job: Job,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the heights, in µm, that the microscope reports for a surface sampled at the pixels of the scan.
+    """Return the heights, in µm, that the microscope reports for a surface.
 
-    The fast axis is x, and the top line is scanned first. Lines run from left to right, or from right to left
-    in retrace. With smaller pixels, the tip moves more slowly, so the same time lag corresponds to a shorter
-    distance.
+    The fast axis is x, and the top line is scanned first. Lines run from left to right in trace, and from
+    right to left in retrace. With smaller pixels, the tip moves more slowly, so that the same time lag causes
+    a shorter lag in position.
 
     Args:
-        surface_um: true height at the pixels of the scan, µm.
-        job: what is scanned, in which direction and with which tip.
+        surface_um: true heights at the pixels of the scan, in µm.
+        frame: position and pitch of the scan.
+        noise: standard deviations of the default noise.
+        knobs: the effects beyond plain printing.
+        job: the field that is scanned, the direction of the lines, and the tip.
         rng: random generator for the default noise of this scan.
     """
     height, scan_index = surface_um, job.index
@@ -60,11 +63,12 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: Array, pitch_um: float, radii_um: YX) -> Array:
-    """Return the height ``max_u h(x − u) − u²/2R`` of a paraboloid tip whose radii along y and x are given.
+    """Return the heights at which a tip shaped like a paraboloid touches the surface h: ``max_u h(x − u) −
+    u²/2R``, where the radii R along y and x are ``radii_um``.
 
     The tip may touch the surface between two pixels.
     """
-    # A paraboloid is a sum of two parabolas, so the maximum can be computed one axis at a time.
+    # A paraboloid is a sum of two parabolas, so the maximum can be computed along one axis after the other.
     columns_done = _dilate_columns(height, pitch_um, radii_um[0])
     return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
 
@@ -73,7 +77,8 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
     from scipy.interpolate import CubicSpline
 
     fine_um = pitch_um / _TIP_OVERSAMPLING
-    # The tip touches where its slope u/R equals the slope of the surface.
+    # The tip touches the surface where the tip's slope u/R equals the slope of the surface. The steepest
+    # slope therefore limits the distance u that must be searched.
     steepest = np.abs(np.diff(height, axis=0)).max() / pitch_um
     reach = int(np.ceil(1.5 * radius_um * steepest / fine_um)) + 1
     rows = height.shape[0]
@@ -88,7 +93,9 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
 
 
 def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
-    """Apply first-order feedback along the lines; it follows falling edges more slowly than rising edges."""
+    """Return the heights that a first-order feedback reports along the lines. It follows falling edges more
+    slowly than rising edges.
+    """
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
     at = height[:, 0].copy()
@@ -103,7 +110,7 @@ def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> Array:
-    """Return the sum, in nm, of all contributions that do not depend on the surface."""
+    """Return the sum, in nm, of all contributions of the microscope that do not depend on the surface."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)
@@ -130,7 +137,9 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Add scars along the fast axis and single-pixel spikes, each with a random sign."""
+    """Return the heights with scars along the fast axis and spikes of a single pixel, each with a random
+    sign.
+    """
     scarred = height.copy()
     ny, nx = height.shape
     for _ in range(rng.poisson(scars_per_row * ny)):

@@ -1,4 +1,6 @@
-"""Simulate the exposure (hatch lines, slices, two-photon dose) with the effects of beam, galvo and field."""
+"""Simulate the exposure of the resist in hatch lines and slices, with effects of the beam, the galvo scanner
+and the write field.
+"""
 
 import numpy as np
 import scipy.ndimage
@@ -31,19 +33,19 @@ def accumulate_dose(
     order: float = 0.0,
     scan_index: int = 0,
 ) -> Array:
-    """Return the two-photon dose on a written canvas.
+    """Return the two-photon dose on the canvas. It is 1 in the middle of a wide block of the highest level.
 
-    The dose is 1 in the middle of a wide block of the highest level. Each row of the canvas is one hatch
-    line. In slice k, the laser is on where the level is at least k. Absorption is proportional to the squared
-    intensity of the spot, so the sum over the slices is ``level``, convolved with the squared spot.
+    Each row of the canvas is one hatch line. In slice k, the laser is on where the level is at least k.
+    Absorption is proportional to the squared intensity of the spot. The sum over all slices is therefore
+    ``level`` convolved with the squared intensity.
 
     Args:
         canvas: the canvas that is written.
-        printer: spot and slicing.
-        knobs: effects on the dose.
-        relative_dose: two-photon dose of this print relative to the dose of the recipe.
-        order: position in the print order, from −0.5 (first) to 0.5 (last).
-        scan_index: number of the scan, used for random draws that differ from scan to scan.
+        printer: the spot and the slices.
+        knobs: the effects beyond plain printing.
+        relative_dose: two-photon dose of this print relative to the nominal dose.
+        order: position in the order of printing, from −0.5 (first) to 0.5 (last).
+        scan_index: number of the print. Random draws that differ from print to print depend on it.
     """
     nominal = canvas.level / (printer.levels - 1)
     if strength := knobs["unseen-neighbours"]:
@@ -85,11 +87,14 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Write every point x of a hatch line at x + strength·x(1 − x/L), with 0 ≤ x ≤ L in the write field."""
+    """Return the nominal dose with every point x of a hatch line written at x + strength·x(1 − x/L) instead.
+
+    Here, x runs from 0 to L, the side of the write field.
+    """
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point x that is written at ``at`` solves x + strength·x(1 − x/L) = at. Of the two roots, it is the
-    # one that is 0 for at = 0.
+    # The point x that is written at ``at`` solves the equation x + strength·x(1 − x/L) = at. Of its two
+    # roots, x is the one that is 0 for at = 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
@@ -100,23 +105,22 @@ def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:
-    """Return the first canvas pixel of each write field along one axis.
+    """Return the first pixel of each write field along one axis of the canvas.
 
-    The outermost fields include the guard frame.
+    The first and the last write field include the guard frame.
     """
     return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Write a canvas (ny, nx) field by field, with a displacement for each field.
-
-    Doses add up where fields overlap.
+    """Return the nominal dose if every write field is displaced. Where fields overlap, their doses add up.
 
     Args:
-        starts: the first pixel row of each row of fields, and the first pixel column of each column of
-            fields.
-        offset_px: (y, x) displacement of every field, pixels; an array of shape (fields along y, fields along
-            x, 2). The dose of a displaced pixel is divided among the four pixels that it covers.
+        nominal: nominal dose on the canvas.
+        starts: the first rows of the fields along y, and the first columns of the fields along x, in pixels
+            of the canvas.
+        offset_px: displacements (y, x) of the fields in pixels, shape (fields along y, fields along x, 2).
+            The dose of a displaced pixel is divided among the four pixels that it covers.
     """
     written = np.zeros_like(nominal)
     ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
@@ -129,7 +133,7 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
 
 
 def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
-    """Return the relative dose over the write field."""
+    """Return the dose over the write field, relative to that at its centre."""
     if not (strength := knobs["vignetting"]):
         return 1.0
     y_um, x_um = canvas.field_offset_um()
@@ -138,9 +142,11 @@ def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
 
 
 def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the transfer function of the squared spot, including ellipticity, ghost spot and galvo lag."""
+    """Return the transfer function of the spot's squared intensity, with the effects of ellipticity, ghost
+    spot and galvo lag.
+    """
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
-    # The square of a Gaussian intensity is a Gaussian that is narrower by a factor of √2.
+    # The square of a Gaussian is a Gaussian that is narrower by a factor of √2.
     sigma_um = printer.spot_sigma_um / 2**0.5
     transfer = np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
     if strength := knobs["elliptical-psf"]:
@@ -158,7 +164,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Return the effective dose for a resist in which each slice must reach the threshold by itself."""
+    """Return the effective dose in a resist in which each slice must exceed the threshold by its own dose."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):
@@ -169,12 +175,16 @@ def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, pri
 
 
 def _soft_step(dose: Array) -> Array:
-    """Apply a logistic step that maps 0 exactly to 0, and 1 exactly to 1."""
+    """Return a logistic function of the dose, scaled so that it is exactly 0 at dose 0 and exactly 1 at dose
+    1.
+    """
     low, high = (1 / (1 + np.exp(-_SLICE_STEEPNESS * (edge - _SLICE_THRESHOLD))) for edge in (0.0, 1.0))
     return (1 / (1 + np.exp(-_SLICE_STEEPNESS * (dose - _SLICE_THRESHOLD))) - low) / (high - low)
 
 
 def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
-    """Return an exponentially weighted mean of the lines above, which were written earlier."""
+    """Return, for every line, the mean dose of the lines above it, which were written earlier. The weights
+    fall exponentially with the distance, with the decay length ``decay_um``.
+    """
     memory = np.exp(-pitch_um / decay_um)
     return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

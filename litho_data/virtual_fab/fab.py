@@ -1,4 +1,6 @@
-"""Define the fab, a printer and a microscope with knobs and noise, and print and scan one field with it."""
+"""Define the virtual fab (a printer and a microscope with their knobs and noise), and simulate the print and
+the scan of one field.
+"""
 
 from dataclasses import dataclass
 
@@ -15,7 +17,10 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs and noise, and an optional effect that is not a knob."""
+    """A virtual fab: a printer, a microscope, their knobs and noise, and the seed of all random draws.
+
+    ``cause`` is an optional effect of your own that is not a knob.
+    """
 
     printer: Printer
     microscope: Microscope
@@ -32,10 +37,10 @@ class FabScan:
     Args:
         job: the field that was printed and scanned.
         frame: the position of the scan on the layout.
-        height_um: heights that the microscope reports, float64 (ny, nx) of the scan.
+        height_um: heights that the microscope reports, in µm, float64 with the shape (ny, nx) of the scan.
         noiseless_um: the same heights without the default noise.
-        clean_um: the print without roughness, on the layout grid, µm.
-        surface_um: the print with its roughness, on the layout grid, µm.
+        clean_um: heights of the print without roughness, on the layout's grid, in µm.
+        surface_um: heights of the print with its roughness, on the layout's grid, in µm.
     """
 
     job: Job
@@ -47,7 +52,7 @@ class FabScan:
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
-    """Print and scan one field; the result depends only on the fab and the job, and not on other fields."""
+    """Print and scan one field. The result depends only on the fab and the job, and not on other fields."""
     geometry_seed, _, instrument_seed = _seeds(fab, job.index)
     roughness_seed = _seeds(fab, job.printed)[1]
     frame = place_scan(
@@ -79,5 +84,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Return the seeds for the scan's position, the surface's roughness and the microscope's noise."""
+    """Return three seeds for the scan or print with the number ``index``: for the scan's position, for the
+    roughness of the surface, and for the noise of the microscope.
+    """
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

@@ -1,8 +1,9 @@
-"""Simulate films that are exposed by an electron beam or through a lens, then etched and imaged by SEM.
+"""Simulate films that are exposed by an electron beam or through a lens, then etched, and imaged in a
+scanning electron microscope.
 
-The simulation shares no code with the models. Electron scattering is computed as a product of spectra. The
-image behind a lens is the sum of the images from all points of the light source. Etching shifts all edges by
-the same distance.
+The simulation shares no code with the models that are tested on it. Electron scattering is a convolution,
+computed as a product of spectra. The image behind a lens is the mean of the images that the single points of
+the light source make. Etching shifts all edges by the same distance.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# Pixels per layout pixel, along each axis, of the micrograph and of the image in which edges are located, and
-# the padding of this image.
+# Number of pixels per layout pixel, along each axis, in the micrograph and in the image in which edges are
+# located, and the number of pixels by which this image is padded.
 _FINER, _AROUND = 4, 64
-# Width of the rim of a random layout that has no film, px.
+# Width, in px, of the rim without film around a random layout.
 _RIM_PX = 12
 _RESIST = 30.0
-# Number of points across the source. With 9 points, edges are displaced by 1.5 nm; with 21 points, by 0.5 nm.
+# Number of points across the light source. With 9 points, the numerical error displaces edges by 1.5 nm; with
+# 21 points, by 0.5 nm.
 _SOURCE_POINTS = 21
 _CARD = """name = "virtual-{process}"
 title = "Simulated films of the process {process}, with simulated micrographs"
@@ -53,16 +55,16 @@ surround = "unknown"
 
 @dataclass(frozen=True)
 class FilmKnobs:
-    """Effects of a film process beyond plain printing; lengths are in µm.
+    """The effects that can be added to the plain process of a film. Lengths are in µm.
 
     Attributes:
-        backscatter: backscattered electrons (or stray light), relative to the dose.
-        backscatter_um: range of the backscattered electrons.
-        diffusion_um: standard deviation of the diffusion of the exposed species.
-        etch_bias_um: outward shift of every edge.
+        backscatter: dose from backscattered electrons (or from stray light), relative to the direct dose.
+        backscatter_um: range of the backscattered electrons, as the standard deviation of a Gaussian.
+        diffusion_um: standard deviation of the diffusion of the exposed species in the resist.
+        etch_bias_um: outward shift of every edge by etching.
         defocus_um: defocus of the lens.
         dose_error: relative error of the dose.
-        charging: relative change of brightness across a micrograph.
+        charging: relative change of the brightness from the middle of a micrograph to its right edge.
     """
 
     backscatter: float = 0.0
@@ -76,8 +78,17 @@ class FilmKnobs:
 
 @dataclass(frozen=True)
 class FilmPrinter:
-    """A machine that prints films, described by its process, pixel pitch, beam (standard deviation) or lens,
-    film thickness and resist threshold.
+    """A machine that prints films, and its resist.
+
+    Attributes:
+        process: exposure by an electron beam or by projection through a lens.
+        pitch_um: pitch of the layout's pixels.
+        spot_um: standard deviation of the electron beam.
+        film_um: thickness of the film.
+        threshold: dose above which film remains, relative to the dose of a large exposed area.
+        wavelength_um: wavelength of the light, for projection.
+        na: numerical aperture of the lens.
+        source: radius of the light source relative to the aperture of the lens (partial coherence).
     """
 
     process: Literal["e-beam", "projection"]
@@ -91,7 +102,7 @@ class FilmPrinter:
 
     @property
     def resolved_um(self) -> float:
-        """Return the width of the smallest feature that the beam or lens resolves."""
+        """Return the width, in µm, of the smallest feature that the beam or the lens resolves."""
         return self.spot_um if self.process == "e-beam" else 0.25 * self.wavelength_um / self.na
 
 
@@ -102,10 +113,10 @@ FILM_PRINTERS = {
 
 
 class FilmTruth(Result):
-    """The record ``films.json``.
+    """The record ``films.json`` of simulated films.
 
-    Next to it, one file ``<id>.npy`` per film contains the distances from the edge of the film, in layout
-    pixels.
+    In the same folder, a file ``<id>.npy`` for each film contains the distances from the edge of the film, in
+    layout pixels.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
@@ -119,7 +130,7 @@ class FilmTruth(Result):
 
 
 def film_knobs(words: Iterable[str]) -> FilmKnobs:
-    """Make knobs from words ``name=value``.
+    """Make the knobs of a film from texts ``name=value``.
 
     Raises:
         InputError: a name is unknown, or a value is not a number.
@@ -135,9 +146,10 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Return the distance from the edge of the film, at 4 × 4 points in each pixel of a binary layout.
+    """Return the distance from the nearest edge of the film, at 4 × 4 points in each pixel of a layout of 0
+    and 1.
 
-    Distances are in layout pixels and positive on the film. The layout is periodic.
+    Distances are in layout pixels and positive on the film. The layout is continued periodically.
     """
     pitch = printer.pitch_um
     written = np.asarray(level, float)
@@ -153,7 +165,7 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
         turned = 1 / (1 + np.exp(-_RESIST * (field - threshold)))
         field, threshold = blur(turned, pitch, knobs.diffusion_um), 0.5
     fine = zoom(field, _FINER, order=3, mode="grid-wrap", grid_mode=True) > threshold
-    # Edges beyond the border count too, because the layout continues there.
+    # The nearest edge may lie beyond the border, because the layout continues there.
     fine = np.pad(fine, _AROUND, mode="wrap")
     inside, outside = distance_transform_edt(fine), distance_transform_edt(~fine)
     distance = np.where(fine, inside - 0.5, 0.5 - outside)[_AROUND:-_AROUND, _AROUND:-_AROUND]
@@ -161,7 +173,9 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
 
 
 def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
-    """Return the electron micrograph of a film, uint8, with bright rims, charging along x, and noise."""
+    """Return the electron micrograph of a film as uint8. It has bright rims, a change of brightness along x
+    by charging, and noise.
+    """
     film = 1 / (1 + np.exp(-_FINER * distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(_FINER * distance_px, 0) / 12))
     grey = grey * (1 + knobs.charging * np.linspace(-1, 1, distance_px.shape[1]))
@@ -177,13 +191,21 @@ def simulate_films(
     seed: int = 0,
     knobs: FilmKnobs = FilmKnobs(),
 ) -> Path:
-    """Simulate films of random layouts and their micrographs; return the path of the card.
+    """Simulate films of random layouts and their micrographs, and return the path of the dataset card.
 
-    ``out/raw`` contains what a laboratory would deliver; ``out/truth`` contains the knobs and the distances
-    from the edges.
+    The folder ``out/raw`` contains what a laboratory would deliver: the card, the layouts and the
+    micrographs. The folder ``out/truth`` contains the knobs and the distances from the films' edges.
+
+    Args:
+        out: folder of the run.
+        process: ``e-beam`` or ``projection``.
+        count: number of films.
+        size_px: side of each layout in pixels.
+        seed: seed of all random draws.
+        knobs: effects beyond the plain process.
 
     Raises:
-        InputError: the process is unknown, or the folder contains other files.
+        InputError: the process is unknown, or the folder contains a run with other settings or other files.
     """
     import cv2
 
@@ -195,7 +217,7 @@ def simulate_films(
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)
-        # Each field lies alone on bare ground. Its periodic copies are too far away to matter.
+        # Bare ground around each field keeps its periodic copies so far away that they do not matter.
         longest_um = max(8 * printer.resolved_um, 3 * knobs.backscatter_um * (knobs.backscatter > 0))
         bare_px = math.ceil(longest_um / 2 / printer.pitch_um)
         inner = (slice(_FINER * bare_px, -_FINER * bare_px),) * 2
@@ -216,10 +238,10 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """Make a random layout of 0 and 1, uint8 (ny, nx), with a bare rim and features that the process can
-    resolve.
+    """Return a random layout of 0 and 1 as uint8 of the given shape (ny, nx). It has a rim of 0, and features
+    that the process can resolve.
 
-    A larger value of ``finer`` makes the features smaller; the films of a run use 0, 1 and 2 in turn.
+    A larger ``finer`` makes the features smaller. The films of a run use 0, 1 and 2 in turn.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)
@@ -230,8 +252,8 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
-    """Return the intensity of the image of a mask, averaged over the points of a round source. The intensity
-    is 1 for an open mask.
+    """Return the intensity of a mask's image behind the lens, averaged over the points of a round light
+    source. For an open mask, the intensity is 1.
     """
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)

@@ -1,4 +1,4 @@
-"""Find where the pixels of a scan lie on the print."""
+"""Place a scan on the print, and sample the print's surface at the pixels of the scan."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ _REFERENCE_PX = 512
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """The frame of one scan.
+    """The size of a scan, and its position on the layout.
 
     Args:
-        shape: (ny, nx) of the scan.
-        pitch_um: nominal pixel pitch, µm.
-        scan_to_layout: 3×3 matrix that maps (x_um, y_um, 1) of the scan to the layout.
-        layout_pitch_um: pitch of the layout and of the canvas around it, µm.
+        shape: shape (ny, nx) of the scan, in pixels.
+        pitch_um: nominal pitch of the scan's pixels in µm.
+        scan_to_layout: 3×3 matrix that maps positions (x_um, y_um, 1) of the scan to positions in the layout.
+        layout_pitch_um: pitch of the layout, and of the canvas around it, in µm.
     """
 
     shape: Shape
@@ -31,12 +31,12 @@ class ScanFrame:
 
     @property
     def size_um(self) -> YX:
-        """Return the nominal (y, x) extent of the scan, µm."""
+        """Return the nominal side lengths (y, x) of the scan in µm."""
         return self.shape[0] * self.pitch_um, self.shape[1] * self.pitch_um
 
     @property
     def unit_axes(self) -> tuple[Array, Array]:
-        """Return (y, x) coordinates from −1 to 1 over the scan, as broadcastable arrays."""
+        """Return coordinates y and x that run from −1 to 1 over the scan, with shapes (ny, 1) and (1, nx)."""
         return np.linspace(-1, 1, self.shape[0])[:, None], np.linspace(-1, 1, self.shape[1])[None, :]
 
 
@@ -48,10 +48,16 @@ def place_scan(
     turned_deg: float = 0.0,
     pixel_size: float = 1.0,
 ) -> ScanFrame:
-    """Centre a scan on the layout, then add a small random shift, rotation, shear and anisotropic scale.
+    """Return the frame of a scan. The scan is centred on the layout except for a small random shift, and has
+    a small random rotation, shear and scale error along each axis.
 
-    ``turned_deg`` is the rotation of the print under the microscope, in addition to the small random
-    rotation. ``pixel_size`` is the pixel size of the scan, in pixels of the layout.
+    Args:
+        layout_shape: shape (ny, nx) of the layout.
+        pitch_um: pitch of the layout in µm.
+        microscope: the largest random errors, and the margin of the scan.
+        rng: random generator for the errors.
+        turned_deg: rotation of the print under the microscope, in addition to the random rotation.
+        pixel_size: size of the scan's pixels, in pixels of the layout.
     """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
@@ -74,8 +80,8 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """Interpolate a surface on the canvas at the pixels of the scan. The result has the shape
-    ``frame.shape``.
+    """Return the heights of a surface, given on the canvas, at the pixels of the scan. The result has the
+    shape ``frame.shape``.
     """
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
@@ -95,9 +101,12 @@ def sample_surface(
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
-    """Draw a random second-order polynomial without an affine part; its rms is 1 on average."""
+    """Draw a random polynomial of degree 2 without an affine part, at the pixels of the scan. Its mean square
+    is 1 on average.
+    """
     y, x = frame.unit_axes
     c = rng.standard_normal(3)
-    # Over the square, the two Legendre terms have a variance of 1/5 each, and the product one of 1/9.
+    # Over the square, each of the two Legendre terms has a variance of 1/5, and the product xy has one of
+    # 1/9.
     terms = (c[0] * (1.5 * x**2 - 0.5) * 5**0.5, c[1] * (1.5 * y**2 - 0.5) * 5**0.5, c[2] * 3 * x * y)
     return (terms[0] + terms[1] + terms[2]) / 3**0.5

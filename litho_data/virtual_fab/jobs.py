@@ -1,4 +1,6 @@
-"""Define the fields of a run: random layouts in print blocks, and reference fields for a noise analysis."""
+"""Make the jobs of a run, one for each field to print and scan. The layouts are random or come from a card,
+and reference fields for a noise analysis can be added.
+"""
 
 import re
 from collections.abc import Iterator
@@ -16,25 +18,26 @@ from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Printer
 
-# Columns of a card's table that say how a scan was made.
+# The columns of a card's table that state how a scan was made.
 SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
-# Cut-offs of the random layouts, which successive prints use in turn.
+# Cut-off frequencies of the random layouts, in cycles/µm. Successive prints use them in turn.
 _CUTOFFS_PER_UM = (0.25, 0.5)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Fields to print with random layouts.
+    """A set of fields with random layouts to print.
 
     Args:
         count: number of fields.
-        size_px: (ny, nx) of a layout.
-        fields_per_print: number of fields in one print block.
-        write_field_um: side of the write field that all fields of a print share. None places each field at
-            the centre of a write field of its own.
-        references: whether to add print 0: a bare substrate, a flat print and a five-step print.
+        size_px: shape (ny, nx) of each layout, in pixels.
+        fields_per_print: number of fields in each print.
+        write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
+            field lies at the centre of a write field of its own.
+        references: whether to add print 0, which consists of a bare substrate, a flat print and a staircase
+            of five steps.
     """
 
     count: int = 12
@@ -54,18 +57,22 @@ class Plan:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
 
     def scan_id(self, block: int, field: int) -> str:
-        """Return the name of a field, with zero-padded numbers, so that sorted names are in print order."""
+        """Return the name of a field. Its numbers are padded with zeros, so that sorted names are in the
+        order of printing.
+        """
         blocks = -(-self.count // self.fields_per_print)
         return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
 
     @property
     def total(self) -> int:
-        """Return the number of scans, including references."""
+        """Return the number of scans, including those of reference fields."""
         return self.count + 3 * self.references
 
 
 def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
-    """Yield the fields of a plan in print order; each field depends only on the seed and its own number."""
+    """Yield the jobs of a plan in the order of printing. Each layout depends only on the seed and the number
+    of its field.
+    """
     for index in range(plan.count):
         block, field = divmod(index, plan.fields_per_print)
         yield Job(
@@ -87,7 +94,9 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
 
 
 def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
-    """Return the (y, x) centre of a field in the shared write field, which is filled row by row."""
+    """Return the centre (y, x) of a field in the write field of its print, in µm from the write field's
+    centre. The fields of a print fill the write field row by row.
+    """
     if plan.write_field_um is None:
         return 0.0, 0.0
     side = int(np.ceil(plan.fields_per_print**0.5))
@@ -103,8 +112,8 @@ def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
 
 
 def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
-    """Yield jobs for a bare substrate, a flat print of the middle level, and a staircase with steps of one
-    level.
+    """Yield the jobs of the reference fields: a bare substrate, a flat print of the middle level, and a
+    staircase of five steps, each one level high.
     """
     middle = (printer.levels - 1) // 2
     flat = np.full(plan.size_px, middle, np.uint8)
@@ -116,19 +125,19 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Make jobs that print and scan the layouts of a dataset card in the way that its table states.
+    """Make the jobs that print and scan the layouts of a dataset card, in the way that its table states.
 
-    The table may state how each scan was made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``). Rows
-    with the same print and layout are then scans of the same printed field.
+    The table may state for each scan how it was made, in the columns ``turned_deg``, ``direction``, ``tip``
+    and ``pixel_size``. Rows with the same print and the same layout are then scans of one printed field.
 
     Args:
         path: path of the card.
-        first: number of the first scan. The random values for a scan or print depend on its number.
-        printer: the printer to use; the default printer if None.
+        first: number of the first scan. The random draws for a scan or a print depend on its number.
+        printer: the printer; None stands for the default printer.
 
     Raises:
-        InputError: the card is invalid or has no layout files, or the pitch or level height of the printer
-            differs from that of the layouts.
+        InputError: the card is invalid or has no layout files, or the pitch or level height in the card
+            differs from that of the printer.
     """
     card = load_card(path)
     printer = printer or Printer()

@@ -1,4 +1,6 @@
-"""Define all knobs (effects beyond plain printing) with their units, ranges and names in the catalogue."""
+"""Define the knobs, which are the effects that the virtual fab can add to plain printing. Each has a unit, a
+range and a name in the catalogue of effects.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,20 @@ OFF_CATALOGUE = "off-catalogue"
 
 @dataclass(frozen=True)
 class Knob:
-    """One effect that the fab can add; with strength 0, every bit of the result is unchanged.
+    """One effect that the virtual fab can add. With strength 0, the result is exactly that without the knob.
 
     Args:
-        name: name on the command line and in the truth file.
-        effect: identifier in the effects catalogue, or `off-catalogue`.
-        stage: the stage at which the effect acts.
-        role: whether the effect belongs to the print, to the microscope, or to chance.
+        name: name of the knob on the command line and in the truth file.
+        effect: name of the effect in the catalogue of effects, or `off-catalogue` if it is not listed there.
+        stage: the stage of printing or scanning at which the effect acts.
+        role: what causes the effect: the process, the measurement, chance (``nuisance``), or an unknown one
+            of the first two (``undetermined``).
         unit: unit of the strength.
-        limit: largest meaningful strength.
-        meaning: what a strength of one unit does, and what is drawn with the seed.
-        nuisance_span: True if offset, gain, plane and bow of each scan absorb nearly all of the effect.
-        refit_absorbs: True if other parameters of the plain printing model imitate most of the effect.
+        limit: largest strength that is accepted.
+        meaning: what the strength means, and what the seed draws.
+        nuisance_span: True if the offset, gain, plane and bow fitted to each scan absorb nearly all of the
+            effect.
+        refit_absorbs: True if other parameters of the plain model of printing can imitate most of the effect.
     """
 
     name: str
@@ -45,13 +49,13 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """Return the largest strength as text, followed by its unit unless the unit is 1."""
+        """Return the largest strength as text with its unit, or without a unit if the unit is 1."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob set to a strength; without a seed of its own, it uses the seed of the run."""
+    """A knob set to a strength. If ``seed`` is None, its random draws use the seed of the run."""
 
     name: str
     strength: float
@@ -59,7 +63,7 @@ class KnobSetting:
 
     @classmethod
     def parse(cls, text: str) -> KnobSetting:
-        """Parse ``name=strength`` or ``name=strength@seed``.
+        """Make a setting from a text ``name=strength`` or ``name=strength@seed``.
 
         Raises:
             InputError: the text has another form, the name is unknown, or the strength is out of range.
@@ -77,7 +81,11 @@ class KnobSetting:
 
 
 def checked(setting: KnobSetting) -> KnobSetting:
-    """Return the setting unchanged; raise InputError for an unknown knob or a value out of range."""
+    """Return the setting unchanged if it is valid.
+
+    Raises:
+        InputError: there is no knob of this name, or its strength or seed is out of range.
+    """
     knob = KNOBS.get(setting.name)
     if knob is None:
         raise unknown_name("knob", setting.name, KNOBS, "`litho-data simulate --list-knobs` explains all")
@@ -91,7 +99,7 @@ def checked(setting: KnobSetting) -> KnobSetting:
 
 
 class KnobBoard:
-    """The knobs of one run: strengths, and a separate random stream per knob."""
+    """The knobs of one run: their strengths, and a separate stream of random numbers for each."""
 
     def __init__(self, settings: Iterable[KnobSetting], run_seed: int):
         self.settings = tuple(checked(setting) for setting in settings)
@@ -104,15 +112,17 @@ class KnobBoard:
         return self._strength.get(KNOBS[name].name, 0.0)
 
     def any(self, *names: str) -> bool:
-        """Return whether any of these knobs has a strength other than zero."""
+        """Return whether any of the named knobs has a strength other than zero."""
         return any(self[name] for name in names)
 
     def machine_rng(self, name: str) -> np.random.Generator:
-        """Return the knob's random generator for properties of the machine, the same for every scan."""
+        """Return the knob's random generator for properties of the machine. It gives the same numbers for
+        every scan.
+        """
         return self._rng(name, 0)
 
     def scan_rng(self, name: str, scan_index: int) -> np.random.Generator:
-        """Return the knob's random generator for one scan, different for every scan."""
+        """Return the knob's random generator for one scan. It gives different numbers for every scan."""
         return self._rng(name, scan_index + 1)
 
     def _rng(self, name: str, stream: int) -> np.random.Generator:
@@ -120,4 +130,4 @@ class KnobBoard:
 
 
 KNOBS: dict[str, Knob] = {one["name"]: Knob(**one) for one in table_beside(__file__, "knobs.toml")["knob"]}
-"""All knobs by name, in the order in which they are listed; they are defined in ``knobs.toml``."""
+"""All knobs by name, in the order in which ``knobs.toml`` defines them."""

@@ -1,4 +1,4 @@
-"""Simulate the print of one field, from the layout to the dry surface."""
+"""Simulate the printing of one field, from the layout to the dried surface."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from litho_data.virtual_fab.resist import develop
 from litho_data.virtual_fab.settings import Noise, Printer
 
 _SUBSTRATE_GRAIN_UM = 0.3
-# Height of a calibration grating with a square profile, and width of its flanks.
+# Height of a calibration grating with a square profile, and width of its flanks, in µm.
 _GRATING_UM, _FLANK_UM = 0.5, 0.2
 
 
@@ -25,22 +25,22 @@ class Job:
 
     Args:
         id: name of the scan.
-        level: uint8 layout, shape (ny, nx).
-        index: number of the scan in its set, on which its random values depend.
-        order: position in the print order, from −0.5 (first) to 0.5 (last).
-        dose: two-photon dose relative to the dose of the recipe.
-        field_um: (y, x) centre of the layout in its write field, µm.
-        write_field_um: side of the write field, µm; None for a field as large as the layout.
-        use: purpose of the scan. Nothing is printed for ``substrate`` or for ``grating``, a calibration
-            standard.
-        grating_um: period of the grating, µm.
-        print_index: number of the print in its set, if prints are scanned more than once. None means that
-            ``index`` is also the number of the print.
-        turned_deg: rotation of the print under the microscope, a multiple of 90.
-        direction: 1 for trace, -1 for retrace.
-        tip: number of the tip; every tip after the first is new and sharp.
-        pixel_size: pixel size of the scan, in pixels of the layout. The time per pixel does not depend on
-            this size.
+        level: levels of the layout, uint8 of shape (ny, nx).
+        index: number of the scan in its set. The random draws for the scan depend on it.
+        order: position in the order of printing, from −0.5 (first) to 0.5 (last).
+        dose: two-photon dose relative to the nominal dose.
+        field_um: centre (y, x) of the layout in its write field, in µm from the write field's centre.
+        write_field_um: side of the write field in µm. With None, the write field is as large as the layout.
+        use: purpose of the scan. For ``substrate`` and ``grating`` (a calibration standard), nothing is
+            printed.
+        grating_um: period of the grating in µm.
+        print_index: number of the print in its set, for prints that are scanned more than once. With None,
+            the number of the print is ``index``.
+        turned_deg: rotation of the print under the microscope in degrees, a multiple of 90.
+        direction: direction of the scan lines, 1 for trace and -1 for retrace.
+        tip: number of the tip. Tip 1 is as blunt as the knobs state; every later tip is new and sharp.
+        pixel_size: size of the scan's pixels, in pixels of the layout. The scan spends the same time on a
+            pixel of any size.
     """
 
     id: str
@@ -60,41 +60,47 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Return the number of the print.
-
-        The random values of the print depend on this number, and the random values of the scan depend on
-        ``index``.
+        """Return the number of the print. The random draws for the print depend on this number, and those for
+        the scan on ``index``.
         """
         return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Return the layout with its guard frame, placed in its write field."""
+        """Return the canvas of the field: the layout with its guard frame, and its place in the write
+        field.
+        """
         side_um = self.write_field_um or max(self.level.shape) * pitch_um
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
 
 
 class Cause:
-    """Base class for an effect of your own that is not a knob; the base class changes nothing.
+    """Base class for effects of your own that are not knobs. The base class itself changes nothing.
 
-    A subclass overrides one or more stages. A stage may depend only on its arguments, because a field may be
-    printed and scanned more than once.
+    A subclass overrides one or more of the methods. Their results may depend only on their arguments, because
+    a field may be printed and scanned more than once.
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:
-        """Change the two-photon dose on the canvas; 1 is the full dose, and no dose is negative."""
+        """Return the changed two-photon dose on the canvas. The full dose is 1, and no dose may be
+        negative.
+        """
         return dose
 
     def on_surface(self, surface_um: Array, canvas: Canvas, job: Job) -> Array:
-        """Change the dry surface without roughness, on the canvas, µm."""
+        """Return the changed heights of the dried surface without roughness, on the canvas, in µm."""
         return surface_um
 
     def on_scan(self, height_um: Array, frame: ScanFrame, job: Job) -> Array:
-        """Change the true surface at the pixels of the scan, µm, before the microscope adds its errors."""
+        """Return the changed true heights at the pixels of the scan, in µm, before the microscope adds its
+        errors.
+        """
         return height_um
 
 
 def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> Array:
-    """Return the surface of one print without roughness, on the canvas, µm; a bare substrate is 0."""
+    """Return the heights of one print without roughness, on the canvas, in µm. A bare substrate has height
+    0.
+    """
     cause = cause or Cause()
     canvas = job.canvas(printer.pitch_um)
     if job.use == "substrate":
@@ -116,7 +122,9 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
 
 
 def _bars(at_um: Array, period_um: float) -> Array:
-    """Return a profile that is 1 on bars half a period wide and 0 between the bars, with straight flanks."""
+    """Return the profile of a grating at the given positions. It is 1 on bars that are half a period wide,
+    and 0 between the bars. The flanks are straight lines.
+    """
     away_um = np.abs(at_um % period_um - period_um / 2)
     return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
 
@@ -124,7 +132,7 @@ def _bars(at_um: Array, period_um: float) -> Array:
 def surface_noise(
     job: Job, printer: Printer, noise: Noise, knobs: KnobBoard, rng: np.random.Generator
 ) -> Array:
-    """Return the roughness of the surface, on the canvas, µm."""
+    """Return the heights of the surface's roughness, on the canvas, in µm."""
     canvas = job.canvas(printer.pitch_um)
     shape = canvas.level.shape
     if job.use in ("substrate", "grating"):

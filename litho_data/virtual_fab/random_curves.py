@@ -1,28 +1,31 @@
-"""Draw random shapes: Perlin curves, smooth maps, and roughness with a given spectrum."""
+"""Draw random curves and maps: Perlin noise, smooth maps, and roughness with a given spectrum."""
 
 import numpy as np
 
 from litho_data.foundation import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
-# The spectrum of the fine residual of the measured prints. It consists of a band, whose line-shaped features
-# are 0.45 µm apart across the hatch lines, and a slower part. Both parts vary slowly along the hatch lines.
+# The spectrum of the fine structure in the measured prints that models do not explain. Across the hatch
+# lines, it consists of a band around a period of 0.45 µm and a part with longer periods. Along the hatch
+# lines, both parts vary slowly.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# A spot of 0.2 µm writes no structure along the line that is smaller than this.
+# Sigma of a blur along the lines, because a spot of 0.2 µm writes no finer structure there.
 _SMOOTH_UM = 0.06
 
 
 def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
-    """Draw line-shaped roughness (ny, nx) along x with a mean variance of 1."""
+    """Draw roughness shaped like lines along x, with the given shape (ny, nx). Its variance is 1 on
+    average.
+    """
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
 
 def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
-    """Return the power spectrum of `line_roughness` on the half plane, in arbitrary units."""
+    """Return the power spectrum of ``line_roughness`` at the frequencies of rfft2, in arbitrary units."""
     frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
     band = np.exp(-((np.abs(frequency_y) - _BAND_PER_UM) ** 2) / (2 * _BAND_WIDTH_PER_UM**2))
     slow = np.exp(-(frequency_y**2) / (2 * _SLOW_WIDTH_PER_UM**2))
@@ -34,11 +37,13 @@ def line_roughness_psd(shape: Shape, pitch_um: float) -> Array:
 
 
 def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
-    """Draw a Gaussian random field with a power spectrum given on the half plane.
+    """Draw a Gaussian random field with the given shape (ny, nx) and power spectrum. Its variance is 1 on
+    average.
 
-    The variance of the field is 1 on average.
+    ``psd`` contains the power at the frequencies of rfft2, in any units.
     """
-    # Except for column 0 and the Nyquist column, each column represents two frequencies of the full plane.
+    # Each column of rfft2 represents two columns of the full spectrum, except column 0 and the Nyquist
+    # column.
     doubled = np.full(psd.shape[1], 2.0)
     doubled[0] = 1.0
     if shape[1] % 2 == 0:
@@ -48,7 +53,9 @@ def gaussian_field(psd: Array, rng: np.random.Generator, shape: Shape) -> Array:
 
 
 def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw one-dimensional Perlin noise within ±1, with the shape of ``position_um``."""
+    """Draw one-dimensional Perlin noise between -1 and 1, at the given positions. The result has the shape of
+    ``position_um``.
+    """
     slopes = rng.uniform(-1, 1, 1024)
     cell, inside = np.divmod(position_um / period_um, 1.0)
     left = cell.astype(int) % slopes.size
@@ -59,7 +66,9 @@ def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator)
 
 
 def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw a random sum of eight plane waves with periods near ``period_um``; the mean variance is 1."""
+    """Draw a sum of eight plane waves with random directions and phases, and periods near ``period_um``. Its
+    variance is 1 on average.
+    """
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)
     phase = rng.uniform(0, 2 * np.pi, waves)

@@ -1,4 +1,4 @@
-"""Simulate the resist and its development: conversion, diffusion, shrinkage, losses and residues."""
+"""Simulate the resist and its development: conversion, diffusion, shrinkage, loss of material and residue."""
 
 import numpy as np
 import scipy.ndimage
@@ -13,13 +13,16 @@ _NARROW_UM = 1.5
 
 
 def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the height of the developed and dried print above the zero of the scans, µm.
+    """Return the heights, in µm, of the developed and dried print above the zero of the scans, on the canvas.
 
-    The conversion of a column of resist is a logistic function of its dose. On drying, a denser polymer
-    network shrinks less.
+    The conversion of a column of resist is a logistic function of its dose. When the print dries, a denser
+    polymer network shrinks less.
 
     Args:
-        dose: two-photon dose on the canvas; 1 is the full dose.
+        dose: two-photon dose on the canvas; the full dose is 1.
+        canvas: the canvas that was written.
+        printer: the properties of the resist.
+        knobs: the effects beyond plain printing.
     """
     conversion = _convert(dose, printer, knobs["threshold-softness"])
     if strength := knobs["diffusion-blur"]:
@@ -44,7 +47,9 @@ def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> 
 
 
 def _convert(dose: Array, printer: Printer, extra_steepness: float) -> Array:
-    """Apply a logistic conversion, shifted and scaled so that it is 0 without dose and 1 at full dose."""
+    """Return the conversion of the resist, a logistic function of the dose. The function is shifted and
+    scaled so that the conversion is 0 without dose and 1 at full dose.
+    """
     steepness = printer.threshold_steepness * (1 + extra_steepness)
 
     def logistic(at: Array | float) -> Array:
@@ -54,7 +59,9 @@ def _convert(dose: Array, printer: Printer, extra_steepness: float) -> Array:
 
 
 def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Return a random tilt and bow over the write field, scaled so that no value exceeds 1."""
+    """Return the sum of a random tilt and a random bow over the write field, scaled so that it does not
+    exceed 1 there.
+    """
     rng = knobs.machine_rng("field-curvature")
     y_um, x_um = canvas.field_offset_um()
     half_um = canvas.write_field_um / 2
@@ -64,7 +71,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Apply the additional shrinkage that the knobs cause, beyond that of plain drying."""
+    """Return the heights after the shrinkage that the knobs add to that of plain drying."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:
@@ -81,7 +88,9 @@ def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, 
 
 
 def _lose_and_leave(height: Array, canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Apply the effects of capillary forces and developer on narrow features and steep flanks."""
+    """Return the heights after the effects of capillary forces and of the developer on narrow features and
+    steep flanks.
+    """
     window_px = 2 * round(_NARROW_UM / canvas.pitch_um / 2) + 1
     if strength := knobs["feature-collapse"]:
         surroundings = scipy.ndimage.grey_opening(height, size=(window_px, window_px), mode="nearest")

@@ -1,4 +1,6 @@
-"""Define the settings of the plain fab (printer, microscope, default noise) and the named presets of runs."""
+"""Define the settings of the virtual fab without knobs (printer, microscope and default noise), and named
+presets of runs.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,23 @@ from litho_data.foundation import Shape, require_known, table_beside
 
 @dataclass(frozen=True)
 class Printer:
-    """A two-photon printer and its resist.
+    """A two-photon printer and its resist. Lengths are in µm.
 
     Args:
-        pitch_um: hatch pitch, which is also the pitch of the layout, µm.
-        level_height_um: slice height, µm.
-        levels: number of levels; the tallest column has ``levels - 1`` slices.
-        spot_sigma_um: sd of the focal *intensity*, µm. Two-photon absorption is proportional to the square
-            of the intensity, whose sd is smaller by a factor of √2 (0.2 µm).
-        threshold_dose: dose at which conversion rises fastest, as a share of the full column's dose.
-        threshold_steepness: slope parameter of the logistic conversion curve, per full dose.
-        network_reach_um: sd of the neighbourhood whose conversion determines how much a column shrinks, µm.
-        loose_retention: share of its height that an isolated, loose network keeps; a dense network keeps its
-            whole height.
-        base_um: height of the base layer's surface above the zero of the scans, µm.
-        stitch_field_um: side of the fields into which a larger layout is divided for writing, µm; the knob
+        pitch_um: distance between hatch lines, which is also the pitch of the layout.
+        level_height_um: height of a slice.
+        levels: number of levels. The highest column has ``levels - 1`` slices.
+        spot_sigma_um: standard deviation of the *intensity* in the focus. Two-photon absorption is
+            proportional to the squared intensity, whose standard deviation is smaller by a factor of √2
+            (0.2 µm by default).
+        threshold_dose: dose at which the conversion of the resist rises fastest, as a share of the full dose.
+        threshold_steepness: steepness of the logistic curve of conversion against dose, per full dose.
+        network_reach_um: standard deviation of the Gaussian neighbourhood whose mean conversion determines
+            how much a column shrinks.
+        loose_retention: share of its height that a column keeps if nothing around it is converted. Where
+            everything around it is converted, a column keeps its whole height.
+        base_um: height of the base layer's surface above the zero of the scans.
+        stitch_field_um: side of the write fields into which a larger layout is divided. The knob
             ``stitching`` displaces these fields.
     """
 
@@ -41,23 +45,24 @@ class Printer:
 
     @property
     def full_height_um(self) -> float:
-        """Return the nominal height of the highest level, µm."""
+        """Return the nominal height of the highest level in µm."""
         return (self.levels - 1) * self.level_height_um
 
 
 @dataclass(frozen=True)
 class Microscope:
-    """A microscope: the margin of its scans, and a small affine error that is drawn for each scan.
+    """A microscope, whose scans have a margin around the layout and a small affine error that is drawn for
+    each scan.
 
     Args:
-        margin_px: number of pixels by which a scan extends beyond the layout on each side, per 512 px of
-            layout.
-        rotation_deg: largest rotation angle, degrees.
-        scale: largest relative error of each lateral scale.
-        shear: largest shear.
-        shift_um: largest shift along each axis, µm.
-        files: format of the scan files, either ``text-matrix`` (only heights, in metres) or ``gsf`` (with
-            size and unit).
+        margin_px: number of pixels by which a scan extends beyond the layout on each side, for a layout of
+            512 px. It grows in proportion to the layout.
+        rotation_deg: largest random rotation, in degrees.
+        scale: largest relative error of the scale of each axis.
+        shear: largest random shear.
+        shift_um: largest random shift along each axis, in µm.
+        files: format of the scans' files. ``text-matrix`` contains only heights, in metres; ``gsf`` also
+            contains the size and the unit.
     """
 
     margin_px: float = 14.0
@@ -69,23 +74,25 @@ class Microscope:
 
     @classmethod
     def aligned(cls) -> Microscope:
-        """Return a microscope without warp, whose scan pixels coincide with layout pixels."""
+        """Return a microscope without affine errors. The pixels of its scans coincide with those of the
+        layout.
+        """
         return cls(rotation_deg=0.0, scale=0.0, shear=0.0, shift_um=0.0)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """The default noise, as standard deviations in nm.
+    """The standard deviations of the default noise, in nm.
 
-    On a flat print, the noise is the quadrature sum of ``roughness_nm``, ``line_nm`` and ``pixel_nm``. On a
-    bare substrate, it is that of ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
+    On a flat print, the total noise is the root of the sum of the squares of ``roughness_nm``, ``line_nm``
+    and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of ``roughness_nm``.
 
     Args:
-        roughness_nm: line-shaped roughness of printed surfaces.
+        roughness_nm: roughness of printed surfaces, shaped like hatch lines.
         substrate_nm: roughness of the bare substrate.
-        line_nm: offset of each scan line.
-        pixel_nm: uncorrelated pixel noise.
-        datum_nm: offset of each scan.
+        line_nm: offsets of single scan lines.
+        pixel_nm: noise that is independent from pixel to pixel.
+        datum_nm: offsets of whole scans.
     """
 
     roughness_nm: float = 15.9
@@ -96,20 +103,20 @@ class Noise:
 
     @classmethod
     def off(cls) -> Noise:
-        """Return noise settings that are all zero."""
+        """Return settings without any noise."""
         return cls(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Named settings of a run. Arguments that the caller passes override these settings.
+    """The named settings of a run. Arguments that the caller passes take precedence over them.
 
     Args:
         count: number of scans.
-        size_px: side of the layouts, pixels (one number, or ny and nx).
-        fields_per_print: number of fields in one print block.
-        knobs: settings of the form ``name=strength[@seed]``.
-        printer, microscope, noise: settings of the machines.
+        size_px: size of each layout in pixels, as one number for both sides or as (ny, nx).
+        fields_per_print: number of fields in each print.
+        knobs: settings of the knobs, as texts ``name=strength[@seed]``.
+        printer, microscope, noise: settings of the printer, the microscope and the default noise.
     """
 
     count: int
@@ -136,7 +143,7 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """Return the preset with this name.
+    """Return the preset with the given name.
 
     Raises:
         InputError: there is no preset with this name.

@@ -1,4 +1,6 @@
-"""Run the virtual fab. Write raw files as a laboratory would deliver them, and write the truth separately."""
+"""Run the virtual fab. It writes raw files as a laboratory would deliver them, and in a separate folder the
+truth about them.
+"""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -44,37 +46,44 @@ def simulate(
     plan_of: str = "",
     print_pattern: str = PRINT_PATTERN,
 ) -> Path:
-    """Print and scan a set of fields; return the path of the card, ``out/raw/card.toml``.
+    """Print and scan a set of fields in the virtual fab, and return the path of the dataset card,
+    ``out/raw/card.toml``.
 
-    ``out/raw`` contains what a laboratory would deliver: card, table, layouts and scans. ``out/truth``
-    contains what only a simulation knows: `truth.json`, and the prints without and with roughness. Scans are
-    made one at a time, so the memory used does not grow with their number.
+    The folder ``out/raw`` contains what a laboratory would deliver: the card, its table, the layouts and the
+    scans. The folder ``out/truth`` contains what only a simulation knows: ``truth.json``, and the heights of
+    the prints without and with roughness. Scans are made one at a time, so the memory used does not grow with
+    their number.
 
     Args:
+        out: folder of the run.
         count: number of scans with random layouts.
-        size_px: size of a layout, pixels (one number, or ny and nx).
-        seed: seed of every random draw of the run.
-        knobs: effects beyond plain printing, as settings or in the form ``name=strength[@seed]``.
-        cause: an effect of your own that is not a knob; the truth file does not record it.
+        size_px: size of each layout in pixels, as one number for both sides or as (ny, nx).
+        seed: seed of all random draws of the run.
+        knobs: effects beyond plain printing, as settings or as texts ``name=strength[@seed]``.
+        cause: an effect of your own that is not a knob. The truth does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
-        microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or your own values.
-        fields_per_print: number of fields in one print block.
-        write_field_um: side of the write field that the fields of a print share, µm. None gives each field
-            its own write field.
-        references: whether to add scans of a bare substrate, a flat print and a five-step print.
-        jobs: your own layouts instead of random ones; arguments about random layouts are then ignored.
-        plan_of: hash, to be written to the card, of the dataset from which the layouts were planned.
-        print_pattern: pattern, to be written to the card, that finds the print of a scan in the id of the
-            scan.
+        microscope: ``default`` (scans with a margin and small affine errors), ``aligned`` (scans with a
+            margin only), or your own microscope.
+        printer: your own printer; None stands for the default printer.
+        fields_per_print: number of fields in each print.
+        write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
+            field has a write field of its own.
+        references: whether to add scans of a bare substrate, a flat print and a staircase of five steps.
+        jobs: your own layouts, which are printed in place of random ones. Arguments about random layouts are
+            then ignored.
+        name: name of the dataset, which is written to the card.
+        plan_of: hash of the dataset from which the layouts were planned, which is written to the card.
+        print_pattern: regular expression that finds the print of a scan in the scan's id, which is written to
+            the card.
 
     Raises:
-        InputError: a knob is unknown or its strength is out of range, the plan is impossible, or the folder
-            contains a run with different settings or unrelated files.
+        InputError: a knob is unknown or its strength is out of range, the layouts cannot be printed, or the
+            folder contains a run with other settings or other files.
     """
     if references and jobs is not None:
         raise InputError(
-            "references cannot be added to your own layouts",
-            wanted="reference layouts among your own layouts, and their use in the card's table",
+            "reference prints cannot be added to your own layouts",
+            wanted="reference layouts among your own, marked in the column use of the card's table",
         )
     settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
     fab = Fab(
@@ -144,7 +153,7 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """Write one scan in the file format of the microscope."""
+    """Write the file of one scan in the format that the microscope's settings name."""
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
         write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
@@ -152,7 +161,8 @@ def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
         write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
-# The usual values: not rotated, in trace, with the first tip and the pixel size of the layout.
+# The values in the columns SCANNING of a usual scan: not rotated, in trace, with the first tip, and with
+# pixels as large as those of the layout.
 AS_EVER = (0.0, 1.0, 1.0, 1.0)
 
 
@@ -169,7 +179,7 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
 
 
 def _described(job: Job) -> dict[str, Any]:
-    """Return the attributes of a job as a dict in which a hash replaces the layout."""
+    """Return the attributes of a job as a dictionary, with a hash in place of the layout."""
     return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
@@ -191,8 +201,8 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """Write the card's table. The columns that say how scans were made are added only if a scan differs from
-    the default.
+    """Write the card's table. The columns that state how scans were made are written only if some scan was
+    made in another way than usual.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
@@ -213,20 +223,21 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 
 
 def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: int = 1) -> Path:
-    """Print and scan a plan in the fab of an earlier run; return the path of the new card.
+    """Print and scan planned layouts in the virtual fab of an earlier run, and return the path of the new
+    card.
 
-    The machine is the same: printer, microscope, noise, knobs, and the seeds of the knobs. All that varies
+    The fab is that of the earlier run: its printer, microscope, noise and knobs with their seeds. What varies
     from print to print or from scan to scan is drawn anew.
 
     Args:
-        plan: folder with ``card.toml``, layouts and ``scans.csv``, as `litho-models next-print` writes it.
+        plan: folder with ``card.toml``, layouts and ``scans.csv``, as ``litho-models next-print`` writes it.
         fab: folder of the earlier run, which contains ``truth``.
-        out: folder for ``raw`` and ``truth`` of the new run.
-        seed: seed of the new draws; it must differ from that of the earlier run.
+        out: folder of the new run, in which ``raw`` and ``truth`` are written.
+        seed: seed of the new random draws. It must differ from that of the earlier run.
 
     Raises:
         InputError: the plan or the truth is missing, the seed is that of the earlier run, or the printer
-            cannot write the layouts.
+            cannot print the layouts.
     """
     card = Path(plan) / CARD_NAME
     truth = Truth.read(Path(fab) / "truth")

@@ -1,4 +1,4 @@
-"""Measure how much a knob changes the scans, and find the strength for a given change."""
+"""Measure how much a knob changes the scans, and find the strength that causes a given change."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
-# The knob that is noise: no noise-free scan shows it, and its strength is its rms.
+# This knob is noise, so scans without noise do not show it. Its strength is its rms in nm.
 NOISE_KNOB = "line-roughness"
 _RELATIVE_PRECISION = 0.01
 _MAX_STEPS = 40
@@ -20,9 +20,9 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """The strength of a knob, and the rms change ``rms_nm`` that it causes.
+    """A setting of a knob, and the rms change of the scans in nm that it causes.
 
-    The rms is smaller than requested if the knob's range is too small.
+    ``rms_nm`` is smaller than requested if the request exceeds what the knob's largest strength causes.
     """
 
     setting: KnobSetting
@@ -36,20 +36,21 @@ def strength_for_rms(
     jobs: Sequence[Job] | None = None,
     seed: int = 0,
 ) -> KnobStrength:
-    """Find the strength at which a knob changes the noise-free scans by ``rms_nm``.
+    """Find the strength at which a knob changes scans without noise by ``rms_nm``.
 
-    The rms is computed by `knob_rms_nm`. The rms grows with the strength, so an interval search within the
+    The change is computed by ``knob_rms_nm``. It grows with the strength, so an interval search within the
     range of the knob finds the strength.
 
     Args:
         name: name of the knob.
-        rms_nm: desired rms, nm.
-        jobs: fields on which the rms is measured; by default four of 256 × 256 px, two of each cut-off.
+        rms_nm: wanted rms change of the scans in nm.
+        jobs: the fields on which the change is measured. By default, they are four random layouts of
+            256 × 256 px, two for each of the two cut-off frequencies.
         seed: seed of the knob.
 
     Raises:
-        InputError: the knob is unknown, the rms is not positive, or offset, gain, plane and bow of each scan
-            absorb the effect completely.
+        InputError: the knob is unknown, ``rms_nm`` is not positive, or the offset, gain, plane and bow fitted
+            to each scan absorb the effect completely.
     """
     if not rms_nm > 0:
         raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
@@ -64,7 +65,7 @@ def strength_for_rms(
         strength = min(rms_nm, highest)
         return KnobStrength(KnobSetting(name, strength, seed), strength)
     at_limit = measured(highest)
-    # Residuals of the size of float32 rounding do not count as an effect.
+    # A change that is not larger than float32 rounding errors does not count as an effect.
     if at_limit < 1e-3:
         raise InputError(
             f"effect of knob {name} on the scans",
@@ -85,17 +86,18 @@ def search_strength(
     at_highest: float,
     precision: float = _RELATIVE_PRECISION,
 ) -> tuple[float, float]:
-    """Find the strength below ``highest`` at which a measure reaches ``wanted``; return strength and measure.
+    """Find the strength at which a measured quantity has the value ``wanted``. Return the strength and the
+    measured value.
 
     Args:
-        measured: function that returns the measure at a strength; the measure grows with the strength.
-        wanted: desired value of the measure.
+        measured: function that takes a strength and returns the quantity, which must grow with the strength.
+        wanted: wanted value of the quantity.
         highest: upper limit of the strength.
-        at_highest: the measure at ``highest``, which must exceed ``wanted``.
-        precision: largest accepted relative distance from ``wanted``.
+        at_highest: value of the quantity at ``highest``. It must exceed ``wanted``.
+        precision: largest accepted relative deviation from ``wanted``.
     """
     low, high = 0.0, highest
-    # Most effects grow about linearly and only some quadratically, so the first guess assumes linear growth.
+    # Most effects grow about linearly with the strength, so the first guess assumes linear growth.
     strength = highest * wanted / at_highest
     for _ in range(_MAX_STEPS):
         found = measured(strength)
@@ -108,12 +110,12 @@ def search_strength(
 
 
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
-    """Return the rms change, in nm, that a knob causes in noise-free scans after the per-scan terms are
-    removed.
+    """Return the rms change, in nm, that a knob causes in scans without noise, apart from the per-scan terms.
 
-    Scan pixels coincide with layout pixels, so a warp is measured by the changes in height that it causes.
-    The per-scan terms are the least-squares fit of {1, P, x, y, x², xy, y²} to each scan's change, where P is
-    the scan without the knob.
+    The per-scan terms are offset, gain, plane and bow: {1, P, x, y, x², xy, y²}, where P is the scan without
+    the knob. They are fitted to the change of each scan by least squares and subtracted. The pixels of the
+    scans coincide with those of the layout, so a knob that displaces the scan is measured by the changes of
+    height that it causes.
     """
     mean_squares = []
     for job in jobs:
@@ -124,7 +126,9 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Fit the prediction and a quadratic surface to ``change`` by least squares, and return the residual."""
+    """Return the residual after a gain times ``prediction`` and a quadratic surface are fitted to
+    ``change``.
+    """
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )
@@ -135,7 +139,9 @@ def _free_of_nuisances(change: Array, prediction: Array) -> Array:
 
 
 def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
-    """Return four fields of 256 × 256 px, two of each cut-off, evenly spaced in the print order."""
+    """Return four random fields of 256 × 256 px, evenly spaced in the order of printing. There are two fields
+    for each of the two cut-off frequencies.
+    """
     return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
 
 

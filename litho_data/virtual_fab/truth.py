@@ -1,5 +1,5 @@
-"""Record the truth about a simulated run, which its dataset build must not know: knobs, warps, clean prints
-and noise floors.
+"""Define the record of the truth about a simulated run: its knobs, the positions of its scans, and the noise
+in them. A build of the run's dataset must not read this record.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 
 class KnobTruth(Record):
-    """One knob with a strength other than zero."""
+    """The record of one knob that was set in the run."""
 
     name: str
     effect: str
@@ -28,7 +28,9 @@ class KnobTruth(Record):
 
     @classmethod
     def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
-        """Return the record of a setting, with the seed that was used."""
+        """Return the record of a knob's setting. Its seed is the one that was used, if need be that of the
+        run.
+        """
         knob = KNOBS[setting.name]
         return cls(
             name=knob.name,
@@ -42,13 +44,15 @@ class KnobTruth(Record):
 
     @property
     def setting(self) -> KnobSetting:
-        """Return the setting with the seed that was used, so that the effect can be repeated."""
+        """Return the setting of the knob with the seed that was used, so that the same effect can be made
+        again.
+        """
         return KnobSetting(self.name, self.strength, self.seed)
 
 
 class ScanTruth(Record):
-    """One scan: its position, its datum, and the error that would remain even with perfect models of printer
-    and AFM.
+    """The record of one scan: its position, its datum, and the error that would remain even with perfect
+    models of printer and AFM (the noise floor).
     """
 
     id: str
@@ -66,11 +70,11 @@ class ScanTruth(Record):
 
 
 class Truth(Result):
-    """The record `truth.json` of a simulated run.
+    """The record ``truth.json`` of a simulated run.
 
-    Next to it, ``prints/<id>.npy`` contains the print of each scan without roughness, and
-    ``surfaces/<id>.npy`` contains the print with roughness. Both files contain heights in µm on the layout
-    grid. ``settings`` contains further settings of the run.
+    In the same folder, ``prints/<id>.npy`` contains the print of each scan without roughness, and
+    ``surfaces/<id>.npy`` contains the print with roughness. Both files contain heights in µm on the layout's
+    grid. ``settings`` contains the settings of the fields that were printed.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -86,8 +90,10 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Return the offset and the size, in nm, of the noise in one scan. The ``floor_full`` values also exclude
-    tilt and bow.
+    """Return the offset of the noise in one scan, and its mean absolute and root mean square values, in nm.
+
+    The values named ``floor`` are those without the offset, and the values named ``floor_full`` are those
+    without offset, tilt and bow.
     """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
