@@ -1,14 +1,17 @@
-"""Measure with independent judges whether `litho-design correct` makes prints match their target reliefs.
+"""Measure whether `litho-design correct` makes prints match their target reliefs. The judges are independent
+of the models that make the corrections.
 
     python -m benchmarks.corrections --out runs/corrections [--publish]
 
-Five reliefs are printed by three virtual fabs and by a model of the zoo. The fabs have the effects of
-benchmarks.gap, which none of the models contains. Each correction is made with three models that have
-different formulas. For a fab, these models are trained on scans of its prints. For the measured prints, they
-are models of the zoo, and PBL is the judge. Each correction is compared with two simple layouts: nominal
-heights, and the best affine layout, which has a gain and a zero. The gain and the zero are chosen once by the
-models of the search and once by the judge. The choice of the judge could not be made before printing. An
-interrupted run resumes.
+The judges are three virtual fabs and PBL, a model of the measured prints from the zoo. Each prints five
+reliefs. The fabs have the effects of benchmarks.gap, which none of the models contains. Each correction is
+made with three models that have different formulas. For a fab, these models are trained on scans of its
+prints. For PBL, they are models of the zoo.
+
+Each correction is compared with two simple layouts: the nominal heights, and the best affine layout, whose
+heights are the nominal ones times a gain plus an offset. Gain and offset are chosen once by the models that
+make the correction, and once by the judge. The choice of the judge could not be made before printing. An
+interrupted run continues when it is run again.
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
 RESULT = PAGE.parent / "results" / "corrections" / "corrections.json"
 NAME = "corrections"
 RELIEFS = ("cap", "freeform", "blaze", "staircase", "lens")
-# Announced before any of these fabs printed anything.
+# The seeds of the fabs were announced before any of these fabs printed anything.
 SEEDS = (75, 76, 77)
 FAB_MODELS = ("physics", "blur-table", "linear")
 ZOO_MODELS, ZOO_JUDGE = tuple(f"zoo:{name}" for name in FAB_MODELS), "zoo:pbl"
@@ -50,11 +53,12 @@ COLUMNS = {
     "affine by the judge": "best affine, chosen by the judge",
     "corrected": "corrected",
 }
+# A correction counts as worse if its error exceeds that of the better simple layout by more than this factor.
 ALLOWED = 1.05
 
 
 def main() -> None:
-    """Make the missing corrections, print the table, and write the record."""
+    """Make the corrections that have no result yet, write the record, and print the table."""
     given = _arguments()
     torch.set_num_threads(1)
     settings = relief_settings({"layout.size_px": given.size, "search.polish_rounds": POLISH})
@@ -79,7 +83,9 @@ def main() -> None:
 def corrected(
     relief: str, seed: int, models: Sequence[Printer], judge: Printer, out: Path, settings: ReliefSettings
 ) -> dict[str, Any]:
-    """Make one correction; return the rms errors, nm, of the prints of all layouts in `COLUMNS`."""
+    """Make one correction, and return its record, with the rms errors in nm of the prints of all layouts in
+    ``COLUMNS``.
+    """
     wanted = wanted_um(relief, seed, settings)
     made = correct(wanted, models[0], out, settings=settings, judges=models[1:], announce=False)
     inputs = {"relief_um": wanted}
@@ -100,7 +106,9 @@ def corrected(
 
 
 def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
-    """Return the heights (size, size), µm, of a relief; the freeform surface is drawn from the seed."""
+    """Return the heights of a relief in µm, as an array of shape (size, size). The freeform surface is drawn
+    with the seed.
+    """
     layout, high_um = settings.layout, settings.height_um
     if name in ("cap", "blaze", "staircase"):
         return load_relief("lens" if name == "cap" else name, layout, high_um)[0]
@@ -121,7 +129,9 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return the summary, and a table with one row per relief and printer. Each cell covers all seeds."""
+    """Return the summary, and a table with one row per relief and printer. A cell contains the range over the
+    seeds.
+    """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in record["rows"]:
         groups.setdefault((row["relief"], row["judge"]), []).append(row)
@@ -131,8 +141,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     ]
     heads = ("relief", "printed by", *COLUMNS.values())
     note = (
-        "Rms error of the print in nm, after its mean error is subtracted. The reliefs are 0.6 µm high and "
-        f"{record['size_px']} px wide."
+        "The cells contain the rms error of the print in nm, after its mean error is subtracted. For the "
+        "fabs, they contain the smallest and the largest error of the three fabs. The reliefs are 0.6 µm "
+        f"high and {record['size_px']} px wide."
     )
     return f"{summary(record['rows'])}\n\n{markdown_table(heads, lines, note)}"
 
@@ -143,7 +154,9 @@ def _span(values: Sequence[float]) -> str:
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return how often a correction beats the uncorrected layouts, and how often its error range is right."""
+    """Return a text that says how the corrections compare with the simple layouts, and how often the error of
+    a print lies in the range that the correction stated.
+    """
     worse = [row for row in rows if over_idle(row) > ALLOWED]
     inside = [row for row in rows if holds(row)]
     blazes = [over_idle(row, ("best affine",)) for row in rows if row["relief"] == "blaze"]
@@ -155,24 +168,28 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> str:
         f"best affine layout, whichever is better{named}. The median error of a correction is "
         f"{median:.2f} × that of the better of these two layouts; for a blaze, it is "
         f"{np.median(blazes):.2f} × that of the best affine layout. "
-        f"The errors of {len(inside)} of {len(rows)} prints lie in the stated range."
+        f"The errors of {len(inside)} of {len(rows)} prints lie in the range that the correction stated."
     )
 
 
 def holds(row: Mapping[str, Any]) -> bool:
-    """Return whether the error of the print lies in the range that the design stated."""
+    """Return whether the error of the print lies in the range that the correction stated."""
     low, high = row["between_nm"]
     return bool(low <= row["printed_nm"]["corrected"] <= high)
 
 
 def over_idle(row: Mapping[str, Any], idle: Sequence[str] = ("uncorrected", "best affine")) -> float:
-    """Return the judged error of a correction divided by the judged error of the best layout in ``idle``."""
+    """Return the error of the corrected print divided by that of the best print of the layouts in
+    ``idle``.
+    """
     printed = row["printed_nm"]
     return float(printed["corrected"] / min(printed[name] for name in idle))
 
 
 def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[Printer], Printer]]:
-    """Yield the seed, the models and the judge of each printer. Missing prints and models are made first."""
+    """Yield, for each printer, its seed, the models that make corrections for it, and the printer itself as
+    judge. Fabs and models that do not exist yet are made first.
+    """
     for seed in SEEDS:
         folder = out / f"fab-{seed}"
         store = folder / "prints.zarr"
@@ -192,7 +209,9 @@ def _printers(out: Path, settings: ReliefSettings) -> Iterator[tuple[int, list[P
 
 
 class _Plain(ReliefTask):
-    """Find the best affine layouts with a loss that ignores the models' errors on their training prints."""
+    """The task with which the best affine layouts are found. Its loss ignores the errors of the models on
+    their training prints.
+    """
 
     loss_by = Task.loss_by
 
@@ -203,9 +222,9 @@ def _rms_nm(task: ReliefTask, level: torch.Tensor) -> float:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = options(__doc__, "write the record and the table into docs")
-    parser.add_argument("--out", type=Path, required=True, help="folder of fabs, models and designs")
-    parser.add_argument("--size", type=int, default=SIZE_PX, help="side of the reliefs, pixels")
+    parser = options(__doc__, "write the record and the table into the documentation")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the fabs, models and designs")
+    parser.add_argument("--size", type=int, default=SIZE_PX, help="side of the reliefs in pixels")
     return parser.parse_args()
 
 

@@ -1,12 +1,13 @@
-"""Design a fan-out of 7 x 7 equal far-field spots with 13 levels; compare it with continuous phases.
+"""Design an element with 13 levels that splits a beam into 7 x 7 equal spots in the far field (a fan-out),
+and compare it with continuous phases.
 
     python -m benchmarks.fan_out [--publish]
 
-The element is 12.8 µm wide. Neighbouring spots are two diffraction limits apart. The power and uniformity of
+The element is 12.8 µm wide. Adjacent spots are two diffraction limits apart. The power and the uniformity of
 the spots are computed for the printed layout. The printer is either the Physics model of the zoo or an ideal
 printer that prints the nominal heights. The element is compared with a continuous phase that is designed with
-the same loss. It is also compared with the Gerchberg-Saxton phase, which is used both as a continuous phase
-and rounded to the nearest of 13 levels.
+the same loss, and with the phase of the Gerchberg-Saxton algorithm. The latter is used both as it is and
+rounded to the nearest of 13 levels.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
 RESULT = PAGE.parent / "results" / "fan-out" / "fan_out.json"
 NAME = "fan-out"
 SIZE_PX, PITCH_UM, LIMITS_APART = 128, 0.1, 2
-# lambda f / D is 0.3 µm, three pixels of the image.
+# The diffraction limit, wavelength times focal length over width, is 0.3 µm, which is three pixels of the
+# image.
 FOCAL_UM = 0.3 * SIZE_PX * PITCH_UM / 0.6328
 SETTINGS = {
     "layout.size_px": SIZE_PX,
@@ -51,7 +53,7 @@ PRINTER = "zoo:physics"
 
 @register_task
 class FanOut(Task):
-    """Design 49 spots of equal power; score their total power and their uniformity."""
+    """The task of making 49 spots of equal power. The scores are their total power and their uniformity."""
 
     name = "fan-out"
     starts = ("random", "gs")
@@ -59,7 +61,9 @@ class FanOut(Task):
     errors = ("uniformity_error",)
 
     def powers(self, seen: Tensor) -> Tensor:
-        """Return the shares of the power (49,) within 2/3 of a diffraction limit of each spot centre."""
+        """Return the share of the power in each spot, shape (49,). A spot extends to 2/3 of a diffraction
+        limit from its centre.
+        """
         return torch.einsum("kyx,vyx->k", _spots().to(seen), seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
@@ -67,21 +71,27 @@ class FanOut(Task):
         return nearest_levels(_gerchberg_saxton(self), level_phase)
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Return the share of light outside the spots plus the relative standard deviation of power."""
+        """Return the share of the light outside the spots, plus the relative standard deviation of the spots'
+        powers.
+        """
         powers = self.powers(seen)
         return 1 - powers.sum() + powers.std(correction=0) / powers.mean()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the efficiency and the uniformity error: (high - low) / (high + low) of the spot powers."""
+        """Return the efficiency, which is the light in all spots, and the uniformity error. The latter is
+        (high - low) / (high + low), with the highest and the lowest power of a spot.
+        """
         powers = self.powers(seen)
         low, high = float(powers.min()), float(powers.max())
         return {"efficiency": float(powers.sum()), "uniformity_error": (high - low) / (high + low)}
 
 
 def main() -> None:
-    """Design and compare the elements, print the table, and write the record."""
+    """Design and compare the elements, write the record, print the table, and draw the figure."""
     given = options(
-        __doc__, "write the record, the table and the figure into docs", Path("runs/fan_out.json")
+        __doc__,
+        "write the record, the table and the figure into the documentation",
+        Path("runs/fan_out.json"),
     ).parse_args()
     torch.set_num_threads(1)
     settings = design_settings(SETTINGS)
@@ -111,7 +121,7 @@ def main() -> None:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return a table with one line for each element."""
+    """Return a table with one row for each element."""
     lines = [
         (name, f"{100 * row['efficiency']:.1f} %", f"{100 * row['uniformity_error']:.1f} %")
         for name, row in record["rows"].items()
@@ -120,7 +130,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def _spots() -> Tensor:
-    """Return the masks (49, size, size) of the spots."""
+    """Return a mask of each spot, in an array of shape (49, size, size)."""
     place = torch.arange(SIZE_PX) - (SIZE_PX - 1) / 2
     apart = LIMITS_APART * 3
     middles = apart * torch.arange(-3, 4)
@@ -129,7 +139,7 @@ def _spots() -> Tensor:
 
 
 def _phases(task: FanOut) -> dict[str, Tensor]:
-    """Return the phase of each cell, in radians, for each element that has a continuous phase."""
+    """Return the continuous phases by name, each with the phase of every cell in radians."""
     phase = _gerchberg_saxton(task)
     free = phase.clone().requires_grad_()
     optimiser = torch.optim.Adam([free], lr=0.1)
@@ -141,7 +151,7 @@ def _phases(task: FanOut) -> dict[str, Tensor]:
 
 
 def _gerchberg_saxton(task: FanOut) -> Tensor:
-    """Return the phase of each cell, in radians, after sixty Gerchberg-Saxton steps."""
+    """Return the phase of every cell, in radians, after sixty steps of the Gerchberg-Saxton algorithm."""
     target = _spots().sum(0)
     return gerchberg_saxton(
         task.bench.benches[0].propagator, target, task.cells, iterations=60, weighted=False, seed=0
@@ -153,7 +163,7 @@ def _height_um(task: FanOut, phase: Tensor) -> Tensor:
 
 
 def _draw(task: FanOut, seen: Mapping[str, Tensor], path: Path) -> None:
-    """Draw the power of each spot relative to the mean power, and the image of the designed element."""
+    """Draw the image of the designed element, and the power of each spot relative to the mean power."""
     shown = [name for name in seen if "13 levels" in name or name.startswith(("continuous", "designed"))]
     figure = new_figure(10, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))

@@ -1,10 +1,11 @@
-"""Correct the layout of a film through the model of the second machine, and judge it by other models.
+"""Correct the layout of a film with a model of the second machine, and judge the correction with other
+models.
 
     python -m benchmarks.film_design prefab-soi.zarr [--publish]
 
-The target is the layout of a locked pattern, so no model was trained on it. The layout is corrected through
-`e-beam`. The judges `blur-table` and `random-features` were trained on the same micrographs, but have
-different formulas.
+The target is the layout of a locked pattern, on which no model was trained. The layout is corrected with the
+model `e-beam`. The judges `blur-table` and `random-features` were trained on the same micrographs as
+`e-beam`, but have different formulas.
 """
 
 from __future__ import annotations
@@ -38,18 +39,22 @@ if TYPE_CHECKING:
 RESULT = MACHINE.with_name("film_design.json")
 PATTERN, SIZE_PX, POLISH = "random_lpass_0.13_1", 256, 20
 DESIGNER, JUDGES = "e-beam", ("blur-table", "random-features")
-# The prediction assumes that nothing is written outside the design. So the rim is not scored.
+# Width, in px, of the rim that is not scored. It is left out because the prediction assumes that nothing is
+# written outside the design.
 RIM_PX = 24
 PICTURE = """![Corrected layout; target film and edges of both prints](results/second-machine/design.png)
 
-*The corrected layout (grey: partial dose), and the edges that `blur-table` predicts for both layouts.*"""
+*Left: the corrected layout (grey means a partial dose). Middle and right: the target film, and the edges that
+`blur-table` predicts for the uncorrected and for the corrected layout.*"""
 
 
 def main() -> None:
-    """Train the models, correct the layout, judge both layouts, and write the record."""
-    parser = options(__doc__, "write table and picture into docs", RESULT)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("--cache", type=Path, default=Path("runs/film-design"), help="models and design")
+    """Train the models, correct the layout, judge both layouts, write the record, and print the table."""
+    parser = options(__doc__, "write the table and the picture into the documentation", RESULT)
+    parser.add_argument("store", type=Path, help="dataset store of the second machine")
+    parser.add_argument(
+        "--cache", type=Path, default=Path("runs/film-design"), help="folder of the models and the design"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     scan = open_store(given.store).scan(PATTERN)
@@ -85,7 +90,7 @@ def main() -> None:
 
 
 def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
-    """Return settings for a relief with the pitch and levels of a scan."""
+    """Return the settings of a design with the pitch and the levels of a scan."""
     geometry = {"pitch_um": scan.pitch_um, "cell_um": scan.pitch_um, "levels": scan.levels}
     geometry |= {"size_px": size_px, "level_height_um": scan.level_height_um}
     changes = {f"layout.{name}": value for name, value in geometry.items()}
@@ -93,7 +98,9 @@ def settings_for(scan: PrintedScan, size_px: int = SIZE_PX) -> ReliefSettings:
 
 
 def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
-    """Return the middle square of the layout as the target film; its rim is not scored."""
+    """Return the square in the middle of a scan's layout as the target film. Its rim is marked as not valid,
+    so that it is not scored.
+    """
     top, left = ((length - size_px) // 2 for length in scan.shape)
     level = scan.mask_level[top : top + size_px, left : left + size_px]
     inner = np.pad(np.ones([size_px - 2 * RIM_PX] * 2, bool), RIM_PX)
@@ -102,7 +109,9 @@ def wanted_film(scan: PrintedScan, size_px: int = SIZE_PX) -> PrintedScan:
 
 
 def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Printer:
-    """Return a printer with a model trained on the store; train and freeze the model if necessary."""
+    """Return a printer with a model that was trained on the store. The model is trained and frozen if it does
+    not exist yet.
+    """
     folder = cache / name
     if not (folder / "printer" / "card.json").is_file():
         train(store, name, folder / "run", settings={"nuisance": "none"})
@@ -112,14 +121,25 @@ def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Pr
 
 @torch.no_grad()
 def printed(by: Printer, layout_um: np.ndarray, settings: ReliefSettings) -> np.ndarray:
-    """Return the predicted height (y, x), µm, of a layout whose values are heights in µm."""
+    """Return the heights that a printer's model predicts for a layout. Both are arrays of shape (ny, nx) in
+    µm.
+    """
     levels = torch.from_numpy(layout_um / np.float32(settings.layout.level_height_um))
     return by(levels[None, None])[0, 0].numpy()
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """Return the picture, and a table with a row for each model and layout, as Markdown."""
-    heads = ("predicted by", "layout", "edge error, mean", "P95", "area error", "missing", "extra", "merged")
+    """Return the picture, and a table with a row for each model and layout, in Markdown."""
+    heads = (
+        "predicted by",
+        "layout",
+        "mean edge error",
+        "95th percentile of the edge error",
+        "area error",
+        "missing",
+        "extra",
+        "merged",
+    )
     rows = [
         (
             *(row[key] for key in ("model", "layout")),
@@ -133,7 +153,7 @@ def text_of(record: Mapping[str, Any]) -> str:
 
 
 def drawn(wanted_um: np.ndarray, layout_um: np.ndarray, prints: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the corrected layout, and the edges of both prints on the target film."""
+    """Draw the corrected layout, and the target film with the edges of both predicted prints."""
     figure = new_figure(10, 3.6)
     first, *others = figure.subplots(1, 3)
     cut = (slice(RIM_PX, -RIM_PX),) * 2

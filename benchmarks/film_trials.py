@@ -1,10 +1,11 @@
-"""Run blind trials on films: the fab plants at most one cause, and the loop must name only this cause.
+"""Run blind trials on films. The virtual fab plants at most one cause, and the closed loop must name this
+cause and no other.
 
     python -m benchmarks.film_trials [--process e-beam] [--seed 1] [--only 0,3] [--publish]
 
-Each process has ten trials: seven with one cause each, and three without a cause. The dose and the
-charging vary from trial to trial. The loop sees only the store. Its base model is the bare printer of the
-process. An interrupted run resumes.
+Each process has ten trials, seven with one cause and three without a cause. The dose and the charging vary
+from trial to trial. The loop receives only the store. Its base model contains only the beam or lens of the
+process and a threshold. An interrupted run continues when it is run again.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from litho_data.virtual_fab.films import FILM_PRINTERS, FilmKnobs, simulate_film
 from litho_models.loop.run import close_loop
 
 RESULT = MACHINE.with_name("film_trials.json")
-# Two films are locked, and coarse films may fail to register. To confirm anything, eight must remain.
+# Number of films and side of a film in pixels. Two films are locked, and films with coarse features may fail
+# to register. At least eight must remain, because the loop cannot confirm a cause with fewer.
 COUNT, SIZE_PX = 18, 208
 EFFECTS = {
     "backscatter": "electron-backscatter",
@@ -44,7 +46,9 @@ BASES: dict[str, dict[str, Any]] = {
 
 
 class Trial(NamedTuple):
-    """One trial: its number, the knob of the planted cause (empty for none), and all knobs."""
+    """One trial, with its number, the name of the knob that is the planted cause (empty for none), and all
+    knobs.
+    """
 
     number: int
     cause: str
@@ -52,7 +56,7 @@ class Trial(NamedTuple):
 
 
 def draw(process: str, seed: int) -> list[Trial]:
-    """Draw the trials of a process in random order; lengths are drawn in layout pixels."""
+    """Draw the trials of a process. Their order is random, and lengths are drawn in layout pixels."""
     rng = np.random.default_rng([seed, *process.encode()])
     pitch_um = FILM_PRINTERS[process].pitch_um
     causes = rng.permutation([*PLANTED, *[""] * EMPTY]).tolist()
@@ -72,9 +76,10 @@ def draw(process: str, seed: int) -> list[Trial]:
 
 
 def run(trial: Trial, process: str, seed: int, folder: Path) -> dict[str, Any]:
-    """Run and judge one trial. It is ``right`` if the loop names the planted cause and no other.
+    """Run and judge one trial, and return its record.
 
-    If nothing was planted, it is ``right`` if the loop names no cause.
+    The entry ``right`` is true if the loop names the planted cause and no other. If nothing was planted, it
+    is true if the loop names no cause.
     """
     own = folder / f"{trial.number}"
     card = simulate_films(
@@ -108,7 +113,7 @@ def line_of(row: Mapping[str, Any]) -> str:
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """Return a table with a row for each process and cause."""
+    """Return a table with a row for each process and planted cause."""
     table = []
     for process, rows in record["processes"].items():
         for planted in dict.fromkeys(sorted(row["planted"] for row in rows)):
@@ -116,16 +121,29 @@ def text_of(record: Mapping[str, Any]) -> str:
             edges = np.mean([row["edges_nm"] for row in own], axis=0)
             counts = (f"{sum(bool(row[key]) for row in own)} of {len(own)}" for key in ("right", "laws"))
             table.append((process, planted, *counts, "{:.2f} → {:.2f} nm".format(*edges)))
-    return markdown_table(("process", "planted", "right", "with a law", "held-out edge error"), table)
+    heads = (
+        "process",
+        "planted cause",
+        "trials answered correctly",
+        "trials in which a law was added",
+        "edge error on held-out films, before → after the loop",
+    )
+    return markdown_table(heads, table)
 
 
 def main() -> None:
-    """Run the missing trials of the processes, and write the record of all trials."""
+    """Run the trials that have no result yet, write the record of all trials, and print the table."""
     parser = options(__doc__, "write the table into docs/second_machine.md", RESULT)
-    parser.add_argument("--cache", type=Path, default=Path("runs/film-trials"), help="a folder per trial")
-    parser.add_argument("--process", default=",".join(BASES), help="processes, separated by commas")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="numbers of trials, separated by commas; all by default")
+    parser.add_argument(
+        "--cache", type=Path, default=Path("runs/film-trials"), help="folder with a folder for each trial"
+    )
+    parser.add_argument(
+        "--process", default=",".join(BASES), help="names of the processes, separated by commas"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of all random draws")
+    parser.add_argument(
+        "--only", default="", help="numbers of the trials to run, separated by commas; by default, all"
+    )
     given = parser.parse_args()
     wanted = [int(one) for one in given.only.split(",") if one] or range(len(PLANTED) + EMPTY)
     processes: dict[str, list[dict[str, Any]]] = {}

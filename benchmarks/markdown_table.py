@@ -1,4 +1,4 @@
-"""Make tables in Markdown, and the text of errors with their confidence intervals."""
+"""Write tables in Markdown, and errors with their confidence intervals as text."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: str) -> str:
-    """Return a table in Markdown, followed by its notes, one paragraph each."""
+    """Return a table in Markdown. It is followed by the notes, each as a paragraph."""
 
     def line(cells: Sequence[str]) -> str:
         return "|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|"
@@ -16,5 +16,5 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: 
 
 
 def with_interval(value: float, interval: Sequence[float] | None) -> str:
-    """Return the text of an error in nm, with its confidence interval if there is one."""
+    """Return an error in nm as text, followed by its confidence interval in brackets if there is one."""
     return f"{value:.2f} nm" + (f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else "")

@@ -1,9 +1,9 @@
-"""Copy the results for the measured prints into the documentation: small files, tables and figures.
+"""Copy the results for the measured prints into the documentation, as records, tables and a figure.
 
     make demo DATASET=neural-lithography
     python -m benchmarks.measured runs/neural-lithography
 
-Writes all numbers that the pages quote from the result files. A test checks that the pages agree with them.
+All tables on the pages are written from the copied records. A test checks that the pages agree with them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ PAGES = {
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the texts for the pages, by the names of their marks, made from the result files in a folder."""
+    """Return the texts for the pages, by the names of their marks. They are made from the records in a
+    folder.
+    """
     benchmark, noise = in_table(folder), _found(folder, "noise.json")
     return {
         "headline": headline_table(benchmark, noise),
@@ -55,7 +57,9 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def in_table(folder: Path) -> dict[str, Any]:
-    """Return the benchmark that the table shows, with the newest result of each model."""
+    """Return the record of the benchmark that the table shows. It contains the newest result of each
+    model.
+    """
     networks = in_one(_found(folder, "benchmark.json"), _found(folder, "benchmark_pbl.json"))
     return in_one(networks, _found(folder, "benchmark_least_squares.json"))
 
@@ -65,11 +69,13 @@ def _found(folder: Path, file: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Copy the results, draw the figure, and publish the tables."""
+    """Copy the records, draw the figure, and write the tables into the pages."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", type=Path, help="folder of `make demo DATASET=neural-lithography`")
+    parser.add_argument(
+        "runs", type=Path, help="folder that `make demo DATASET=neural-lithography` has written"
+    )
     runs = parser.parse_args().runs
     made = [name for name, source in RESULTS.items() if (runs / source).exists()]
     for name in made:
@@ -77,7 +83,7 @@ def main() -> None:
     if "benchmark_pbl.json" in made:
         draw_prediction(runs / "store.zarr", runs / "benchmark-pbl", FOLDER / "prediction.jpg")
     if kept := [name for name in RESULTS if name not in made]:
-        print(f"not found in {runs}, so the published files are kept: {', '.join(kept)}")
+        print(f"these records are not in {runs}, so the published ones are kept: {', '.join(kept)}")
     written = texts(FOLDER)
     for page, name in PAGES.items():
         publish(page, name, written[name])

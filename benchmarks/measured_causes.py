@@ -1,4 +1,4 @@
-"""Publish the results of the closed loop on the measured prints: the record, the tables and the picture.
+"""Publish the results of the closed loop on the measured prints, as a record, tables and a picture.
 
 litho-models close-loop runs/neural-lithography/store.zarr --nested prints --out runs/causes
 python -m benchmarks.measured_causes runs/causes
@@ -35,9 +35,9 @@ _MEASURED = {
 }
 _HELD_OUT = {
     "scans": "five folds of scans",
-    "prints": "whole prints; causes chosen with them",
-    "nested prints": "whole prints; all chosen without them",
-    "nested folds": "five folds of scans; all chosen without them",
+    "prints": "whole prints; the causes were chosen with these prints",
+    "nested prints": "whole prints; everything was chosen without these prints",
+    "nested folds": "five folds of scans; everything was chosen without these scans",
 }
 
 
@@ -47,7 +47,9 @@ def texts(result: CloseLoop) -> dict[str, str]:
 
 
 def errors_table(result: CloseLoop) -> str:
-    """Return the table of errors, one row for each model, measurement model and way of holding out scans."""
+    """Return the table of errors. It has a row for each combination of model, measurement model and way of
+    holding out scans.
+    """
     keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
     rows = []
     for model, measurement, held_out in keys:
@@ -66,11 +68,18 @@ def errors_table(result: CloseLoop) -> str:
             ]
         )
     return markdown_table(
-        ["model", "what is added to the print", "held out", "parameters", "k = 1", "k = 7"],
+        [
+            "model",
+            "what is added to the predicted print",
+            "held out",
+            "parameters (printer + measurement model)",
+            "error at k = 1",
+            "error at k = 7",
+        ],
         rows,
         f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans. Only "
-        "k terms are fitted to a scored scan, on pixels that are not scored. Parameters: printer + "
-        "measurement model. Intervals: 95 %, bootstrap over scans.",
+        "k terms are fitted to a scored scan, on pixels that are not scored. Brackets contain 95 % "
+        "bootstrap intervals over scans.",
     )
 
 
@@ -79,12 +88,12 @@ def causes_table(result: CloseLoop) -> str:
     return markdown_table(
         [
             "effect",
-            "groups",
-            "size (95 % over prints)",
-            "error without it",
+            "groups of scans with one strength",
+            "strengths (95 % interval over prints)",
+            "change of the error without the effect",
             "scans improved",
             "looks like",
-            "also with base",
+            "also found with the base model",
         ],
         [
             [
@@ -138,11 +147,11 @@ def picture(result: CloseLoop) -> Figure:
 
 
 def main() -> None:
-    """Copy the record, draw the picture, and publish the tables."""
+    """Copy the record, draw the picture, and write the tables into the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, help="folder of the closed loop")
+    parser.add_argument("run", type=Path, help="folder that `litho-models close-loop` has written")
     run = parser.parse_args().run
     FOLDER.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(run / CloseLoop.FILE_NAME, FOLDER / CloseLoop.FILE_NAME)

@@ -1,4 +1,4 @@
-"""Draw the figure of a held-out prediction for the documentation."""
+"""Draw the documentation's figure of a prediction for a scan that was held out of the fit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from litho_data.store import open_store
 
 
 def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl") -> None:
-    """Draw layout, print, held-out prediction and difference for the scan with the model's median error."""
+    """Draw the layout, the print, its prediction and their difference, for the held-out scan on which the
+    model has its median error.
+    """
     result = json.loads((benchmark / "benchmark.json").read_text(encoding="utf-8"))
     rows = next(s for s in result["scores"] if s["model"] == model)["scans"]
     errors = [row["mae_datum_free_nm"] for row in rows]
@@ -22,7 +24,7 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
     difference = 1e3 * np.where(scan.valid, scan.height_um - prediction, np.nan)
     difference -= np.nanmedian(difference)
     measured = np.where(scan.valid, scan.height_um, np.nan)
-    # Layout and print have separate colour scales, because a print is lower and has another zero height.
+    # The layout has a colour scale of its own, because a print is lower and has another zero height.
     low, high = np.nanpercentile(measured, (0.1, 99.9))
     printed = float(low), float(high)
     panels: list[tuple[str, np.ndarray, str, tuple[float, float]]] = [

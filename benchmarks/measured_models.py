@@ -1,4 +1,4 @@
-"""Make the tables for the measured prints: errors of the models on held-out scans, and the noise."""
+"""Write the tables for the measured prints: the errors of the models on held-out scans, and the noise."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ _FREE = {
 
 
 def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
-    """Merge two benchmarks on the same scans; for a model in both, use the newer result.
+    """Merge the records of two benchmarks on the same scans. For a model that is in both, the newer result is
+    used.
 
-    Training a network takes long, so a model that has changed is benchmarked again without the others.
+    Training a network takes long. Therefore, if a model has changed, only this model is benchmarked again.
 
     Raises:
-        ValueError: the benchmarks differ in data, scans, folds or scan terms.
+        ValueError: the benchmarks differ in their data, scans, folds or in the terms fitted to each scan.
     """
     for key, parts in (
         ("dataset", ("sha256",)),
@@ -43,12 +44,14 @@ def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
 
 
 def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
-    """Return the table of held-out errors, one row per model, with the noise floor in the last row."""
+    """Return the table of the errors on held-out scans, with one row per model and the noise in the last
+    row.
+    """
     heads = (
         "model",
-        "datum-free error (offset fitted per scan, k = 1)",
-        "the same, without the shared background",
-        "gain, tilt and bow also fitted, k = 7",
+        "datum-free error (offset fitted to each scan, k = 1)",
+        "datum-free error without the shared background",
+        "error with gain, tilt and bow also fitted (k = 7)",
         "absolute error",
         "parameters",
     )
@@ -67,19 +70,22 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     return markdown_table(
         heads,
         rows,
-        f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds by scan, "
-        f"seed {split['seed']}; {_steps_text(benchmark)}), with 95 % bootstrap intervals over scans. The "
-        f"{len(split['lock_box'])} locked scans belong to no fold and affect no number here. Per-scan "
-        "terms are fitted on pixels that are not scored. Levelling leaves a shared background in every map. "
-        "Its five coefficients come from the training scans. It is added to predictions of measured maps, "
-        "but not to designs. The noise is an upper estimate ([how](../../noise.md)); its intervals are over "
-        "prints. A better model can remove at least the part of an error that exceeds the noise. At k = 1 "
-        f"and at k = 7, this part is: {_above(benchmark, floor)}.",
+        f"Mean absolute error on {len(split['scored_ids'])} held-out scans ({split['folds']} folds of scans, "
+        f"seed {split['seed']}; {_steps_text(benchmark)}). Brackets contain 95 % bootstrap intervals over "
+        f"scans. The {len(split['lock_box'])} locked scans belong to no fold and affect no number here. The "
+        "k terms of each scan are fitted to pixels that are not scored. Levelling leaves in all maps the "
+        "same smooth background, whose five coefficients are fitted to the training scans. It is added to "
+        "predictions of measured maps, but not to designs. The noise is an upper estimate "
+        "([how](../../noise.md)), and its intervals are over prints. A better model can remove at least the "
+        "part of an error that exceeds the noise. For each model, this part at k = 1 and at k = 7 is: "
+        f"{_above(benchmark, floor)}.",
     )
 
 
 def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
-    """Return the README's table: the errors of a few models, the noise, and the error in the paper."""
+    """Return the table in the README, with the errors of a few models, the noise, and the error in the
+    paper.
+    """
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
     rows: list[tuple[str, ...]] = []
@@ -93,18 +99,26 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     rows.append(("PBL in the paper (other split, levelling and zero)", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
     return markdown_table(
-        ("model", "parameters", "offset fitted (k = 1)", "offset, gain, tilt and bow fitted (k = 7)"),
+        (
+            "model",
+            "parameters",
+            "error with the offset fitted (k = 1)",
+            "error with offset, gain, tilt and bow fitted (k = 7)",
+        ),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds. Each scan is predicted by models not trained on it, plus the smooth background of "
-        "their training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
-        "Intervals: 95 % confidence over scans. For what the layout cannot explain, they are over "
-        "the 6 prints and include errors common to a place, field or print.",
+        "folds. Each scan is predicted by a model that was not trained on it, plus the smooth background of "
+        "the scans on which the model was trained. Then k terms are fitted to each scan, on pixels that are "
+        "not scored. Brackets contain 95 % confidence intervals over scans. In the row of what the layout "
+        "cannot explain, the intervals are over the 6 prints, and the values include errors that are common "
+        "to a place, a field or a print.",
     )
 
 
 def noise_table(noise: dict[str, Any]) -> str:
-    """Return two tables of the noise of the measured prints: by scan terms, and by level on flat areas."""
+    """Return two tables of the noise of the measured prints: by the terms fitted to each scan, and by the
+    level of flat areas.
+    """
     budget = noise["budget"]
     by_terms = markdown_table(
         ("fitted to each scan", "terms k", "noise, MAE", "noise, σ"),
@@ -118,7 +132,8 @@ def noise_table(noise: dict[str, Any]) -> str:
             for row in budget["floor"]["by_policy"]
         ],
         f"The noise is computed from the residuals of `{budget['model']}` at all scored pixels of "
-        f"{noise['run']['n_scans']} unlocked scans of the measured prints, with 95 % intervals over prints.",
+        f"{noise['run']['n_scans']} unlocked scans of the measured prints. Brackets contain 95 % intervals "
+        "over prints.",
     )
     by_level = markdown_table(
         ("level", "pixels", "σ where flat", "MAE where flat"),
@@ -131,21 +146,25 @@ def noise_table(noise: dict[str, Any]) -> str:
             )
             for row in budget["flat_levels"]
         ],
-        "Only the flattest quarter of all layout pixels is used (slope at most "
-        f"{budget['flat_slope']:.3f}). Offset, gain, tilt, bow and lines are fitted to each scan.",
+        "Only the flattest quarter of all layout pixels is used, in which the slope is at most "
+        f"{budget['flat_slope']:.3f}. Offset, gain, tilt, bow and line offsets are fitted to each scan.",
     )
     return f"{by_terms}\n\n{by_level}"
 
 
 def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
-    """Return the row of the noise, with one cell per policy of scan terms. The cell of None is a dash."""
+    """Return the row of the noise, with a cell for each policy, which names the terms fitted to each scan.
+    The cell for None is a dash.
+    """
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
     return (f"noise ({floor['kind'].replace('-', ' ')})", *cells)
 
 
 def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
-    """Return text that states how far the error of each model exceeds the noise with the same scan terms."""
+    """Return a text that states by how much the error of each model exceeds the noise, at k = 1 and at k =
+    7.
+    """
     least = {row["policy"]: row["mae_nm"] for row in floor["by_policy"]}
     parts = []
     for score in benchmark["scores"]:
@@ -156,6 +175,6 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
 
 
 def _steps_text(benchmark: dict[str, Any]) -> str:
-    """Return text that states for how many optimiser steps each network was trained."""
+    """Return a text that states for how many steps of the optimiser each network was trained."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())

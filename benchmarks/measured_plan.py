@@ -1,10 +1,12 @@
-"""Copy the plan for new prints on the measured printer into the docs, with lab files, tables and pictures.
+"""Copy the plan for new prints on the measured printer into the documentation, with the files for the
+laboratory, the tables and the picture.
 
     litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
         --steps 20
     python -m benchmarks.measured_plan runs/neural-lithography/next-print
 
-Copies the plan, except its report and CSV tables, into docs/results, and rewrites the tables of the page.
+The plan is copied into docs/results without its report and its CSV tables, and the tables of the page are
+written anew.
 """
 
 from __future__ import annotations
@@ -27,11 +29,13 @@ _LEFT_OUT = ("report.html", "*.csv")
 
 
 def main() -> None:
-    """Copy the plan, draw its layouts, and write the tables."""
+    """Copy the plan, draw its layouts, and write the tables into the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("plan", type=Path, help="plan made from the closed loop of the measured prints")
+    parser.add_argument(
+        "plan", type=Path, help="folder of the plan that was made from the closed loop on the measured prints"
+    )
     given = parser.parse_args()
     plan = NextPrint.read(given.plan)
     shutil.rmtree(RESULTS, ignore_errors=True)
@@ -50,7 +54,7 @@ def main() -> None:
 
 
 def draw(plan: NextPrint) -> None:
-    """Draw the layouts of the prints side by side."""
+    """Draw the layouts of the planned prints side by side."""
     first = {scan.print: scan.id for scan in reversed(plan.scans) if scan.use == "dataset"}
     levels = {
         f"print {name}": read_layout(RESULTS / "layouts" / f"{first[name]}.tif") for name in sorted(first)
@@ -84,9 +88,26 @@ def texts(plan: NextPrint) -> dict[str, str]:
         for q in plan.questions
         for pair in q.pairs
     ]
-    heads = ("question", "rivals", "difference, nm rms", "with random layouts", "noise, nm rms")
-    more = ("error of the model, nm", f"power, {count} prints", "prints for power 0.95", "status")
-    of_pairs = ("rival", "rival", "difference, nm rms", "noise, nm rms", f"power, {count} prints")
+    heads = (
+        "question",
+        "competing explanations (rivals)",
+        "difference of their predictions, nm rms",
+        "the same difference with random layouts, nm rms",
+        "noise along the difference, nm rms",
+    )
+    more = (
+        "error of the model, nm",
+        f"power with {count} prints",
+        "number of prints for a power of 0.95",
+        "status",
+    )
+    of_pairs = (
+        "rival",
+        "other rival",
+        "difference of their predictions, nm rms",
+        "noise along the difference, nm rms",
+        f"power with {count} prints",
+    )
     return {
         "measured questions": markdown_table((*heads, *more), questions),
         "measured rivals": markdown_table(of_pairs, pairs),

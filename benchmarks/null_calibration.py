@@ -1,11 +1,13 @@
-"""Measure how often the loop finds a false cause in prints that its own model simulates, plus noise.
+"""Measure how often the closed loop finds a false cause. Its data are prints that its own base model
+simulates, plus noise.
 
     python -m benchmarks.null_calibration [--stores 40] [--workers 2] [--publish]
 
-Each store has 12 scans of random layouts, printed by a Physics model whose values differ from the loop's
-starting values. The noise is stationary and Gaussian and has a standard deviation of 16 nm. Its spectrum,
-which includes lines along x, is that of a flat print in the virtual fab. Each scan also has its own datum and
-tilt. The right result is to find nothing: every cause or law is a false positive. An interrupted run resumes.
+Each store contains 12 scans of random layouts. They are printed by a Physics model whose values differ from
+those at which the loop starts. The noise is stationary and Gaussian, with a standard deviation of 16 nm. Its
+spectrum, which includes lines along x, is that of a flat print in the virtual fab. Each scan also has a datum
+and a tilt of its own. The right result is to find nothing, so every cause or law that is found is a false
+positive. An interrupted run continues when it is run again.
 """
 
 from __future__ import annotations
@@ -37,18 +39,26 @@ RESULT = PAGE.parent / "results" / "null-calibration" / "null_calibration.json"
 NAME = "null_calibration.json"
 SCANS, SIZE_PX, PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 12, 192, 0.1, 13, 0.1
 ROUGHNESS_UM, DATUM_SD_UM, TILT_SD_UM = 0.016, 0.03, 0.005
-# The false-positive rate that the loop claims; a count that is less likely than UNLIKELY contradicts it.
+# The rate of false positives that the loop claims. A number of false positives contradicts this rate if so
+# many or more have a probability of at most UNLIKELY.
 RATE, UNLIKELY = 0.05, 0.025
 FOLDS, FIRST_SEED = 5, 7000
 
 
 def main() -> None:
-    """Run the missing stores, print the outcome, and write the record."""
-    parser = options(__doc__, "write the outcome into docs/closing_the_loop.md")
-    parser.add_argument("--stores", type=int, default=40)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
-    parser.add_argument("--cache", type=Path, default=Path("runs/null-calibration"), help="a file per store")
+    """Run the loop on the stores that have no result yet, write the record, and print the result."""
+    parser = options(__doc__, "write the result into docs/closing_the_loop.md")
+    parser.add_argument("--stores", type=int, default=40, help="number of stores")
+    parser.add_argument("--workers", type=int, default=2, help="number of local processes")
+    parser.add_argument(
+        "--dask", help="address of a Dask scheduler, whose workers are used in place of local processes"
+    )
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        default=Path("runs/null-calibration"),
+        help="folder with a result file for each store",
+    )
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -68,7 +78,9 @@ def main() -> None:
 
 
 def calibrate_one(seed: int) -> dict[str, Any]:
-    """Return the causes that the loop finds in one store, and the error, nm, before and after the loop."""
+    """Run the loop on one store. Return the causes that it finds, and the rms error in nm before and after
+    it.
+    """
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     closed = close(Study.dealt(null_scans(seed), FOLDS), {"physics": base})
     return {
@@ -80,7 +92,7 @@ def calibrate_one(seed: int) -> dict[str, Any]:
 
 
 def null_scans(seed: int) -> list[PrintedScan]:
-    """Return scans of a Physics model plus noise, without any other effect."""
+    """Return the scans of one store: prints simulated by a Physics model, plus noise and no other effect."""
     rng = np.random.default_rng(seed)
     model = build_model(
         "physics",
@@ -119,19 +131,22 @@ def null_scans(seed: int) -> list[PrintedScan]:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return the outcome as a sentence that names each false positive."""
+    """Return the result as text, which names every false positive."""
     stores: Sequence[Mapping[str, Any]] = record["stores"]
     false = [store for store in stores if store["found"]]
     named = "; ".join(f"seed {s['seed']}: {', '.join(s['found'])}" for s in false)
     return (
-        f"{len(stores)} stores of {record['scans']} scans, {record['size_px']} px, {record['noise']}: "
-        f"**{len(false)}** with a false positive (up to {most_at_the_rate(len(stores))} would be consistent "
-        f"with {100 * RATE:g} %){': ' + named if named else ''}."
+        f"The loop was run on {len(stores)} stores, each with {record['scans']} scans of {record['size_px']} "
+        f"px. The noise is: {record['noise']}. **{len(false)}** of the stores gave a false positive; up to "
+        f"{most_at_the_rate(len(stores))} would be consistent with a rate of {100 * RATE:g} %."
+        f"{' False positives: ' + named + '.' if named else ''}"
     )
 
 
 def most_at_the_rate(stores: int) -> int:
-    """Return the largest number of false positives in ``stores`` stores that is consistent with 5 %."""
+    """Return the largest number of false positives in ``stores`` stores that is consistent with a rate of 5
+    %.
+    """
     from scipy.stats import binom
 
     return max(count for count in range(stores + 1) if binom.sf(count - 1, stores, RATE) > UNLIKELY)

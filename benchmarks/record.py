@@ -1,4 +1,4 @@
-"""Functions that all benchmarks use to record a run, write result files, and insert text into the docs."""
+"""Record the runs of benchmarks, write their result files, and insert their texts into the documentation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ NOT_MEASURED = "Not measured yet."
 
 
 def options(doc: str | None, publishing: str, out: Path | None = None) -> argparse.ArgumentParser:
-    """Return a parser with ``--publish`` (help text: ``publishing``), and ``--out`` if ``out`` is given."""
+    """Return a parser of options for a benchmark. It has the option ``--publish``, and ``--out`` if ``out``
+    is given.
+
+    Args:
+        doc: description of the benchmark.
+        publishing: help text of ``--publish``.
+        out: default of ``--out``.
+    """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if out is not None:
         parser.add_argument("--out", type=Path, default=out, help="JSON file to write")
@@ -32,12 +39,12 @@ def usable_cores() -> int:
 
 
 def origin() -> dict[str, Any]:
-    """Return the command line, commit and versions that made a result."""
+    """Return the command line, the commit and the versions of software with which a result is made."""
     return {**run_facts(), "command": command_line()}
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Write a result as JSON."""
+    """Write the record of a result as JSON."""
     with atomic_file(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
@@ -45,10 +52,11 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 def conclude(
     record: Mapping[str, Any], text: str, out: Path, page: Path, name: str, *, published: bool
 ) -> None:
-    """Write the record of a benchmark and print its text. If ``published``, also insert the text into a page.
+    """Write the record of a benchmark to ``out``, and print its text. If ``published`` is true, also insert
+    the text into a page of the documentation.
 
     Raises:
-        InputError: see ``publish``.
+        InputError: the page lacks the marks between which the text is inserted (see ``publish``).
     """
     write_record(out, record)
     print(text)
@@ -68,12 +76,18 @@ def publish(page: Path, name: str, text: str) -> None:
 
 
 def published(page: Path, name: str) -> str:
-    """Return the text between the two marks called ``name``; raise InputError if the page lacks them."""
+    """Return the text between the two marks called ``name`` in a Markdown page.
+
+    Raises:
+        InputError: the page lacks one of the marks, or they are in the wrong order.
+    """
     return _parts(page, name)[1].strip("\n")
 
 
 def _parts(page: Path, name: str) -> tuple[str, str, str]:
-    """Split a page into three texts: up to and including the first mark, between the marks, and the rest."""
+    """Split a page at its two marks into three texts: the text up to and including the first mark, the text
+    between the marks, and the text from the second mark on.
+    """
     start, end = f"<!-- {name}: written by the benchmark -->", f"<!-- end of {name} -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(start)
     inside, found_end, after = rest.partition(end)

@@ -1,11 +1,12 @@
-"""Measure how well models predict a second machine: silicon patterned by electron beam, imaged by a SEM.
+"""Measure how well the models predict a second machine, which patterns silicon with an electron beam. The
+patterns are imaged in a scanning electron microscope.
 
     litho-data build datasets/prefab-soi.toml --out prefab-soi.zarr
     python -m benchmarks.second_machine prefab-soi.zarr [--learned features,fno] [--loop FOLDER] [--publish]
 
-Models are fitted per fold, with whole patterns held out, and judged by the edges that they predict. Then the
-closed loop runs on the same folds, starting from a model with a spot and a threshold. An interrupted run
-resumes.
+The models are fitted fold by fold, with whole patterns held out, and judged by the edges that they predict
+for these patterns. Then the closed loop is run on the same folds, with a base model that has only a spot and
+a threshold. An interrupted run continues when it is run again.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ RESULT = PAGE.parent / "results" / "second-machine" / "second_machine.json"
 BASELINES = ("identity", "affine", "blur-table")
 BASE, WHOLE = "spot and threshold", "e-beam"
 BARE: dict[str, Any] = {"parts": ["spot", "etch"], "spot.sigma_um": 0.02, "fixed": ["etch.bias_px"]}
-# A model with few parameters is fitted to a window of 256 px of every second pattern; more is not needed.
+# Models with few parameters are fitted to a window of 256 px in every second pattern, which is enough for
+# them.
 FITTED_EVERY = 2
 LEARNED: dict[str, dict[str, int]] = {
     "features": {},
@@ -57,12 +59,22 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    """Fit and judge the models, run the closed loop, and write the record."""
+    """Fit and judge the models, run the closed loop, write the record, and print the tables."""
     parser = options(__doc__, "write the tables into docs/second_machine.md", RESULT)
-    parser.add_argument("store", type=Path)
-    parser.add_argument("--cache", type=Path, default=Path("runs/second-machine"), help="a file per fit")
-    parser.add_argument("--learned", default="", help=f"models to train, out of {', '.join(LEARNED)}")
-    parser.add_argument("--loop", type=Path, help="folder of the closed loop; it runs if there is no result")
+    parser.add_argument("store", type=Path, help="dataset store of the second machine")
+    parser.add_argument(
+        "--cache", type=Path, default=Path("runs/second-machine"), help="folder with a file for each fit"
+    )
+    parser.add_argument(
+        "--learned",
+        default="",
+        help=f"further models to train, separated by commas, out of {', '.join(LEARNED)}",
+    )
+    parser.add_argument(
+        "--loop",
+        type=Path,
+        help="folder of the closed loop, which is run if the folder does not contain its result",
+    )
     arguments = parser.parse_args()
     store = open_store(arguments.store)
     folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
@@ -91,23 +103,25 @@ def main() -> None:
 
 
 class Bench:
-    """Fits of the models to the folds; each fit is kept in a file."""
+    """The fits of the models to the folds. The result of each fit is kept in a file."""
 
     def __init__(self, folds: Sequence[Fold], cache: Path):
         self.folds, self._cache = folds, cache
         cache.mkdir(parents=True, exist_ok=True)
 
     def rows(self, name: str) -> list[Row]:
-        """Return the scores of every held-out pattern."""
+        """Return the scores of a model on every pattern, each from the fit that did not use the pattern."""
         kept = [self.fit(name, fold) for fold in progress(self.folds, name)]
         return sorted((row for one in kept for row in one["rows"]), key=lambda row: row["scan"])
 
     def values(self, name: str) -> list[dict[str, float]]:
-        """Return the fitted values of every fold."""
+        """Return the values of a model's parameters, fitted in every fold."""
         return [self.fit(name, fold)["values"] for fold in self.folds]
 
     def fit(self, name: str, fold: Fold) -> dict[str, Any]:
-        """Return, for one fold, the fitted values of a model and the scores of the held-out patterns."""
+        """Return the fitted values of a model in one fold, and its scores on the held-out patterns of the
+        fold.
+        """
         file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
         if not file.exists():
             bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
@@ -116,10 +130,11 @@ class Bench:
 
 
 def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str, Any]:
-    """Fit one model to the training patterns of a fold and judge it on the held-out patterns.
+    """Fit one model to the training patterns of a fold, and judge it on the held-out patterns.
 
-    If ``bare`` holds the fitted values of the bare model, a model composed of parts is fitted twice: once
-    from its default values, and once from the values of the bare model. The better fit counts.
+    If ``bare`` contains the fitted values of the base model (only a spot and a threshold), the model is
+    fitted twice. One fit starts from the default values of the model, the other from the values in ``bare``.
+    The better fit is used.
     """
     geometry = common_geometry(fold.training)
     if name in LEARNED:
@@ -137,18 +152,20 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
 
 
 def made(name: str, values: Mapping[str, Any], **geometry: Any) -> Simulator:
-    """Return a model of the table, not yet fitted, with these values."""
+    """Return an unfitted model of the table, with the given values of its parameters."""
     fields = {**BARE, **values} if name == BASE else values
     return build_model("e-beam" if name == BASE else name, **geometry, **fields)
 
 
 def started(bare: Mapping[str, float]) -> dict[str, float]:
-    """Return starting values for the model with all parts, taken from the fitted bare model."""
+    """Return starting values for the model with all components, taken from the fitted base model."""
     return {"two-spots.sigma_um": bare["spot.sigma_um"], "hill.threshold": bare["etch.threshold"]}
 
 
 def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
-    """Return the errors of edges, area, features and height of one pattern."""
+    """Return the errors of the edges, the area, the features and the heights that were predicted for one
+    pattern.
+    """
     residual_um = np.where(scan.usable, scan.height_um - prediction_um, np.nan)
     edges = edges_of_scan(scan, prediction_um, residual_um)
     films = films_of_scan(scan, prediction_um, residual_um)
@@ -163,7 +180,9 @@ def judged(scan: PrintedScan, prediction_um: np.ndarray) -> Row:
 
 
 def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str, Any]:
-    """Return the findings and edge errors of the loop, and compare it with the model that has all parts."""
+    """Return the findings of the loop, its edge errors, and the comparison of its final model with the model
+    that has all components.
+    """
     before, after = loop.error("base"), loop.error("all")
     assert before is not None
     assert after is not None
@@ -182,7 +201,9 @@ def of_loop(loop: CloseLoop, whole: Sequence[Row], pitch_um: float) -> dict[str,
 
 
 def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
-    """Return how far the mean edge error falls, with interval and p, and how many patterns improved."""
+    """Return by how much the mean edge error falls from ``before`` to ``after``, with its interval and its
+    p-value, and the number of patterns whose error falls.
+    """
     gains = [was["edge_mean_nm"] - now["edge_mean_nm"] for was, now in zip(before, after, strict=True)]
     found = over_units(gains)
     better = [found.positive, found.count]
@@ -190,7 +211,9 @@ def compared(before: Sequence[Row], after: Sequence[Row]) -> dict[str, Any]:
 
 
 def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return mean errors over patterns, total counts, and the range of each fitted value over the folds."""
+    """Return the row of a model: its mean errors over the patterns, its numbers of wrong features in all
+    patterns, and the range of each fitted value over the folds.
+    """
     errors = [row["edge_mean_nm"] for row in rows]
     means = {
         key: float(np.mean([row[key] for row in rows]))
@@ -209,7 +232,9 @@ def summary(name: str, rows: Sequence[Row], values: Sequence[Mapping[str, float]
 
 
 def draw_places(store: Store, bench: Bench, name: str) -> Figure:
-    """Draw the narrowest neck, the smallest island and the most rounded corner of the held-out patterns."""
+    """Draw three places in the patterns: the narrowest neck, the smallest island and the most rounded corner.
+    Each is drawn with the prediction of the fit that did not use the pattern.
+    """
     kept = [bench.fit(name, fold) for fold in bench.folds]
     values = {row["scan"]: one["values"] for one in kept for row in one["rows"]}
     scans = [store.scan(scan_id) for scan_id in values]
@@ -234,7 +259,9 @@ def draw_places(store: Store, bench: Bench, name: str) -> Figure:
 
 
 def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Return half the width (px) and the place of the narrowest neck: a film that continues at both ends."""
+    """Return half the width, in px, and the place (y, x) of the narrowest neck, which is a narrow part of the
+    film that continues at both ends.
+    """
     from scipy.ndimage import binary_dilation, convolve
     from skimage.morphology import medial_axis
 
@@ -245,7 +272,7 @@ def neck(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
 
 
 def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Return the size (px) and place of the smallest island."""
+    """Return the area, in px, and a place (y, x) of the smallest island."""
     from scipy.ndimage import label as labels
 
     parts, _ = labels(_inner_film(scan))
@@ -254,7 +281,9 @@ def island(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
 
 
 def corner(scan: PrintedScan) -> tuple[float, tuple[int, int]]:
-    """Return minus the largest difference between film and layout at an edge, and the place of this edge."""
+    """Return the largest difference between film and layout at an edge, with a minus sign, and the place (y,
+    x) of this difference.
+    """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     film = _inner_film(scan)
@@ -279,11 +308,13 @@ PLACES = {"neck": neck, "island": island, "corner": corner}
 
 
 def text_of(record: Mapping[str, Any]) -> str:
-    """Return the two tables and the edge errors as Markdown."""
+    """Return the table of the models, the table of the loop's findings, and the edge errors of the loop, in
+    Markdown.
+    """
     heads = (
         "model",
-        "edge error, mean (95 % over patterns)",
-        "P95",
+        "mean edge error (95 % interval over patterns)",
+        "95th percentile of the edge error",
         "area error",
         "missing",
         "extra",
@@ -315,7 +346,7 @@ def text_of(record: Mapping[str, Any]) -> str:
     found += [
         (one["name"], "–", "–", "–", f"{one['verdict']}: {one['reason']}") for one in loop["candidates"]
     ]
-    edges = "Mean edge error of held-out patterns: {:.2f} nm before, {:.2f} nm after the loop.".format(
+    edges = "Mean edge error on held-out patterns: {:.2f} nm before the loop, {:.2f} nm after it.".format(
         *loop["edges_nm"]
     )
     loop_heads = ("effect", "size", "squared error removed", "patterns improved", "verdict")

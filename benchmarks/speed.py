@@ -1,8 +1,8 @@
-"""Measure the time and memory that prediction and design need with each model of the zoo.
+"""Measure the time and the memory that predictions and designs need with each model of the zoo.
 
     python -m benchmarks.speed [--size-px 256] [--threads 1] [--device cuda] [--publish]
 
-Each model runs in a separate process. --publish also writes the table into docs/speed.md.
+Each model is measured in a process of its own. With --publish, the table is also written into docs/speed.md.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ REPEATS = 3
 
 
 def main() -> None:
-    """Measure every model, print the table, and write the record."""
+    """Measure every model, write the record, and print the table."""
     parser = options(__doc__, "write the table into docs/speed.md", OUT)
     parser.add_argument("--models", default=",".join(MODELS), help="models of the zoo, separated by commas")
-    parser.add_argument("--size-px", type=int, default=256)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="cpu", help="cpu, or a GPU: cuda")
+    parser.add_argument("--size-px", type=int, default=256, help="side of the layout in pixels")
+    parser.add_argument("--threads", type=int, default=1, help="number of threads")
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda for a GPU")
     parser.add_argument("--here", action="store_true", help="measure one model in this process")
     given = parser.parse_args()
     if given.here:
@@ -76,7 +76,9 @@ def main() -> None:
 
 
 def measured(name: str, size_px: int, threads: int, device: str) -> dict[str, Any]:
-    """Measure the seconds of a prediction with its gradient, and of an iteration of a hologram design."""
+    """Measure one model. Return the seconds that a prediction with its gradient and an iteration of a
+    hologram design take, and the peak memory.
+    """
     torch.set_num_threads(threads)
     settings = hologram_settings(changes={"layout.size_px": size_px})
     printer = load_printer(f"{zoo.PREFIX}{name}", settings.layout, device=device)
@@ -124,14 +126,17 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     return markdown_table(
         heads,
         rows,
-        f"{size_px} × {size_px} px, float32, {record['device']}, {record['threads']} thread, "
-        f"processor time, median of {REPEATS} runs, torch {record['versions']['torch']}. Training was "
-        "timed by the wall clock on a busy machine.",
+        f"The layouts have {size_px} × {size_px} px. The times were measured in float32 on the "
+        f"{record['device']} with {record['threads']} thread{'s' * (record['threads'] > 1)} and torch "
+        f"{record['versions']['torch']}. They are processor times and medians of {REPEATS} runs. The times "
+        "of training are wall-clock times on a computer that did other work at the same time.",
     )
 
 
 def _seconds(work: Callable[[], None], device: str) -> float:
-    """Return the median time of ``work`` in seconds: processor time, or clock time on a GPU."""
+    """Return the median time that ``work`` takes, in seconds. It is processor time on the CPU, and wall-clock
+    time on a GPU.
+    """
     clock = time.process_time if device == "cpu" else time.perf_counter
 
     def once() -> float:

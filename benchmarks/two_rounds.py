@@ -1,14 +1,17 @@
-"""Run two rounds of prints on the virtual fab. The second round is planned to decide open questions.
+"""Run two rounds of prints in the virtual fab. The second round is planned to decide questions that the first
+round left open.
 
     python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
-Each trial has its own fab and plants one knob in it, with an effect of 12 to 30 nm rms. Knobs and sizes are
-drawn from the seed before anything is run. The first round is a loop on 14 scans of random layouts. To
-answer its open questions, four prints are planned and printed in the same fab. As a control, the same number
-of prints with random layouts are made and scanned in the same ways. An answer is right if only the planted
-cause remains and is attributed to the right machine (printer or microscope). If the first round leaves no
-question that scans can decide, the trial is counted separately. Every seed has its own result file and
-table. An interrupted run resumes.
+Each trial has a fab of its own, in which one knob is set (the planted cause). Its effect is 12 to 30 nm rms.
+Knobs and sizes are drawn from the seed before anything is run. In the first round, the closed loop is run on
+14 scans of random layouts. To answer the questions that it leaves open, four prints are planned and printed
+in the same fab. As a control, the same number of prints with random layouts is made and scanned in the same
+ways.
+
+An answer is right if only the planted cause remains and is attributed to the right machine (printer or
+microscope). Trials whose first round leaves no question that scans can decide have no answers. Every seed has
+a result file and a table of its own. An interrupted run continues when it is run again.
 """
 
 from __future__ import annotations
@@ -53,29 +56,40 @@ DEALT = (
     "diffusion-blur",
     "slope-thinning",
 )
-# The board tests what new prints decide. Therefore the base model has the form of the fab's printer.
+# These trials test what new prints can decide, and not how good the base model is. Therefore, the base model
+# has the same form as the printer of the fab.
 BASE = "physics"
 SCANS, PRINTS = 14, 4
 RMS_NM = (12.0, 30.0)
-# Bins of the predicted power.
+# Ranges of the predicted power into which questions are grouped in the table.
 POWERS = ((0.0, 0.2), (0.2, 0.95), (0.95, 1.01))
 Arm = Literal["optimised", "random"]
 ARMS: tuple[Arm, ...] = get_args(Arm)
 
 
 def main() -> None:
-    """Run the missing trials, print the summary, and write the record."""
+    """Run the trials that have no result yet, write the record of all trials, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
     parser.add_argument("--seed", type=int, default=20271, help="seed of all random draws")
-    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="knobs to plant, in turn")
-    parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest effect")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="layouts of the second round")
-    parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
-    parser.add_argument("--publish", action="store_true", help="write the results into docs/next_print.md")
+    parser.add_argument(
+        "--knobs", nargs="+", choices=KNOBS, default=DEALT, help="knobs that the trials plant, in turn"
+    )
+    parser.add_argument(
+        "--rms-nm",
+        nargs=2,
+        type=float,
+        default=RMS_NM,
+        help="smallest and largest effect of a knob, in nm rms",
+    )
+    parser.add_argument(
+        "--arms", nargs="+", choices=ARMS, default=ARMS, help="kinds of layouts printed in the second round"
+    )
+    parser.add_argument("--size", type=int, default=192, help="side of each layout in pixels")
+    parser.add_argument("--publish", action="store_true", help="write the table into docs/next_print.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
@@ -101,7 +115,9 @@ def main() -> None:
 def draws(
     count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
 ) -> list[dict[str, Any]]:
-    """Draw the cause and the seed of each trial. Knobs are taken in turn, and their sizes are log-uniform."""
+    """Draw the knob, the size of its effect and the seed of each trial. The trials take the knobs in turn,
+    and the sizes are distributed log-uniformly.
+    """
     random = np.random.default_rng([seed, 17])
     return [
         {
@@ -121,7 +137,9 @@ def run_trial(
     arms: Sequence[Arm],
     report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run both rounds of one trial. The second round is run once for each kind of layout in ``arms``."""
+    """Run both rounds of one trial, and return its record. The second round is run once for each kind of
+    layout in ``arms``.
+    """
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
@@ -164,7 +182,9 @@ def run_trial(
 
 
 def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str, Any]:
-    """Return one decision with its predicted power, and whether it is right or wrong."""
+    """Return the record of one decision, with the power that the plan predicted for it, and whether the
+    decision is right or wrong.
+    """
     truth = KNOBS[knob]
     owner = MICROSCOPE if truth.role == "measurement" else PRINTER
     asked = {truth.effect, f"{truth.effect} as {owner}'s", owner} & set(decision.declared)
@@ -177,7 +197,8 @@ def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str,
         "evidence": decision.evidence,
         "power": planned.power[PRINTS - 1],
         "status": planned.status,
-        # The fab's default noise contains terms of single scans in every trial, whatever is planted.
+        # A question about terms of single scans does not count. The fab's default noise contains such terms
+        # in every trial, whatever is planted.
         "counts": bool(asked) and decision.kind != "per-scan",
         "right": decision.verdict == "decided" and set(decision.left) == asked,
         "wrong": decision.verdict == "decided"
@@ -201,7 +222,9 @@ def line_of(trial: dict[str, Any]) -> str:
 
 
 def summary(trials: list[dict[str, Any]]) -> str:
-    """Return a table of how many questions were decided correctly, by arm and predicted power."""
+    """Return a table that says how many questions were decided correctly, by the kind of layouts and the
+    predicted power.
+    """
     rows = []
     for arm in (one for one in ARMS if any(one in trial["answers"] for trial in trials)):
         every = [one for trial in trials for one in trial["answers"].get(arm, [])]
@@ -221,23 +244,26 @@ def summary(trials: list[dict[str, Any]]) -> str:
                     str(sum(one["status"] == "no experiment separates" for one in some)),
                 )
             )
-        rows.append((arm, "not about the planted cause", "–", "–", "–", str(stray), "–"))
+        rows.append((arm, "questions about other causes", "–", "–", "–", str(stray), "–"))
     with_question = sum(any(one["counts"] for one in t["answers"].get("optimised", [])) for t in trials)
     return markdown_table(
         (
-            "layouts",
+            "layouts of the second round",
             "predicted power",
             "questions",
-            "mean power",
+            "mean predicted power",
             "decided correctly",
-            "wrongly",
+            "decided wrongly",
             "declared not separable",
         ),
         rows,
-        f"The {len(trials)} trials plant the knobs in turn. In {with_question} of them, the first round left "
-        f"a question about the planted cause. Powers are those that the plan predicts for {PRINTS} prints. "
-        "Shares have 95 % Wilson intervals. The last column was declared before printing.",
-        f"Questions about the planted cause that optimised layouts decided correctly: {_by_knob(trials)}.",
+        f"Each of the {len(trials)} trials plants one knob. In {with_question} of them, the first round left "
+        "a question about the planted cause. The predicted power is the probability, according to the plan, "
+        f"that {PRINTS} prints decide a question. Brackets contain 95 % Wilson intervals of the share. For "
+        "the questions in the last column, the plan stated before printing that no experiment separates the "
+        "answers.",
+        "For each planted knob, the number of questions about it that the optimised layouts decided "
+        f"correctly: {_by_knob(trials)}.",
     )
 
 

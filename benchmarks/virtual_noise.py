@@ -1,4 +1,4 @@
-"""Publish the noise analysis of virtual prints with known roughness in the documentation.
+"""Publish the noise analysis of virtual prints, whose roughness is known, in the documentation.
 
     litho-data masks --out doses --pattern dose-matrix --count 7 --size-px 512
     litho-data simulate --out doses-printed --layouts doses/card.toml
@@ -10,7 +10,7 @@
     litho-models noise fab.zarr --out fab-noise --residuals fab-benchmark
     python -m benchmarks.virtual_noise doses-noise fab-noise
 
-Writes all numbers that the page quotes from the result files. A test checks that the page agrees with them.
+The texts on the page are written from the copied records. A test checks that the page agrees with them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ DOSES, REFERENCES = "dose-matrix", "references"
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """Return the texts for the page, by the names of their marks, made from the two results in a folder."""
+    """Return the texts for the page, by the names of their marks. They are made from the two records in a
+    folder.
+    """
     doses, references = (NoiseAnalysis.read(folder / name) for name in (DOSES, REFERENCES))
     return {
         "dose matrix": dose_table(doses),
@@ -40,7 +42,9 @@ def texts(folder: Path) -> dict[str, str]:
 
 
 def dose_table(found: NoiseAnalysis) -> str:
-    """Return a table of height, roughness, lost steps and readability for every dose, with the best dose."""
+    """Return a table of the heights, the roughness, the lost steps and the readability at every dose,
+    followed by the recommended dose.
+    """
     assert found.dose is not None
     rows = [
         (
@@ -54,29 +58,38 @@ def dose_table(found: NoiseAnalysis) -> str:
         for row in found.dose.rows
     ]
     return markdown_table(
-        ("dose", "gain", "highest level", "roughness", "lost steps, low + high levels", "worst readability"),
+        (
+            "dose",
+            "gain",
+            "height of the highest level",
+            "roughness",
+            "lost steps at low + at high levels",
+            "readability of the worst step",
+        ),
         rows,
-        f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. Left out of the "
-        f"other estimates: {', '.join(found.run.dropped)}.",
+        f"Recommended dose: {found.dose.recommended_dose:g}. Reason: {found.dose.reason}. These scans were "
+        f"left out of the other estimates: {', '.join(found.run.dropped)}.",
     )
 
 
 def planted_text(found: NoiseAnalysis) -> str:
-    """Return a sentence that compares the flat print and the noise budget with the planted roughness."""
+    """Return a text that compares two measured values of the roughness, from the flat print and from the
+    noise budget, with the true one.
+    """
     flat = next(one for one in found.references.flats if one.background == "offset")
     assert found.budget is not None
     noise = found.budget.floor.at("full")
     assert noise is not None
     return (
-        f"The planted roughness of the virtual prints is {Noise().roughness_nm:g} nm. The flat print gives "
-        f"{flat.sigma_nm:.2f} ± {flat.sigma_uncertainty_nm:.2f} nm, and the noise budget gives "
-        f"{with_interval(noise.rmse_nm, noise.rmse_ci95_nm)} at k = 7, from residuals of "
-        f"`{found.budget.model}` on {found.run.n_scans} scans."
+        f"The true roughness of the virtual prints is {Noise().roughness_nm:g} nm. The value from the flat "
+        f"print is {flat.sigma_nm:.2f} ± {flat.sigma_uncertainty_nm:.2f} nm. The value from the noise budget "
+        f"at k = 7, computed from the residuals of `{found.budget.model}` on {found.run.n_scans} scans, is "
+        f"{with_interval(noise.rmse_nm, noise.rmse_ci95_nm)}."
     )
 
 
 def main() -> None:
-    """Copy the results and publish the texts."""
+    """Copy the records, and write the texts into the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

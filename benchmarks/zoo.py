@@ -1,10 +1,12 @@
-"""Make the models that ship with the package: the models of the benchmark table, trained in the same way.
+"""Make the models that come with the package (the zoo). They are the models of the benchmark table, trained
+in the same way.
 
     make zoo
     python -m benchmarks.zoo runs/zoo --models pbl,fno
 
-Training uses all scans except the locked ones. A finished run is reused; an interrupted one continues.
-Each card first lists the errors of the table. They come from five other fits, each of them to fewer scans.
+Training uses all scans except the locked ones. A finished training run is reused, and an interrupted one
+continues. The card of each model first lists the errors from the table, which are those of five other fits,
+each of them to fewer scans.
 """
 
 from __future__ import annotations
@@ -32,8 +34,9 @@ from litho_models.scoring.scores import score_model
 
 CARD = ROOT / "datasets" / "neural-lithography.toml"
 LARGEST_ZOO_BYTES = 10_000_000
-# The scored PBL includes its scan-axis network. The prints cannot show whether printer or microscope causes
-# what this network describes.
+# For these models, the parts that are attributed to the printer when the model is frozen. The errors in the
+# table are those of PBL with its scan-axis network, so the frozen model includes it. The measured prints
+# cannot show whether the printer or the microscope causes what this network describes.
 WHOLE: dict[str, dict[str, Attribution]] = {"pbl": {SCAN_AXIS: "printer"}}
 LIMITATIONS = [
     "Trained on prints of one machine, resist and protocol. Retrain the model for any other.",
@@ -49,18 +52,20 @@ def make_zoo(
     root: str | Path = zoo.ZOO_FOLDER,
     models: Sequence[str] = (),
 ) -> dict[str, ModelCard]:
-    """Train, freeze and describe the models of a table; a repeated call continues an interrupted one.
+    """Train the models of a benchmark table, freeze them, and write their cards. Return the cards by name.
+
+    If a call was interrupted, another call continues it.
 
     Args:
-        store: dataset store.
-        runs: folder of the run folders.
-        table: benchmark of that store with split ``grouped``.
-        root: folder of the zoo, which gets a folder per model.
-        models: names of models in the table; all by default.
+        store: path of the dataset store.
+        runs: folder of the training runs, with a folder for each model.
+        table: record of a benchmark on this store with the split ``grouped``.
+        root: folder of the zoo, with a folder for each model.
+        models: names of the models to make; by default, all models of the table.
 
     Raises:
-        InputError: the table is not about these data, a model has other training settings, or the zoo is too
-            large.
+        InputError: the table belongs to another dataset or split, a model was trained with other settings
+            than in the table, or the zoo is too large.
     """
     dataset = open_store(store)
     if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
@@ -94,7 +99,7 @@ def make_zoo(
 
 
 def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
-    """Return the errors of one model, in the order of the columns of the table."""
+    """Return the errors of one model for its card, in the order of the table's columns."""
     bare = {row.policy: row for row in scores.without_background}
     used: BackgroundUse = "training" if bare else "none"
     free = {row.policy: row for row in scores.by_policy}
@@ -118,12 +123,15 @@ def card_metrics(scores: ModelScores, split: str) -> list[CardMetric]:
 
 
 def size_bytes(root: str | Path) -> int:
-    """Return the size of all files of the zoo, in bytes."""
+    """Return the total size of all files of the zoo, in bytes."""
     return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())
 
 
 def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtocol, ModelScores]:
-    """Score a frozen model on scans, with the background of its card; return the protocol and the scores."""
+    """Score a frozen model on scans. The background in its card is added to its predictions.
+
+    Return the protocol of the scoring, and the scores.
+    """
     model = load_frozen(folder)
     learned = card_background(model, scans)
     predictions = [Prediction.beside(learned, predict_frozen(model, scan)) for scan in scans]
@@ -132,20 +140,26 @@ def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtoco
 
 
 def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise InputError if a model was not trained with the settings of the table."""
+    """Check that a model was trained with the settings in the table.
+
+    Raises:
+        InputError: a setting differs.
+    """
     for key, value in wanted.items():
-        # A fit by least squares ignores the optimiser of the recipe.
+        # The optimiser is not compared, because fits by least squares do not use it.
         if key != "optimiser" and trained[key] != value:
             raise InputError(f"{key} of {name}", got=trained[key], wanted=f"{value}, as in the table")
 
 
 def main() -> None:
-    """Build the store, make the models, and print their errors."""
+    """Build the store if it does not exist, make the models, and print their errors."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", type=Path, help="folder of the store and of the training runs")
-    parser.add_argument("--models", help="names, separated by commas; by default all models of the table")
+    parser.add_argument(
+        "--models", help="names of the models, separated by commas; by default, all models of the table"
+    )
     given = parser.parse_args()
     store = given.runs / "neural-lithography.zarr"
     if not store.exists():
@@ -153,7 +167,7 @@ def main() -> None:
     table = Benchmark.model_validate(in_table(FOLDER))
     cards = make_zoo(store, given.runs, table, models=given.models.split(",") if given.models else ())
     for name, card in cards.items():
-        print(f"{name:16} {card.parameters:9,} numbers")
+        print(f"{name:16} {card.parameters:9,} parameters")
         for metric in card.metrics:
             print(f"  {metric.name:16} {metric.text:28} policy {metric.policy:8} {metric.split}")
     print(f"{zoo.ZOO_FOLDER.name}: {size_bytes(zoo.ZOO_FOLDER) / 1e6:.2f} MB")

@@ -1,8 +1,9 @@
 """Run the whole workflow: prints and scans → dataset → models → closed loop → design → score.
 
-Without ``--dataset`` the virtual fab makes the prints and adds effects that no model contains.
-``--dataset neural-lithography`` uses the measured prints. Every step runs one command of the project and
-prints this command. A step whose result exists is skipped, so an interrupted demo resumes.
+Without ``--dataset``, the virtual fab makes the prints, with two effects of which the demo does not tell the
+programs. With ``--dataset neural-lithography``, the measured prints are used. Every step runs one command of
+the project and prints it. Steps whose result exists are skipped, so an interrupted demo continues when it is
+run again.
 """
 
 from __future__ import annotations
@@ -22,15 +23,18 @@ from litho_models.cli import main as models
 PROGRAMS = {"litho-data": data, "litho-models": models, "litho-design": design}
 CARDS = Path(__file__).parents[1] / "datasets"
 WORKERS = ("--workers", 2)
-# Seeds of the random draws of the paper's split.
+# Seeds with which the paper's random split into training and test scans is drawn.
 PAPER_SEEDS = (0, 1, 2, 3)
-# The networks are not trained with whole prints left out, because that would double the time of the demo.
+# The models that are compared with whole prints held out. The networks are left out, because training them
+# once more would double the time of the demo.
 BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random-features"
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much the demo trains and designs: enough for the main steps, or as much as the docs need."""
+    """How much the demo trains and designs: enough to show the main steps, or as much as the results in the
+    documentation need.
+    """
 
     models: str
     arms: tuple[str, ...]
@@ -41,8 +45,8 @@ class Effort:
     seeds: int
 
 
-# An element of 256 px resolves wavelength x distance / side: 0.6 µm at a distance of 25 µm. The target's
-# letters have strokes of 0.8 µm.
+# An element resolves wavelength times distance over side. With 256 px and a distance of 25 µm, this is 0.6
+# µm, and the letters of the target have strokes of 0.8 µm.
 QUICK = Effort(
     models="identity,affine,blur-table,physics",
     arms=("physics",),
@@ -52,7 +56,7 @@ QUICK = Effort(
     iterations=50,
     seeds=1,
 )
-# The settings of docs/results. At 75 µm the resolution is 1.9 µm, so the letters are blurred.
+# The settings of the results in docs/results. At 75 µm, the resolution is 1.9 µm, so the letters are blurred.
 MEASURED = Effort(
     models=f"{BY_PRINT},pbl,fno",
     arms=("affine", "physics", "pbl"),
@@ -66,7 +70,9 @@ MEASURED = Effort(
 
 @dataclass(frozen=True)
 class Step:
-    """One command, the file or folder that exists once the command has finished, and its report."""
+    """One step of the demo. ``command`` is its command line, ``result`` is the file or folder that exists
+    once the command has finished, and ``report`` is the page that the command writes, if it writes one.
+    """
 
     title: str
     command: tuple[str, ...]
@@ -78,7 +84,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--dataset", default="", help="name of a card in datasets/, e.g. neural-lithography")
+    parser.add_argument(
+        "--dataset",
+        default="",
+        help="name of a dataset card in datasets/, such as neural-lithography; by default, the virtual fab",
+    )
     parser.add_argument("--out", type=Path, default=Path("runs"), help="folder for all results")
     arguments = parser.parse_args()
 
@@ -91,8 +101,9 @@ def main() -> None:
 
 
 def plan(out: Path, dataset: str) -> list[Step]:
-    """Return the steps in order. Later steps read the results of earlier ones."""
-    # Worker processes import this module, so it imports torch only where the demo itself needs it.
+    """Return the steps of the demo in order. Later steps read the results of earlier ones."""
+    # This import loads torch. It stands here because worker processes import this module and do not need
+    # torch.
     from examples.demo_story import CORRECTED, FAB
 
     effort = MEASURED if dataset else QUICK
@@ -108,9 +119,10 @@ def plan(out: Path, dataset: str) -> list[Step]:
             _data("simulate", "--preset", "demo", "--out", card.parents[1]),
             card,
         )
-        # Physics contains the process of the fab, and a single base model keeps the demo below five minutes.
+        # Physics has the same form as the fab's process, and with a single base model the demo takes less
+        # than five minutes.
         anew = ["--base", "physics"]
-    # A network trains in all threads; two processes would leave one to each.
+    # Networks are trained in all threads. With two processes, each would have only one thread.
     workers = () if dataset else WORKERS
     steps = [
         source,
@@ -174,7 +186,8 @@ def plan(out: Path, dataset: str) -> list[Step]:
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
         "--iterations", effort.iterations,
     )  # fmt: skip
-    # If the printer is virtual, it is the judge itself, and the corrected model can be one of the arms.
+    # A virtual printer judges the designs itself, and designs are also made with the corrected model. For the
+    # measured printer, the corrected model is the judge.
     judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")
     arms = effort.arms if dataset else (*effort.arms, CORRECTED)
     models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in arms)])
@@ -182,13 +195,13 @@ def plan(out: Path, dataset: str) -> list[Step]:
     if dataset:
         steps += [
             Step(
-                "Design a hologram through the learned printer",
+                "Design a hologram with the learned model of the printer",
                 _design("hoe", "--model", out / "models" / "pbl", *element, "--out", out / "hoe"),
                 out / "hoe" / "design.json",
                 out / "hoe" / "report.html",
             ),
             Step(
-                "Score it with a printer that was not used to design it",
+                "Score the hologram with a model that was not used to design it",
                 _design("score", out / "hoe", "--judge", f"corrected={corrected}", "--out", out / "score"),
                 out / "score" / "score.json",
                 out / "score" / "report.html",
@@ -209,10 +222,12 @@ def plan(out: Path, dataset: str) -> list[Step]:
 
 
 def run(step: Step, number: str) -> float:
-    """Run one step unless its result exists, and return its time in s; a failed step ends the demo."""
+    """Run one step unless its result exists, and return the time that it took in seconds. A step that fails
+    ends the demo.
+    """
     print(f"\n{number} {step.title}\n$ {_spell(step.command)}", flush=True)
     if step.result.exists():
-        print("  already done")
+        print("  skipped, because its result exists")
         return 0.0
     started = time.monotonic()
     code = call(step.command)
@@ -223,9 +238,9 @@ def run(step: Step, number: str) -> float:
 
 
 def call(words: tuple[str, ...]) -> int:
-    """Run a command of the project in this process and return its exit code.
+    """Run a command of the project in this process, and return its exit code.
 
-    A process of its own would import the packages again, which takes some seconds.
+    A separate process would have to import the packages again, which takes some seconds.
     """
     given, sys.argv = sys.argv, list(words)
     try:
@@ -238,7 +253,9 @@ def call(words: tuple[str, ...]) -> int:
 
 
 def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> tuple[str, Path]:
-    """Write a page with the demo's answer and links to all reports; return the answer and the page's path."""
+    """Write a page with the demo's answer and links to all reports. Return the answer and the path of the
+    page.
+    """
     import pandas as pd
 
     from examples.demo_story import tell
@@ -247,7 +264,8 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     from litho_models.loop.report import said
 
     page = Page(
-        f"litholoop: {name}", "From raw scans to a design that was optimised through the learned printer."
+        f"litholoop: {name}",
+        "From raw scans to a design that was optimised with a learned model of the printer.",
     )
     if (out / "fab").exists():
         answer = tell(page, out)
@@ -257,7 +275,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
         page.verdict(answer)
         rows = {"the base model": loop.error("base"), "what the loop found": loop.error("all")}
         tiles = [
-            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans (one term fitted per scan)")
+            (f"{row.mae_nm:.2f} nm", f"error with {name} on held-out scans (one offset fitted to each scan)")
             for name, row in rows.items()
             if row is not None
         ]
@@ -268,7 +286,9 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     table = pd.DataFrame(
         {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
     )
-    page.table(table, "0 s means that the result existed from an earlier run.", "steps.csv", digits=1)
+    page.table(
+        table, "A time of 0 s means that an earlier run had already made the result.", "steps.csv", digits=1
+    )
     return answer, page.write(out, "index.html")
 
 

@@ -1,4 +1,6 @@
-"""Write the page of the demo: the planted effects, the effects that were found, and a better hologram."""
+"""Write the page of the demo. It tells which effects were planted in the virtual fab, which of them were
+found, and how much better a hologram becomes.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +26,20 @@ from litho_models.loop.record import CloseLoop, FoundEffect
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Name that ``compare`` uses for the printer of the scans.
+# The name of the virtual fab, as judge, in the comparison of designs.
 FAB = "fab"
-# Name of the base model with the effects that the loop added.
+# The name of the corrected model, which is the base model with the effects that the loop added.
 CORRECTED = "corrected"
-# Found in every print: the fab, like an AFM, gives each scan a different zero, and lines are always rough.
+# These effects are found in every run and not listed. Like an AFM, the fab gives each scan a different zero,
+# and its printed lines are always rough.
 ALWAYS = ("datum-offset", "line-roughness")
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
-# All images have the same scale, so that dim images look dim.
+# All images have the same brightness scale, so that dim images look dim.
 IMAGE = {"cmap": "inferno", "vmin": 0.0, "vmax": BRIGHTEST}
 
 
 def tell(page: Page, out: Path) -> str:
-    """Add the verdict and the sections to the index page of the demo in ``out``; return the verdict."""
+    """Add the verdict and the sections to the page of a demo with results in ``out``. Return the verdict."""
     truth = Truth.read(out / "fab" / "truth")
     loop = CloseLoop.read(out / "close-loop")
     gap = GapResult.read(out / "compare")
@@ -59,18 +62,21 @@ def tell(page: Page, out: Path) -> str:
         f"{': ' if hit else ''}{' and '.join(hit)}"
         f"{_also([name for name in found if name not in planted])}. On held-out scans, the error "
         f"changed from {before.mae_nm:.1f} to {after.mae_nm:.1f} nm ({abs(less):.0f} % "
-        f"{'less' if less >= 0 else 'more'}). When this printer prints it, a hologram designed through "
-        f"the corrected model reaches {psnr[CORRECTED]:.1f} dB; one designed without a model reaches "
-        f"{psnr['none']:.1f} dB. A single run cannot show how much of this is chance."
+        f"{'less' if less >= 0 else 'more'}). If the virtual fab prints it, a hologram designed with "
+        f"the corrected model reaches {psnr[CORRECTED]:.1f} dB (SI-PSNR of its image), and one designed "
+        f"without a model {psnr['none']:.1f} dB. A single run cannot show how much of this difference is "
+        "chance."
     )
     page.verdict(answer)
     page.heading("1. What was planted")
     told = [f"{get_effect(name).title} ({knob})" for name, knob in planted.items()]
     page.paragraph(
-        f"Only the virtual fab knows these effects: {'; '.join(told)}. No file that the programs read "
+        f"The virtual fab prints with these effects: {'; '.join(told)}. No file that the programs read "
         "mentions them."
     )
-    page.figure(_first_scan(out / "store.zarr"), "The first field: its layout, its scan, and the difference.")
+    page.figure(
+        _first_scan(out / "store.zarr"), "The first field: its layout, its scan, and their difference."
+    )
     page.links([("store-report/report.html", "The dataset, scan by scan")])
     page.heading("2. What was found")
     page.paragraph(f"Found and planted: {', '.join(hit) or 'none'}. Planted and not found: "
@@ -78,21 +84,24 @@ def tell(page: Page, out: Path) -> str:
                    f"{_width(loop)}")  # fmt: skip
     page.figure(
         _gains(loop, set(planted)),
-        "How much the error grows when each cause is left out. Planted causes are blue.",
+        "Increase of the error if one of the found causes is left out. Planted causes are blue.",
     )
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
     page.heading("3. The error before and after the loop")
     over = loop.over_scans
-    interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, 95 % over scans)".format(*over.ci95_nm)
+    interval = (
+        "" if over.ci95_nm is None else " (95 % interval over scans: {:.2f} to {:.2f})".format(*over.ci95_nm)
+    )
     page.paragraph(
-        f"The mean absolute error of {over.count} held-out scans is {loop.gain_nm:.2f} nm smaller{interval}, "
-        f"and it is smaller in {over.positive} of {over.count} scans. "
-        f"Terms fitted per scan: {before.k:g} before and {after.k:g} after."
+        f"After the loop, the mean absolute error on {over.count} held-out scans is {loop.gain_nm:.2f} nm "
+        f"smaller{interval}. It is smaller in {over.positive} of the {over.count} scans. The number of terms "
+        f"fitted to each scan is {before.k:g} before and {after.k:g} after the loop."
     )
     pairs = {"before": before, "after": after}
     page.figure(
         _bars({name: one.mae_nm for name, one in pairs.items()}, "error, nm", [OTHER, PLANTED]),
-        "Before: the model as it was trained. After: with the effects that the loop found.",
+        "Before: the base model as it was trained. After: the base model with the effects that the loop "
+        "found.",
     )
     page.heading("4. Which model predicts best")
     benchmark = Benchmark.read(out / "benchmark")
@@ -101,7 +110,8 @@ def tell(page: Page, out: Path) -> str:
     colours = [model_colour(name) for name in scores]
     page.figure(
         _bars(scores, "error, nm", colours),
-        "Errors of the models on held-out scans, after the zero of each scan is fitted.",
+        "Errors of the models on held-out scans. The zero height of each scan is fitted before its error is "
+        "computed.",
     )
     page.links(
         [
@@ -109,27 +119,35 @@ def tell(page: Page, out: Path) -> str:
             ("compare/report.html", "Designs made with one model and judged with another"),
         ]
     )
-    designs = {"none": "without a model", CORRECTED: "through the corrected model"}
+    designs = {"none": "without a model", CORRECTED: "with the corrected model"}
     for number, (arm, how) in enumerate(designs.items(), 5):
         folder = design_folder(Path("compare"), arm, gap.seeds[0])
         page.heading(f"{number}. A hologram designed {how}")
-        page.paragraph(f"When the fab prints this hologram, its image reaches {psnr[arm]:.1f} dB.")
-        page.figure(_hologram(out / folder, out / "fab" / "truth"), "The target, the print, and its image.")
+        page.paragraph(f"If the fab prints this hologram, the SI-PSNR of its image is {psnr[arm]:.1f} dB.")
+        page.figure(
+            _hologram(out / folder, out / "fab" / "truth"),
+            "The target, the print, and the image of the print.",
+        )
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
     return answer
 
 
 def _causes(loop: CloseLoop) -> list[FoundEffect]:
-    """Return the effects in the corrected model, without those that only describe the residual."""
+    """Return the effects in the corrected model, except those that describe the residual without naming a
+    cause.
+    """
     return [effect for effect in loop.effects if effect.knowledge != "description"]
 
 
 def _width(loop: CloseLoop) -> str:
-    """Return a sentence that states how much wider the loop finds the spot along one axis, in µm."""
+    """Return a sentence that states the extra blur in µm that the loop finds along one axis of the spot. It
+    is empty if the loop did not find such a blur.
+    """
     spot = next((effect for effect in loop.effects if effect.name == "elliptical-psf"), None)
     if spot is None:
         return ""
-    # The moments grow by s² along one axis: Cxx - Cyy and 2 Cxy are s² cos 2a and s² sin 2a.
+    # A blur of standard deviation s along an axis at the angle a adds s² cos 2a to the difference Cxx - Cyy
+    # of the spot's second moments, and s² sin 2a to 2 Cxy.
     stretch, shear = (spot.strengths[name][0].value for name in ("stretch_um2", "shear_um2"))
     wider_um = math.hypot(stretch, shear) ** 0.5
     return f" The loop finds an extra blur of {wider_um:.2f} µm along one axis of the spot."
@@ -165,7 +183,8 @@ def _bars(values: dict[str, float], label: str, colours: list[str]) -> Figure:
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
-    # On a phone's screen, the numbers beside the bars need a fifth of the width.
+    # The margin leaves room for the numbers beside the bars. On a phone's screen, they need a fifth of the
+    # width.
     axis.margins(x=0.22)
     axis.invert_yaxis()
     axis.set_xlabel(label)
@@ -182,7 +201,9 @@ def _hologram(folder: Path, fab: Path) -> Figure:
 
 
 def _row(maps: dict[str, np.ndarray], scales: dict[str, dict[str, Any]]) -> Figure:
-    """Draw maps side by side; the colours of a map without an entry in ``scales`` span its own values."""
+    """Draw maps side by side. The colours of a map span the range in ``scales``, or the range of the map's
+    own values if it has no entry there.
+    """
     figure = new_figure(10.5, 3.6)
     for axis, (title, picture) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         figure.colorbar(axis.imshow(picture, **scales.get(title, {})), ax=axis, shrink=0.75)

@@ -1,9 +1,9 @@
-"""Design a lens with an extended depth of focus, whose spot stays bright over a range of distances.
+"""Design a lens with an extended depth of focus. Its spot stays bright over a range of distances.
 
     python examples/extended_focus.py zoo:pbl
 
-The free cells of the layout are rings. The loss rewards brightness on the axis, mainly in the dimmest planes.
-The search starts from a plain lens.
+The search varies the heights of concentric rings, and starts from a plain lens. The loss rewards brightness
+on the axis, mainly in the planes where it is lowest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ WAVELENGTH_UM, PLANES = 0.6328, 9
 
 
 class Axis:
-    """Compute the central spot's brightness in several planes, relative to the focus of a perfect lens."""
+    """The optical axis behind a lens. It computes the brightness of the central spot in several planes,
+    relative to the focus of a perfect lens.
+    """
 
     def __init__(self, element: litho_design.Element, focal_um: float, range_um: float):
         size, pitch = element.layout.size_px, element.layout.pitch_um
@@ -38,7 +40,7 @@ class Axis:
         self.peak = self._light(self.propagators[PLANES // 2], focused)
 
     def brightness(self, element: litho_design.Element) -> torch.Tensor:
-        """Return the relative brightness in each plane (planes,)."""
+        """Return the relative brightness in each plane, as an array of shape (planes,)."""
         behind = element(self.wave, WAVELENGTH_UM)
         return torch.stack([self._light(go, behind) for go in self.propagators]) / self.peak
 
@@ -47,13 +49,15 @@ class Axis:
 
 
 def main() -> None:
-    """Compare printed lenses: a plain one, one designed for a perfect printer, and one through a model."""
+    """Compare three printed lenses: a plain lens, one designed for a perfect printer, and one designed with a
+    model.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
-    parser.add_argument("--size-px", type=int, default=320)
-    parser.add_argument("--focal-um", type=float, default=60)
-    parser.add_argument("--range-um", type=float, default=30)
-    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--size-px", type=int, default=320, help="side of the lens in pixels")
+    parser.add_argument("--focal-um", type=float, default=60, help="focal length in µm")
+    parser.add_argument("--range-um", type=float, default=30, help="range of distances in µm")
+    parser.add_argument("--iterations", type=int, default=100, help="number of iterations of each search")
     words = parser.parse_args()
     layout = {"size_px": words.size_px, "cell_um": 0.2, "symmetry": "radial"}
     judge = litho_design.Element(words.model, layout)
@@ -64,14 +68,15 @@ def main() -> None:
         optimiser = torch.optim.Adam(element.free.parameters(), lr=0.2)
         for _ in range(iterations):
             optimiser.zero_grad()
-            # A soft minimum gives the dimmest planes the largest weight.
+            # The loss is a soft minimum of the brightness, in which the dimmest planes have the largest
+            # weight.
             torch.logsumexp(-3 * axis.brightness(element).log(), 0).backward()
             optimiser.step()
         judge.start_from_levels(element.levels())
         with torch.no_grad():
             seen = axis.brightness(judge)
         what = f"designed with {name}" if iterations else "a plain lens"
-        print(f"{what}: brightness {float(seen.min()):.3f} to {float(seen.max()):.3f} as printed")
+        print(f"{what}: after printing, the brightness is {float(seen.min()):.3f} to {float(seen.max()):.3f}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Measure, scan by scan, how much of the print's own slope and bow a plain background removes.
+"""Measure how much of the print's own slope and bow is removed from each scan by levelling that ignores the
+layout.
 
     python examples/layout_aware_levelling.py STORE.zarr
 
-The script fits a layout-aware background and a plain polynomial to the raw heights of each scan in a store,
-and prints one table in nm.
+The script fits two backgrounds to the raw heights of each scan in a store. One is fitted together with the
+layout (layout-aware), the other is a plain polynomial. It prints a table that compares them, in nm.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from litho_data.store import Store, open_store
 
 
 def main() -> None:
-    """Compare both backgrounds on every scan of the store, and print the table."""
-    parser = argparse.ArgumentParser(description="Compare both backgrounds, scan by scan.")
+    """Compare the two backgrounds of every scan of the store, and print the table."""
+    parser = argparse.ArgumentParser(
+        description="Compare a layout-aware and a plain background of every scan of a store."
+    )
     parser.add_argument("store", help="dataset store built from raw scans")
     store = open_store(parser.parse_args().store)
     rows = [compare(store, scan_id) for scan_id in progress(store.ids, "levelling")]
@@ -31,7 +34,9 @@ def main() -> None:
 
 
 def compare(store: Store, scan_id: str) -> dict[str, float]:
-    """Return the range of each plane over the field, and the rms difference of the second-degree fits, nm."""
+    """Compare the two backgrounds of one scan. Return the range of both planes over the field, and the rms
+    difference of both polynomials of degree 2, in nm.
+    """
     print_ = store.scan(scan_id)
     height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
     own = store.quality["scan"] == scan_id

@@ -1,10 +1,11 @@
-"""Add two effects of your own to the closed loop: one of the printer, and one of single scans.
+"""Add two effects of your own to the closed loop: one that the printer causes, and one that differs from scan
+to scan.
 
     python examples/own_effect.py STORE.zarr --out loop
 
-The script registers a process effect (the first layers sink into the adhesion promoter) and a per-scan term
-(the scanner's bow has a cubic part). It then closes the loop as `litho-models close-loop` does. Nothing else
-needs to change: `close_loop.json` and `report.html` contain a verdict on both effects.
+The script registers an effect of the process (the first layers sink into the adhesion promoter) and a
+per-scan term (the scanner's bow has a cubic part). It then runs the closed loop as `litho-models close-loop`
+does. Nothing else needs to change: `close_loop.json` and `report.html` contain a verdict on both effects.
 """
 
 from __future__ import annotations
@@ -24,18 +25,22 @@ SINKING_DEPTH_UM = 0.2
 
 
 def sinking_layers(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Return H - d exp(-M / 0.2 µm): the lowest parts of a layout M are printed lower, by at most d."""
+    """Return the height H - d exp(-M / 0.2 µm), where M is the layout's height. The lowest parts of the
+    layout are printed lower, by at most the depth d.
+    """
     return height - values["depth_um"] * torch.exp(-context.layout_um / SINKING_DEPTH_UM)
 
 
 def cubic_bow_map(pixels: TermPixels) -> FloatMap:
-    """Return x³ at the pixels, (1, n), with x from -1 to 1 over the scan; its mean is zero."""
+    """Return x³ at n pixels of a scan, as an array of shape (1, n). Here, x runs from -1 to 1 over the scan,
+    so the mean of x³ is zero.
+    """
     x = pixels.smooth[0]
     return (x**3)[None]
 
 
 def register() -> None:
-    """Register both effects, and the scan term that implements the second one."""
+    """Register both effects, and the per-scan term that implements the second one."""
     register_effect(
         Effect(
             name="sinking-layers",
@@ -66,14 +71,14 @@ def register() -> None:
 
 
 def main() -> None:
-    """Register the effects, close the loop, and print the verdict on each."""
+    """Register the effects, run the closed loop, and print the verdict on each effect."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("store", help="dataset store")
     parser.add_argument("--out", required=True, help="folder of the result")
-    parser.add_argument("--base", default="physics", help="model to correct (default physics)")
-    parser.add_argument("--folds", type=int, default=5, help="number of outer folds of scans (default 5)")
+    parser.add_argument("--base", default="physics", help="model that the loop corrects (default physics)")
+    parser.add_argument("--folds", type=int, default=5, help="number of folds of held-out scans (default 5)")
     given = parser.parse_args()
     register()
     result = close_loop(given.store, given.out, base=given.base, folds=given.folds)

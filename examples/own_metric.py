@@ -1,9 +1,9 @@
-"""Add a metric of your own to the results, the report and the tables of an evaluation.
+"""Add a metric of your own to an evaluation. It then appears in the results, the report and the tables.
 
     python examples/own_metric.py zoo:pbl STORE.zarr --out evaluation
 
-The script registers a metric, the share of pixels that are wrong by more than half a level. It then evaluates
-a model as `litho-models evaluate` does. Nothing else needs to change: the metric appears in the JSON file,
+The script registers a metric, the share of pixels whose error exceeds half a level. It then evaluates a model
+as `litho-models evaluate` does. Nothing else needs to change: the metric appears in the JSON file,
 `report.html`, `metrics.csv` and `scans.csv`.
 """
 
@@ -21,7 +21,9 @@ from litho_models import evaluate, register_metric
 def share_off_by_half_a_level(
     scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray
 ) -> float | None:
-    """Return the percentage of scored pixels whose error exceeds half a level; None if no pixel is scored."""
+    """Return the percentage of scored pixels whose error exceeds half a level, or None if no pixel is
+    scored.
+    """
     scored = residual_um[np.isfinite(residual_um)]
     return 100 * float(np.mean(np.abs(scored) > scan.level_height_um / 2)) if scored.size else None
 
@@ -39,10 +41,12 @@ def main() -> None:
         "off_by_half_a_level",
         "percent",
         share_off_by_half_a_level,
-        "off_by_half_a_level is the share of pixels wrong by more than half a level.",
+        "off_by_half_a_level is the share of pixels whose error exceeds half a level.",
     )
     scores = evaluate(given.model, given.store, given.out).scores
-    print(f"{scores.model}: {scores.metrics[metric.key]:.1f} % of the pixels are off by over half a level")
+    print(
+        f"{scores.model}: the error exceeds half a level in {scores.metrics[metric.key]:.1f} % of the pixels"
+    )
 
 
 if __name__ == "__main__":

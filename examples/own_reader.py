@@ -1,7 +1,8 @@
-"""Add a reader of your own: Python, cards and commands can then read files that begin with TOYAFM.
+"""Add a reader of your own for files that begin with TOYAFM. Python code, dataset cards and commands can then
+read such files.
 
-In your own project, a file like this one is all you need. In this package, a reader is a module of
-`litho_data/readers/` that ends in `READER = Reader(...)`, with an entry in `registry.py`.
+In your own project, a file like this one is all you need. In this package, each reader is a module in
+`litho_data/readers/` that ends with `READER = Reader(...)` and is listed in `registry.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ MAGIC = b"TOYAFM"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel: a line `TOYAFM ny nx y_um x_um`, then float32 heights in nm, top row first."""
+    """Return the only channel of a file. The file begins with a line `TOYAFM ny nx y_um x_um`, which states
+    the shape and the side lengths. The heights follow as float32 in nm, with the top row first.
+    """
     head, _, data = path.read_bytes().partition(b"\n")
-    # Any exception of a reader is reported as one line about the file.
+    # If a reader raises any exception, the user sees a one-line message about the file.
     ny, nx, y_um, x_um = (float(text) for text in head.split()[1:])
     height_nm = np.frombuffer(data, "<f4").reshape(int(ny), int(nx))
     return [

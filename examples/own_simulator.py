@@ -1,10 +1,12 @@
-"""Add your own model of the printer, and train, freeze and load it by name, like those of the package.
+"""Add a model of the printer of your own. It is then trained, frozen and loaded by its name, like the models
+of the package.
 
     python examples/own_simulator.py STORE.zarr --out FOLDER
 
-The script registers a printer whose spot is the sum of two Gaussians, and trains it as `litho-models train`
-does. Nothing else needs to change: benchmark, loop and design accept the name of the model. In a plug-in
-(docs/extending.md), put `@register_simulator` above the class; all commands then accept the model.
+The script registers a model whose spot is the sum of two Gaussians, and trains it as `litho-models train`
+does. Nothing else needs to change: the functions for benchmarks, the closed loop and designs accept the name
+of the model. If you put `@register_simulator` above the class in a plug-in (docs/extending.md), all commands
+accept it, too.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from litho_models.models.parts import illuminate, spot_radius_px
 
 
 class TwoSpots(Simulator):
-    """H = gain · ((1 - share) G_narrow + share G_wide) \\* M."""
+    """A printer with the height H = gain · ((1 - share) G_narrow + share G_wide) \\* M. M is the layout's
+    height, and \\* is a convolution with the Gaussians G.
+    """
 
     name = "two-spots"
 
@@ -61,7 +65,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("store", help="dataset store")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the run and of the frozen model")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the training run and of the frozen model"
+    )
     given = parser.parse_args()
     register_simulator(TwoSpots)
     train(given.store, TwoSpots.name, given.out / "run")

@@ -1,10 +1,11 @@
-"""Add a task of your own (three colours in three planes): design, compare, export and score it.
+"""Add an optical task of your own, here three colours in three planes. Elements for it are designed,
+compared, exported and scored like those of the package's tasks.
 
     python examples/own_task.py zoo:pbl --out rgb-planes
 
-A class defines the images (``views``), what the search minimises (``loss``) and the scores (``figures``).
-Everything else (search, checkpoints, polish, process window, report, comparison and export) works as it does
-for holograms and lenses.
+A class defines the images (``views``), the quantity that the search minimises (``loss``) and the scores
+(``figures``). Everything else (search, checkpoints, polish, process window, report, comparison and export)
+works as for holograms and lenses.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ NANOMETRES, PLANES_UM = (640, 532, 473), (-4.0, 0.0, 4.0)
 
 @litho_design.register_task
 class ColoursInPlanes(litho_design.Task):
-    """Draw one spot per colour that is sharp in three planes: extended depth of focus in three colours."""
+    """The task of drawing one spot per colour, each of which is sharp in three planes."""
 
     name = "colours-in-planes"
 
@@ -41,21 +42,25 @@ class ColoursInPlanes(litho_design.Task):
 
 
 def spots(size_px: int) -> np.ndarray:
-    """Return one round spot per colour, float32 (3, size, size)."""
+    """Return a picture with one round spot for each of the three colours, as float32 of shape (3, size,
+    size).
+    """
     y, x = np.mgrid[0:size_px, 0:size_px] / size_px
     places = ((0.3, 0.3), (0.3, 0.7), (0.7, 0.5))
     return np.stack([np.hypot(y - v, x - u) < 0.06 for v, u in places]).astype(np.float32)
 
 
 def main() -> None:
-    """Design for a perfect printer and through a model, print both designs, and export the second one."""
+    """Make one design for a perfect printer and one with a model, compare their prints, and export the second
+    one.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
-    parser.add_argument("--out", type=Path, default=Path("colours-in-planes"))
-    parser.add_argument("--size-px", type=int, default=256)
-    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=Path("colours-in-planes"), help="folder of the result")
+    parser.add_argument("--size-px", type=int, default=256, help="side of the element in pixels")
+    parser.add_argument("--iterations", type=int, default=100, help="number of iterations of each search")
     words = parser.parse_args()
     changes = {
         "layout.size_px": words.size_px,

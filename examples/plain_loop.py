@@ -1,10 +1,11 @@
-"""Analyse a blind board in fifty lines: ridge regression on the layout and on the best covariates.
+"""Find the hidden causes of a blind board in fifty lines, by ridge regression on the layout and on covariates
+that stand for possible causes.
 
     litho-models board judge BOARD --loop "python examples/plain_loop.py" --out judged
 
-Each scan is predicted by a ridge regression fitted to the other scans. Each covariate has the name of the
-effect that causes it. The loop names this effect if the covariate reduces the total squared error by at least
-1 %, and reduces it in all scans but at most one.
+Each scan is predicted by a ridge regression that is fitted to the other scans. A covariate has the name of
+the effect for which it stands. The program names this effect if the covariate reduces the total squared error
+by at least 1 %, and reduces the error of every scan except at most one.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ STEP_PX, BLURS_PX, RIDGE, LEAST_GAIN = 4, (0, 2, 5, 12, 30), 1e-6, 0.01
 
 
 def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the predictors of a scan (pixels, columns) and a dictionary of covariates, keyed by effect."""
+    """Return the predictors that are always used, as an array of shape (pixels, predictors), and a dictionary
+    with the covariate of each effect.
+    """
     level = scan.mask_level / scan.levels
     blurred = [gaussian_filter(level, px) for px in BLURS_PX]
     y, x = (np.linspace(-1, 1, n) for n in level.shape)
@@ -44,7 +47,9 @@ def columns(scan: PrintedScan, order: float) -> tuple[np.ndarray, dict[str, np.n
 
 
 def errors_nm(maps: list[np.ndarray], heights: list[np.ndarray]) -> list[np.ndarray]:
-    """Return each scan's residuals (pixels,), nm, from a fit to the other scans with one offset per scan."""
+    """Return the residuals of each scan in nm, as an array of shape (pixels,). They are those of a fit to the
+    other scans, after an offset is fitted to each scan.
+    """
     maps, heights = ([one - one.mean(axis=0) for one in own] for own in (maps, heights))
     grams, rights = ([a.T @ b for a, b in zip(maps, own, strict=True)] for own in (maps, heights))
     gram, right, found = sum(grams), sum(rights), []
@@ -55,7 +60,9 @@ def errors_nm(maps: list[np.ndarray], heights: list[np.ndarray]) -> list[np.ndar
 
 
 def plain_loop(store: Path, folder: Path) -> Answer:
-    """Name the covariates that reduce the error, one by one, the best one first."""
+    """Return the names of the covariates that reduce the error. They are added one by one, the best one
+    first.
+    """
     opened = open_store(store)
     scans = [scan for scan in opened.scans() if scan.id not in opened.locked_ids]
     made = [columns(scan, at / len(scans) - 0.5) for at, scan in enumerate(scans)]
@@ -82,12 +89,12 @@ def plain_loop(store: Path, folder: Path) -> Answer:
 
 
 def mean_absolute(residuals: list[np.ndarray]) -> float:
-    """Return the mean absolute residual of each scan, averaged over scans."""
+    """Return the mean absolute residual, averaged first over each scan and then over the scans."""
     return float(np.mean([np.abs(one).mean() for one in residuals]))
 
 
 def squares(residuals: list[np.ndarray]) -> np.ndarray:
-    """Return the mean squared residual of each scan."""
+    """Return the mean squared residual of each scan, as an array of shape (scans,)."""
     return np.array([np.mean(one**2) for one in residuals])
 
 

@@ -1,12 +1,13 @@
-"""Run blind trials of the closed loop on the virtual fab.
+"""Run blind trials of the closed loop in the virtual fab.
 
     python -m benchmarks.blind_trials --out runs/singles
     python -m benchmarks.blind_trials --out runs/mixtures --board mixtures --measured runs/measured.zarr
     python -m benchmarks.blind_trials --out runs/development --board mixtures --seed 1 --only 0,1,2
 
-Draws the hidden effects, gives the loop only scans and layouts, and judges its answers by the rules in
-docs/blind_trials.md. An interrupted run resumes. Writes scoreboard.json and scoreboard.csv;
---publish also writes the results into the documentation.
+In each trial, hidden effects are drawn, the loop receives only the scans and the layouts, and its answer is
+judged by the rules in docs/blind_trials.md. The results of all trials are written to scoreboard.json and
+scoreboard.csv, and with --publish also into the documentation. An interrupted run continues when it is run
+again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from litho_models.boards.board import BASE, make_draws
 from litho_models.boards.figures import figure_lines, make_scoreboard, trial_table
 from litho_models.boards.records import Board
 
-# These seeds are announced before any of their trials is run. Development uses other seeds.
+# The seed of each board was announced before any of its trials was run. Other seeds are used for development.
 ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20277}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
@@ -37,7 +38,7 @@ def results_of(board: Board, seed: int) -> Path:
 
 
 def main() -> None:
-    """Run the unfinished trials, then write the scoreboard; invalid input ends with exit code 2."""
+    """Run the unfinished trials, and write the scoreboard. Invalid input ends the run with exit code 2."""
     arguments = _arguments()
     try:
         if arguments.run_one is not None:
@@ -63,7 +64,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
             "store of measured prints",
             got="none",
             wanted="--measured STORE",
-            hint="give the store, or skip these trials with --only",
+            hint="give the store, or select other trials with --only",
         )
     open_campaign(out, draws)
     options = ["--keep-data"] * arguments.keep_data
@@ -96,24 +97,24 @@ def _arguments() -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("--out", type=Path, required=True, help="folder of the board's trials")
+    add("--out", type=Path, required=True, help="folder of the trials")
     add(
         "--board",
         choices=get_args(Board),
         default="singles",
-        help="one cause per trial (singles), or two to four",
+        help="set of trials: with one cause per trial (singles), or with two to four (mixtures)",
     )
     add("--seed", type=int, help="seed of all random draws (default: the seed announced for the board)")
     add("--base", help="base model of the loop (default: physics for singles, auto for mixtures)")
-    add("--measured", type=Path, help="store of measured prints, into which causes are injected")
-    add("--scans", type=int, default=12, help="scans per trial (default 12)")
-    add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
-    add("--workers", type=int, default=1, help="parallel trials, one thread each")
-    add("--dask", help="address of a Dask scheduler; its workers replace --workers")
+    add("--measured", type=Path, help="store of measured prints, to whose heights causes are added")
+    add("--scans", type=int, default=12, help="number of scans per trial (default 12)")
+    add("--size-px", type=int, default=256, help="side of each layout in pixels (default 256)")
+    add("--workers", type=int, default=1, help="number of parallel trials, each with one thread")
+    add("--dask", help="address of a Dask scheduler, whose workers are used in place of local processes")
     add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
-    add("--timeout-s", type=float, default=3600.0, help="time limit of a trial, seconds")
-    add("--keep-data", action="store_true", help="keep raw files and stores")
-    add("--publish", action="store_true", help="write the results into docs/")
+    add("--timeout-s", type=float, default=3600.0, help="time limit of a trial in seconds (default 3600)")
+    add("--keep-data", action="store_true", help="keep the raw files and stores of the trials")
+    add("--publish", action="store_true", help="write the results into docs/blind_trials.md")
     add("--run-one", type=int, help=argparse.SUPPRESS)
     return parser.parse_args()
 

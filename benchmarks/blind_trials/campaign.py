@@ -1,6 +1,6 @@
-"""Run all drawn trials as parallel processes.
+"""Run the trials of a board in parallel processes.
 
-An interrupted campaign can be resumed. A failed trial does not stop the other trials.
+An interrupted run can be continued. A failed trial does not stop the other trials.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ def open_campaign(out: Path, draws: Draws) -> None:
     """Write the draws to ``out/draws.json`` before any trial is run.
 
     Raises:
-        InputError: ``out`` contains a campaign with other settings.
+        InputError: ``out`` contains trials with other settings.
     """
     if not (out / Draws.FILE_NAME).exists():
         draws.write(out)
     elif Draws.read(out) != draws:
         raise InputError(
             f"campaign in {out}",
-            got="draws of other settings",
-            wanted="the same settings",
+            got="trials with other settings",
+            wanted="trials with the same settings",
             hint="choose another --out",
         )
 
@@ -58,10 +58,10 @@ def run_campaign(
     """Run the unfinished trials among ``numbers``, and print a line when a trial ends.
 
     A trial is recorded as failed if its process dies or runs longer than ``timeout_s``. The words in
-    ``options`` are appended to the command of each trial, see `run_one`.
+    ``options`` are appended to the command that runs a trial.
 
     Raises:
-        InputError: a number was not drawn, or the workers are not available.
+        InputError: there is no trial with one of the numbers, or the workers are not available.
     """
     unknown = set(numbers) - {draw.number for draw in draws.trials}
     if unknown:
@@ -69,7 +69,7 @@ def run_campaign(
     done = {trial.draw.number for trial in finished(out, draws)}
     todo = [draw for draw in draws.trials if draw.number in set(numbers) - done]
     if len(todo) < len(set(numbers)):
-        print(f"{len(set(numbers)) - len(todo)} trials are finished already", flush=True)
+        print(f"{len(set(numbers)) - len(todo)} trials were already finished", flush=True)
     jobs = [_Job(out, draw, timeout_s, options) for draw in todo]
     results = run_jobs(_run_apart, jobs, workers, name=lambda job: f"trial {job.draw.number}", apart=True)
     for place, (_, (trial, seconds)) in enumerate(results, 1):
@@ -77,7 +77,7 @@ def run_campaign(
 
 
 def run_one(out: Path, number: int, *, measured: Path | None, keep_data: bool) -> None:
-    """Run one trial of an open campaign in this process."""
+    """Run one trial in this process. The draws must have been written by ``open_campaign``."""
     draws = Draws.read(out)
     draw = next(draw for draw in draws.trials if draw.number == number)
     run_trial(draw, draws, out, measured=measured, keep_data=keep_data, report=_print)
@@ -95,7 +95,9 @@ class _Job(NamedTuple):
 
 
 def _run_apart(job: _Job) -> tuple[Trial, float]:
-    """Run a trial in a separate process, whose output goes to a log file."""
+    """Run a trial in a separate process, whose output is written to a log file. Return the trial and the time
+    that it took in seconds.
+    """
     out, draw, timeout_s, options = job
     folder, clock = trial_folder(out, draw), time.monotonic()
     command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
@@ -107,7 +109,7 @@ def _run_apart(job: _Job) -> tuple[Trial, float]:
             code = subprocess.run(
                 command,
                 cwd=_ROOT,
-                # Parallel trials use the cores better than threads within one trial.
+                # Several trials at once use the cores better than several threads in one trial.
                 env=os.environ | ONE_THREAD,
                 stdout=stream,
                 stderr=subprocess.STDOUT,

@@ -1,4 +1,6 @@
-"""Inject causes into measured prints by adding the height changes that they make in the virtual fab."""
+"""Plant causes in measured prints. The changes of height that the causes make in the virtual fab are added to
+the measured heights.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from litho_models.boards.records import Draw, Planted
 
 
 def measured_jobs(store: Store) -> tuple[Job, ...]:
-    """Return the layouts of a store as jobs for the fab.
+    """Return jobs with which the virtual fab prints the layouts of a store.
 
     Raises:
         InputError: the pitch, level height or number of levels of the store is not that of the fab.
@@ -35,7 +37,9 @@ def measured_jobs(store: Store) -> tuple[Job, ...]:
 
 
 def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
-    """Crop the fields to their centres. To save time, only these parts are used to measure effect sizes."""
+    """Return jobs for the centres of the fields only, of ``size_px`` × ``size_px`` pixels. The sizes of
+    effects are measured with these jobs, because they take less time.
+    """
     corners = [[(side - size_px) // 2 for side in job.level.shape] for job in jobs]
     return [
         replace(job, level=job.level[max(y, 0) : size_px + max(y, 0), max(x, 0) : size_px + max(x, 0)])
@@ -44,10 +48,10 @@ def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
 
 
 def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
-    """Copy a store and add the planted effects to the heights of the copy. Everything else is unchanged.
+    """Copy a store, and add the changes of height that the planted effects make to the heights of the copy.
 
     Raises:
-        InputError: the store is a single file.
+        InputError: the store is a single file and not a folder.
     """
     import zarr
 

@@ -1,4 +1,4 @@
-"""Publish a scoreboard on its page of the documentation."""
+"""Publish the results of a board on a page of the documentation."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def publish_scoreboard(page: Path, scoreboard: Scoreboard) -> None:
 
 
 def mark_of(scoreboard: Scoreboard) -> str:
-    """Return the name that appears in the two marks of a board on the page."""
+    """Return the name of the two marks between which the results of a board stand on the page."""
     return f"board of {scoreboard.board} {scoreboard.seed}"
 
 
 def as_markdown(scoreboard: Scoreboard) -> str:
-    """Return the command and the table of results in Markdown."""
+    """Return the command that ran the trials, and the table of their results, in Markdown."""
     rows = [tuple(figure) for figure in figures_of(scoreboard)]
     return f"```\n{scoreboard.command}\n```\n\n{markdown_table(('', '', 'goal'), rows)}"

@@ -1,4 +1,6 @@
-"""Run one trial: the fab makes scans, `build` makes a store, and the loop's findings are judged."""
+"""Run one trial: the fab makes scans, a store is built from them, the loop is run on the store, and its
+findings are judged.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from litho_models.loop.run import close_loop
 
 
 def trial_folder(out: Path, draw: Draw) -> Path:
-    """Return the folder in which the loop works on a trial and writes its result."""
+    """Return the folder of a trial, which contains its result and the loop's files."""
     return out / TRIALS / name_of(draw)
 
 
@@ -32,17 +34,19 @@ def run_trial(
     keep_data: bool = False,
     report: Callable[[str], None] = lambda message: None,
 ) -> Trial:
-    """Run and judge one trial; write ``trials/NN/trial.json``, and the results of the loop next to it.
+    """Run and judge one trial. Write its record ``trial.json`` into the folder of the trial, beside the
+    results of the loop, and return it.
 
-    The loop receives only the store. An error is recorded as the result of the trial; it is not raised.
+    The loop receives only the store. An error is not raised, but recorded as the result of the trial.
 
     Args:
         draw: the effects to plant.
-        draws: the board of this trial.
+        draws: the settings of the board to which the trial belongs.
         out: folder of the board.
-        measured: store of measured prints, for trials on measured prints.
-        keep_data: keep raw files and store; otherwise they are deleted. They can be made again from the draw.
-        report: function that is called with a message at each stage.
+        measured: store of measured prints, which is needed for trials on measured prints.
+        keep_data: whether to keep the raw files and the store of the trial. They can be made again from the
+            draw.
+        report: function that is called with a message at each stage of the trial.
     """
     folder = trial_folder(out, draw)
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,1 +1,1 @@
-"""Measure the design-to-manufacturing gap at the paper's size, with the virtual fab as judge."""
+"""Measure the gap between designs and their prints at the paper's size, with the virtual fab as judge."""

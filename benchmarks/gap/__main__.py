@@ -1,13 +1,15 @@
-"""Measure the design-to-manufacturing gap at the paper's size, with the virtual fab as judge.
+"""Measure the gap between designs and their prints at the paper's size, with the virtual fab as judge.
 
     python -m benchmarks.gap --out runs/gap --workers 2
     python -m benchmarks.gap --out runs/gap-small --small 128
 
-The fab has effects that no model knows. It prints fields, and six arms are trained on the scans of these
-prints. One hologram and two lenses are designed through each arm with equal budgets, and the fab prints the
-designs. Then the same hologram is designed through the models of measured prints that come with the package.
-The run takes hours; with ``--tasks``, only the tasks named there are run. A step is skipped if its result
-exists. An interrupted design resumes from its checkpoint.
+The fab has effects that no model contains. It prints fields, and models are trained on the scans of these
+prints. One hologram and two lenses are designed without a model and with each model (the arms of the
+comparison), all with the same number of iterations, and the fab prints the designs. Then the same hologram is
+designed with the models of the measured prints that come with the package.
+
+The run takes hours. With ``--tasks``, only the named tasks are run. Steps whose result exists are skipped,
+and an interrupted design continues from its checkpoint.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from litho_models.frozen import zoo
 
 
 def main() -> None:
-    """Run the unfinished steps; invalid input or a failed step ends with exit code 2."""
+    """Run the unfinished steps. Invalid input or a failed step ends the run with exit code 2."""
     try:
         _run(_arguments())
     except InputError as error:
@@ -41,7 +43,9 @@ def _run(given: argparse.Namespace) -> None:
     out, logs = given.out, given.out / "logs"
     workers = Workers(given.workers, given.dask)
     if given.publish and given.tasks:
-        raise InputError("--publish", got="with --tasks", wanted="no --tasks: the page shows all tasks")
+        raise InputError(
+            "--publish", got="together with --tasks", wanted="no --tasks, because the page shows all tasks"
+        )
     effort = Effort() if given.small is None else Effort.small(given.small)
     plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
     measured = {name: str(zoo.folder(name)) for name in zoo.list()}
@@ -66,11 +70,19 @@ def _arguments() -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
-    parser.add_argument("--workers", type=int, default=1, help="parallel processes, one thread each")
-    parser.add_argument("--dask", help="address of a Dask scheduler; its workers replace --workers")
-    parser.add_argument("--small", type=int, metavar="PX", help="try the benchmark with small elements")
     parser.add_argument(
-        "--corrected", type=Path, help="model of a closed loop on the measured prints, as a further arm"
+        "--workers", type=int, default=1, help="number of parallel processes, each with one thread"
+    )
+    parser.add_argument(
+        "--dask", help="address of a Dask scheduler, whose workers are used in place of local processes"
+    )
+    parser.add_argument(
+        "--small", type=int, metavar="PX", help="try the benchmark quickly, with elements PX pixels wide"
+    )
+    parser.add_argument(
+        "--corrected",
+        type=Path,
+        help="frozen model of a closed loop on the measured prints, which is used as a further arm",
     )
     parser.add_argument("--tasks", metavar="NAMES", help="tasks to run, separated by commas; all by default")
     parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/gap.md")

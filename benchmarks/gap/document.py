@@ -1,4 +1,4 @@
-"""Write the result file and the figures of the comparison, and publish them in the documentation."""
+"""Write the results of the comparison (record, tables and figures), and publish them in the documentation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ RESULT_FILE, TABLE_FILE = "gap.json", "gap.csv"
 
 
 def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
-    """Write JSON, CSV and figures of a finished comparison into the folder ``results/`` and return it."""
+    """Write the record, the tables and the figures of a finished comparison into the folder ``results/``
+    below ``out``. Return that folder.
+    """
     folder = out / "results"
     folder.mkdir(exist_ok=True)
     gaps = {task.name: GapResult.read(out / task.name) for task in tasks}
@@ -61,7 +63,7 @@ def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
 
 
 def publish_results(out: Path) -> None:
-    """Copy ``results/`` into the documentation and write its tables into the page."""
+    """Copy the folder ``results/`` into the documentation, and write its tables into the page."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     for file in sorted((out / "results").iterdir()):
         if file.suffix != ".md":
@@ -71,7 +73,9 @@ def publish_results(out: Path) -> None:
 
 
 def _models(out: Path) -> dict[str, dict[str, float]]:
-    """Return the mean absolute errors, nm, of every trained model on the test prints."""
+    """Return the mean absolute errors of every trained model on the test prints, in nm, by the terms that are
+    fitted to each scan.
+    """
     errors = {}
     for arm in ARMS:
         file = out / "test" / arm / "evaluation.json"
@@ -83,13 +87,15 @@ def _models(out: Path) -> dict[str, dict[str, float]]:
 
 
 def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
-    """Return the scores of an unprinted continuous phase on the grid of the designs, or None for a lens."""
+    """Return the scores of an unprinted continuous phase on the grid of the designs. For a lens, return
+    None.
+    """
     design = Design.read(design_folder(folder, next(iter(gap.arms)), gap.seeds[0]))
     return (design.baselines or {}).get("continuous phase")
 
 
 def _search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
-    """Return the search time of each arm in minutes, summed over the judged seeds."""
+    """Return the time that the searches of each arm took, in minutes, summed over the seeds."""
 
     def minutes(arm: str) -> float:
         return sum(Design.read(design_folder(folder, arm, seed)).run.seconds for seed in gap.seeds) / 60

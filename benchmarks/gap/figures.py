@@ -1,4 +1,6 @@
-"""Draw the figures of the comparison: images, PSFs and spectra, as designed and after printing."""
+"""Draw the figures of the comparison: images, point spread functions (PSFs) and spectra, as designed and
+after printing.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _DETAIL_PX = 160
 
 
 def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """Draw one column per arm: the designed image, the image after printing, and the centre of the print."""
+    """Draw the holograms, with one column per arm. A column shows the image that the design predicted, the
+    image after printing, and the centre of the print.
+    """
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.4 * len(judged) + 0.4, 7.4)
     axes = figure.subplots(3, len(judged), squeeze=False)
@@ -41,7 +45,9 @@ def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, pat
 
 
 def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
-    """Draw one column per arm: a line through the PSF and its spectrum, both as designed and as printed."""
+    """Draw the lenses, with one column per arm. A column shows a line through the PSF and its spectrum, both
+    as designed and as printed.
+    """
     judged = _judged(folder, gap, judge)
     figure = new_figure(2.5 * len(judged) + 0.4, 4.8)
     axes = figure.subplots(2, len(judged), squeeze=False, sharey="row")
@@ -66,7 +72,9 @@ def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path:
 def _judged(
     folder: Path, gap: GapResult, judge: tuple[str, str] | None
 ) -> dict[str, tuple[LoadedDesign, Printer]]:
-    """Return the first design and the judge of each arm. The default judge is the last of the other arms."""
+    """Return, for each arm, its first design and the printer that judges it. Without a judge, each arm is
+    judged by the last of the other arms.
+    """
     names = list(gap.arms)
     judged = {}
     for arm in names:

@@ -1,4 +1,4 @@
-"""Run commands as parallel processes with one thread each; skip those whose result exists."""
+"""Run commands in parallel processes with one thread each. Commands whose result exists are skipped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ _BIN = Path(sys.executable).parent
 
 @dataclass(frozen=True)
 class Job:
-    """One command: its name in the log, its command line, and the file or folder that it writes last."""
+    """One command to run. It has a name, a command line, and a result, which is the file or folder that it
+    writes last.
+    """
 
     name: str
     command: tuple[str, ...]
@@ -27,7 +29,9 @@ class Job:
 
     @property
     def done(self) -> bool:
-        """Return whether the result exists; commands write their result last, in one step."""
+        """Return whether the result exists. It is complete if it exists, because commands put it in place
+        last.
+        """
         return self.result.exists()
 
 
@@ -35,7 +39,7 @@ def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> No
     """Run the unfinished jobs, and print a line when a job ends.
 
     Raises:
-        InputError: a job failed. Jobs that had already started are finished first.
+        InputError: a job failed. Before this error is raised, jobs that have already started are finished.
     """
     todo = [job for job in jobs if not job.done]
     if len(todo) < len(jobs):
@@ -50,17 +54,17 @@ def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> No
 
 
 def command(program: str, *words: object) -> tuple[str, ...]:
-    """Return the command that runs a program of this environment."""
+    """Return the command line that runs a program of this Python environment."""
     return (str(_BIN / program), *map(str, words))
 
 
 def design_command(*words: object) -> tuple[str, ...]:
-    """Return a command of ``litho-design``."""
+    """Return the command line of a command of ``litho-design``."""
     return command("litho-design", *words)
 
 
 def _run(step: tuple[Job, Path]) -> float | None:
-    """Run one command; return the number of seconds that it took, or None if it failed."""
+    """Run one command, and return the time that it took in seconds, or None if it failed."""
     (job, log), started = step, time.monotonic()
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as stream:

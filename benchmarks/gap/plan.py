@@ -1,4 +1,6 @@
-"""Define a comparison: the fab with its hidden effects, the arms, the effort, and the folder."""
+"""Define a comparison: the fab with its hidden effects, the arms (models used to make designs), the effort,
+and the places in its folder.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +11,15 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 
 ARMS = ("none", "affine", "affine-mtf", "physics", "fno", "pbl", "pbl-scan-axis")
-# Arms made from the trained model of another arm by other options of `freeze`. Only PBL separates effects
-# along the scan lines and leaves them out of its printer, because scans of one orientation cannot show
-# whether printer or microscope causes them. The other models include them. In this fab the printer causes
-# them, so PBL must include them to know as much as the others.
+# These arms use the trained model of another arm, frozen with other options. By default, PBL leaves effects
+# along the scan lines out of its printer, because scans in one orientation cannot show whether the printer or
+# the microscope causes them. The other models include such effects. In this fab, the printer causes them, so
+# only `pbl-scan-axis`, which includes them, contains as much as the other models.
 FROZEN_WITH = {"pbl-scan-axis": ("pbl", ("--attribute", "scan-axis=printer"))}
-# The strengths were fixed before any design was made, by one rule: each effect of the printer changes the
-# training prints by 10 nm rms after offset, gain, plane and bow of each scan are removed. The physics model
-# has none of these effects, and two of them are in no catalogue. The effects of the microscope are as large
-# as in the measured prints. They do not act on designs.
+# The strengths were chosen before any design was made, by one rule: each effect of the printer changes the
+# training prints by 10 nm rms after the offset, gain, plane and bow of each scan are removed. The Physics
+# model contains none of these effects, and two of them are not in the catalogue. The effects of the
+# microscope are as large as in the measured prints. They do not act on designs.
 PRINT_KNOBS = {
     "write-order-memory": 0.167,
     "slope-thinning-x": 0.346,
@@ -29,16 +31,13 @@ _FULL_HOE_PX, _FULL_LENS_PX = 1024, 1200
 
 
 class Effort(Record):
-    """The amount of printing, training and design work.
-
-    All arms of a task have the same number of iterations.
-    """
+    """How much is printed, trained and designed. All arms of a task have the same number of iterations."""
 
     hoe_px: int = _FULL_HOE_PX
     lens_px: int = _FULL_LENS_PX
     hoe_iterations: int = 80
     lens_iterations: int = 100
-    # Precision of the networks during the search; prints, judges and scores use float32 for every arm.
+    # The precision of the networks during the search. Prints, judges and scores always use float32.
     search_precision: str = "float32"
     seeds: int = 3
     zoo_seeds: int = 1
@@ -50,17 +49,17 @@ class Effort(Record):
 
     @property
     def hoe_distance_um(self) -> float:
-        """Return the image distance in µm; it is 300 µm at full size."""
+        """Return the distance of the image from the hologram in µm. It is 300 µm at full size."""
         return round(300 * self.hoe_px / _FULL_HOE_PX, 3)
 
     @property
     def lens_distance_um(self) -> float:
-        """Return the focal length in µm; it is 400 µm at full size."""
+        """Return the focal length of the lenses in µm. It is 400 µm at full size."""
         return round(400 * self.lens_px / _FULL_LENS_PX, 3)
 
     @classmethod
     def small(cls, size_px: int) -> Effort:
-        """Return a small effort for trying the benchmark, with elements that are ``size_px`` pixels wide."""
+        """Return a small effort for trying the benchmark. Its elements are ``size_px`` pixels wide."""
         return cls(
             hoe_px=size_px,
             lens_px=size_px,
@@ -76,7 +75,7 @@ class Effort(Record):
 
 
 class Plan(Result):
-    """The settings of the comparison in a folder, stored as ``plan.json``."""
+    """The settings of the comparison in a folder, which are stored there as ``plan.json``."""
 
     SCHEMA: ClassVar[str] = "litho-design/benchmark-gap-plan/1"
     FILE_NAME: ClassVar[str] = "plan.json"
@@ -88,7 +87,7 @@ class Plan(Result):
 
 
 def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
-    """Write the plan, or check that the plan in the folder is the same.
+    """Write the plan into the folder. If the folder already contains a plan, check that it is the same.
 
     Raises:
         InputError: the folder contains a comparison with other settings.
@@ -107,12 +106,14 @@ def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
 
 
 def store(out: Path, name: str) -> Path:
-    """Return the path of the dataset store of a fab."""
+    """Return the path of the dataset store with the prints of a fab."""
     return out / f"{name}.zarr"
 
 
 def trained_as(arm: str) -> tuple[str, tuple[str, ...]]:
-    """Return the trained model from which an arm is frozen, and the options of ``freeze``."""
+    """Return the name of the trained model from which an arm is frozen, and the options of ``freeze`` for
+    it.
+    """
     return FROZEN_WITH.get(arm, (arm, ()))
 
 

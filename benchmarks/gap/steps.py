@@ -1,4 +1,6 @@
-"""Define the jobs before the designs: print in the fab, then train, freeze and test every arm."""
+"""Define the jobs that come before the designs: prints are made in the fab, and every arm is trained, frozen
+and tested.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,15 @@ from pathlib import Path
 from benchmarks.gap.jobs import Job, command
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store, trained_as
 
-# Training and test prints come from the same machine, so its random properties have a fixed seed.
+# The random properties of the machine have a fixed seed, so that training and test prints come from the same
+# machine.
 _MACHINE_SEED = 0
 
 
 def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
-    """Return the jobs that print and scan the fields and build their stores, in stages of parallel jobs."""
+    """Return the jobs that print and scan the fields, and then those that build their stores. The jobs of
+    each of these stages can run in parallel.
+    """
     prints = [("fab", effort.scans, 0), ("test-fab", max(2, effort.scans // 4), 1)]
     simulate = [
         Job(
@@ -37,7 +42,9 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 
 
 def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
-    """Return the stages of jobs that train, freeze and test every arm. The longest training starts first."""
+    """Return the jobs that train, then those that freeze, and then those that test every arm. The jobs of
+    each of these stages can run in parallel. The longest training starts first.
+    """
     arms = [arm for arm in reversed(ARMS) if arm != "none"]
     trained = {arm: trained_as(arm) for arm in arms}
     train = [

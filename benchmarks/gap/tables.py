@@ -1,11 +1,11 @@
-"""Make the Markdown tables of the comparison from its result file."""
+"""Make the Markdown tables of the comparison from the record of its results."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-# Two or three scores per table, each with a sign: +1 if higher is better, -1 if lower is better.
+# The scores that the table of each task shows, with +1 if a higher score is better and -1 if a lower one is.
 SHOWN = {
     "hoe": {"si_psnr_db": +1, "ssim": +1, "eff_signal": +1},
     "lens-direct": {"cbr": +1, "strehl": +1, "focusing_efficiency": +1},
@@ -18,8 +18,8 @@ LABELS = {
     "cbr": "centre-to-background ratio",
     "strehl": "Strehl ratio",
     "focusing_efficiency": "focusing efficiency",
-    "mae_calibrated": "image MAE, calibrated PSF",
-    "mae_design": "image MAE, design PSF",
+    "mae_calibrated": "image MAE with the calibrated PSF",
+    "mae_design": "image MAE with the design PSF",
 }
 _FIGURES = {
     "hoe": "Images before and after printing, and the centre of each print",
@@ -35,22 +35,24 @@ TITLES = {
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return all tables of the result file, each with the conditions under which it was made."""
+    """Return all tables of a record, each with the conditions under which it was made."""
     effort = record["plan"]["effort"]
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
         f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
         f"{effort['scans']} scans of its prints, each {effort['scan_px']} px wide; the networks for "
         f"{effort['training_steps']:,} steps. "
-        f"{_precision_text(effort['search_precision'])}\n\n" + _model_table(record["models"])
+        f"{_precision_text(effort['search_precision'])} In the tables of designs, a cell contains the score "
+        "that the design predicted for itself, an arrow, and the score after printing, with ± half its 95 % "
+        "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
         parts.append(_task_part(name, task, [row for row in record["summary"] if row["task"] == name]))
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"The search for {designs} designs took {minutes / 60:.1f} hours in total, each in one thread on a "
-        "machine with other work. Intervals: 95 % (Student's t) over seeds."
+        f"The searches for all {designs} designs took {minutes / 60:.1f} hours in total. Each ran in one "
+        "thread on a computer that did other work at the same time."
     )
     return "\n\n".join(parts)
 
@@ -71,10 +73,12 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     if not independent:
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
         shown = dict(list(shown.items())[:1])
-    # With one judge, a table has several scores; with several judges, each has a column of one score.
+    # With one judge, a table has a column for each score. With several judges, it has a column for each
+    # judge, with the first score.
     heads = [f"{LABELS[figure]}, designed → printed by {judge}" for judge in judges for figure in shown]
-    # A lens is compared with a perfect lens, whose Strehl ratio is 1. A hologram is compared with a
-    # continuous phase. The difference is given as rms error, which follows from the SI-PSNR.
+    # A lens is compared with a perfect lens, whose Strehl ratio is 1. A hologram is compared with an
+    # unprinted continuous phase. Its rms image error relative to that of the phase follows from the two
+    # SI-PSNR.
     ceiling = task.get("ceiling") if independent else None
     heads += ["loss of Strehl ratio against a perfect lens"] if "strehl" in shown else []
     above = "excess rms image error over a continuous phase, printed by"
@@ -100,7 +104,8 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         head += f" A continuous phase on the same grid, without printer or levels, reaches {reached}."
     head += "\n\n"
     verdict = ""
-    # If the judges are arms themselves, each prefers the design made through it, so there is no best arm.
+    # If the judges are arms themselves, each judge prefers the designs made with it, so no arm is called the
+    # best.
     if seeds > 1 and independent:
         figure, sign = next(iter(shown.items()))
         means = {arm: values[arm, judges[0], figure]["judged"] for arm in arms}
@@ -115,8 +120,10 @@ def figure_file(name: str) -> str:
 
 
 def figure_digits(figure: str) -> int:
-    """Return how many decimals of a score are shown. Image errors are a few hundredths and differ by 1 %."""
-    if figure == "cbr":  # a ratio of hundreds and thousands
+    """Return the number of decimals with which a score is shown. Image errors need five, because they are a
+    few hundredths and differ by 1 %.
+    """
+    if figure == "cbr":  # this ratio has values from hundreds to thousands
         return 0
     return 5 if figure.startswith("mae") else 3
 
@@ -131,7 +138,15 @@ def _cell(row: Mapping[str, Any], digits: int) -> str:
 def lead_text(
     paired: Sequence[Mapping[str, Any]], means: Mapping[str, float], figure: str, sign: int, judge: str
 ) -> str:
-    """Return text that names the best arm for a score and its lead over each other arm, paired by seed."""
+    """Return a text that names the arm with the best score after printing, and its lead over each other arm.
+
+    Args:
+        paired: differences between two arms in the scores of the judges, paired by seed, with their
+        intervals. means: mean score of each arm after printing.
+        figure: name of the score.
+        sign: +1 if a higher score is better, -1 if a lower one is.
+        judge: the judge that printed the designs.
+    """
     digits = figure_digits(figure)
     best = max(means, key=lambda arm: sign * means[arm])
     against = []
@@ -139,21 +154,25 @@ def lead_text(
         pair = (item["arm"], item["against"])
         if (item["judge"], item["figure"]) != (judge, figure) or best not in pair or not {*pair} <= {*means}:
             continue
-        # A positive lead means better, also for scores where lower is better.
+        # The lead is positive if the best arm is better, also for scores where lower is better.
         other, turn = (pair[1], sign) if best == pair[0] else (pair[0], -sign)
         low, high = sorted(turn * end for end in item["ci95"])
         open_ = "" if low * high > 0 else ", which includes 0"
-        interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
-        against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
+        interval = f"({low:.{digits}f} to {high:.{digits}f}{open_})"
+        designs = "designs without a model" if other == "none" else f"designs with {other}"
+        against.append(f"{turn * item['mean']:.{digits}f} {interval} over {designs}")
+    name, _, unit = LABELS[figure].removesuffix(")").partition(" (")
     return (
-        f"Of the layouts printed by {judge}, those designed with {best} have the best {LABELS[figure]}. "
-        f"Their lead: {'; '.join(against)}."
+        f"Of the layouts printed by {judge}, those designed with {best} have the best {name}. Their lead in "
+        f"this score{f', in {unit}' if unit else ''}, with its 95 % interval in brackets, is "
+        f"{'; '.join(against)}."
     )
 
 
 def _model_table(models: Mapping[str, Mapping[str, float]]) -> str:
     lines = [
-        "| model | error on unseen prints of the fab, offset fitted | offset, gain, tilt and bow fitted |",
+        "| model | error on unseen prints of the fab, with the offset of each scan fitted | "
+        "the same error, with offset, gain, tilt and bow fitted |",
         "|---|---|---|",
     ]
     lines += [

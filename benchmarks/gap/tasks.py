@@ -1,4 +1,6 @@
-"""Define the tasks, the commands that make their designs, and the command that judges the designs."""
+"""Define the tasks of the comparison, with the commands that make their designs and the command that judges
+them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ ZOO_ARMS = ("none", "physics", "fno", "pbl")
 
 @dataclass(frozen=True)
 class Task:
-    """One comparison: the kind and the options of its designs, and its models and judges by name."""
+    """One task of the comparison: the kind and the options of its designs, the models (arms) by name, the
+    judges by name, and the number of seeds.
+    """
 
     name: str
     kind: str
@@ -26,11 +30,13 @@ class Task:
 
     @property
     def iterations(self) -> int:
-        """Return the number of iterations of every design."""
+        """Return the number of iterations of the search for each design."""
         return int(self.options[self.options.index("--iterations") + 1])
 
     def design(self, out: Path, arm: str, seed: int) -> Job:
-        """Return the job that makes one design, in the folder from which ``compare`` reads it."""
+        """Return the job that makes one design. Its folder is the one from which ``litho-design compare``
+        reads it.
+        """
         folder = out / self.name / "designs" / arm / f"seed{seed}"
         words = ["hoe"] if self.kind == "hoe" else ["lens", "--task", self.kind]
         return Job(
@@ -42,11 +48,13 @@ class Task:
         )
 
     def designs(self, out: Path) -> list[Job]:
-        """Return the jobs of all designs, seed by seed, so that an early stop leaves complete seeds."""
+        """Return the jobs that make all designs. They are ordered by seed, so that all arms of a seed are
+        done before the next seed begins.
+        """
         return [self.design(out, arm, seed) for seed in range(self.seeds) for arm in self.models]
 
     def compare(self, out: Path) -> Job:
-        """Return the job that judges the finished designs."""
+        """Return the job that judges the finished designs of the task."""
         kind = "hoe" if self.kind == "hoe" else f"lens-{self.kind}"
         models = ",".join(arm if arm == source else f"{arm}={source}" for arm, source in self.models.items())
         judges = [word for name, source in self.judges.items() for word in ("--judge", f"{name}={source}")]
@@ -60,16 +68,21 @@ class Task:
         )  # fmt: skip
 
 
-# The comparison shows no yield, and many draws for it would take longer than most searches.
+# The comparison does not show the yield of a design, and computing it with many draws would take longer than
+# most searches.
 _FEW_DRAWS = ("--yield-draws", 10)
 
 
 def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
-    """Return the three tasks with the fab, and the hologram task with models of measured prints.
+    """Return the three tasks that the fab judges, and the hologram task with the models of the measured
+    prints.
 
     Args:
+        out: folder of the comparison.
+        effort: sizes, distances and numbers of iterations and seeds.
         zoo: folders of the frozen models that come with the package, by name.
-        corrected: the final model of a closed loop on the measured prints; if None, this arm is omitted.
+        corrected: folder of the frozen model of a closed loop on the measured prints. Without it, this arm is
+            left out.
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
@@ -83,7 +96,8 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
         "--iterations", effort.lens_iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
     camera = task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
-    # No virtual fab simulates the measured printer, so each arm's model judges the designs of the other arms.
+    # No virtual fab simulates the measured printer. Therefore, the model of each arm judges the designs of
+    # the other arms.
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
     measured |= {} if corrected is None else {"closed-loop": corrected}
     return [
@@ -95,10 +109,10 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
 
 
 def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
-    """Return the tasks with these names, separated by commas; all if None.
+    """Return the tasks whose names are listed in ``names``, separated by commas. With None, return all tasks.
 
     Raises:
-        InputError: no task has one of the names.
+        InputError: there is no task of one of the names.
     """
     if names is None:
         return list(every)
@@ -109,5 +123,5 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
 
 
 def task_options(*words: object) -> tuple[str, ...]:
-    """Return the options of a command as strings."""
+    """Return the options of a command as texts."""
     return tuple(map(str, words))
