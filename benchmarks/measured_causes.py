@@ -35,9 +35,9 @@ _MEASURED = {
 }
 _HELD_OUT = {
     "scans": "five folds of scans",
-    "prints": "whole prints; the causes were chosen with these prints",
-    "nested prints": "whole prints; everything was chosen without these prints",
-    "nested folds": "five folds of scans; everything was chosen without these scans",
+    "prints": "whole prints (causes chosen with them)",
+    "nested prints": "whole prints (everything chosen without them)",
+    "nested folds": "five folds of scans (everything chosen without them)",
 }
 
 
@@ -72,7 +72,7 @@ def errors_table(result: CloseLoop) -> str:
             "model",
             "what is added to the predicted print",
             "held out",
-            "parameters (printer + measurement model)",
+            "parameters (printer + measurement)",
             "error at k = 1",
             "error at k = 7",
         ],
@@ -88,12 +88,12 @@ def causes_table(result: CloseLoop) -> str:
     return markdown_table(
         [
             "effect",
-            "groups of scans with one strength",
+            "groups of scans",
             "strengths (95 % interval over prints)",
-            "change of the error without the effect",
+            "change of error without it",
             "scans improved",
             "looks like",
-            "also found with the base model",
+            "also found with base",
         ],
         [
             [

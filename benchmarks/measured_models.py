@@ -99,19 +99,13 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     rows.append(("PBL in the paper (other split, levelling and zero)", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
     return markdown_table(
-        (
-            "model",
-            "parameters",
-            "error with the offset fitted (k = 1)",
-            "error with offset, gain, tilt and bow fitted (k = 7)",
-        ),
+        ("model", "parameters", "offset fitted (k = 1)", "offset, gain, tilt and bow fitted (k = 7)"),
         rows,
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
-        "folds. Each scan is predicted by a model that was not trained on it, plus the smooth background of "
-        "the scans on which the model was trained. Then k terms are fitted to each scan, on pixels that are "
-        "not scored. Brackets contain 95 % confidence intervals over scans. In the row of what the layout "
-        "cannot explain, the intervals are over the 6 prints, and the values include errors that are common "
-        "to a place, a field or a print.",
+        "folds. Each scan is predicted by a model not trained on it, plus the smooth background of that "
+        "model's training scans. Then k terms are fitted to each scan, on pixels that are not scored. "
+        "Brackets: 95 % intervals over scans. For what the layout cannot explain, they are over "
+        "the 6 prints and include errors common to a place, field or print.",
     )
 
 
