@@ -1,4 +1,6 @@
-"""Models of the printer: they are trained on a dataset, corrected with its residuals, and frozen."""
+"""Models of the printer. A model is trained on a dataset, corrected with the residuals of that dataset, and
+frozen.
+"""
 
 from typing import TYPE_CHECKING
 

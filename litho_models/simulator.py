@@ -16,25 +16,28 @@ Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
 SMALL_PARAMETERS = 64
 FIRST_SPOT_UM = 0.2
-"""Spot of the first printer (standard deviation, µm). Default lengths of models are multiples of it."""
+"""Spot size (standard deviation, µm) of the printer that made the first measured prints. The default lengths
+of all models are multiples of it.
+"""
 _RESOLVED_PX = (0.5, 10.0)
 _SPOT_PX = 2.0
 
 
 def spot_um(pitch_um: float) -> float:
-    """Return the spot (standard deviation, µm) from which the default lengths for layouts with this pitch are
-    derived.
+    """Return the spot size (standard deviation, µm) from which a model derives its default lengths, given the
+    pixel pitch of the layouts.
 
-    This is the spot of the first printer if it is between half a pixel and ten pixels wide. Otherwise the
-    layouts belong to another printer, whose spot is assumed to be two pixels wide.
+    The result is ``FIRST_SPOT_UM`` if this spot is between half a pixel and ten pixels wide. Otherwise the
+    layouts are taken to belong to another printer, whose spot is assumed to be two pixels wide.
     """
     low, high = _RESOLVED_PX
     return FIRST_SPOT_UM if low <= FIRST_SPOT_UM / pitch_um <= high else _SPOT_PX * pitch_um
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """Scale the lengths of a config to a pitch. Lengths that are missing in ``set_`` take their default
-    values. Return an empty dict if the scale is 1.
+    """Return the lengths of a model's configuration, scaled to the spot size for the given pitch. A length
+    that is missing in ``set_`` is scaled from its default value. If the scale is 1, the returned dict is
+    empty.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -48,15 +51,15 @@ def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: floa
 
 
 class SimulatorConfig(BaseModel):
-    """Geometry and variant of a model; subclasses add their hyper-parameters.
+    """Configuration of a model: its geometry and its variant. Subclasses add their hyper-parameters.
 
-    ``VARIANT_FIELDS`` lists the fields that a variant sets. The config stores the values of these fields, so
-    a saved model does not depend on later definitions of a variant.
+    ``VARIANT_FIELDS`` lists the fields that a variant sets. The configuration stores the values of these
+    fields. A saved model therefore stays the same if the definition of a variant changes later.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {}
-    # Fields whose defaults are multiples of the first printer's spot.
+    # Names of the fields whose defaults are multiples of FIRST_SPOT_UM.
     LENGTHS: ClassVar[tuple[str, ...]] = ()
 
     variant: Variant = "default"
@@ -67,10 +70,11 @@ class SimulatorConfig(BaseModel):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the config of a named variant; ``fields`` (geometry or hyper-parameters) override the variant.
+        """Make the configuration of a named variant. Values in ``fields`` (geometry or hyper-parameters)
+        replace those that the variant sets.
 
         Raises:
-            InputError: unknown variant.
+            InputError: the variant is unknown.
         """
         require_known("variant", variant, VARIANTS)
         own = cls.VARIANT_FIELDS.get(variant, {})
@@ -79,13 +83,13 @@ class SimulatorConfig(BaseModel):
 
     @property
     def full_height_um(self) -> float:
-        """Return the nominal height of the highest level, µm."""
+        """Return the nominal height of the highest layout level, µm."""
         return (self.levels - 1) * self.level_height_um
 
 
 class Tile(NamedTuple):
-    """A square on which a model is trained and evaluated; neighbouring tiles overlap by ``overlap_px`` and
-    are blended.
+    """Size of the square tiles on which a model is trained and evaluated. Neighbouring tiles overlap by
+    ``overlap_px`` pixels, and predictions are blended in the overlap.
     """
 
     size_px: int
@@ -93,15 +97,17 @@ class Tile(NamedTuple):
 
 
 class Simulator(nn.Module, ABC):
-    """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
+    """A process model: ``model(layout_um)`` returns the printed height. Layout and height are float32 tensors
+    of shape (batch, 1, ny, nx), in µm.
 
-    A subclass implements ``interior``. A pixel of the interior may depend only on the layout within
-    ``reach_px``, so a crop with this margin gives the same height as the whole field.
+    A subclass implements ``interior``. The height of a pixel may depend only on the layout within
+    ``reach_px`` pixels of it. A crop of the layout with this margin then gives the same heights as the whole
+    field.
     """
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # Whether the height is linear in the parameters; if so, one Jacobian serves the whole fit.
+    # True if the height is linear in the parameters. One Jacobian then serves the whole fit.
     is_linear: ClassVar[bool] = False
 
     def __init__(self, config: SimulatorConfig):
@@ -109,7 +115,7 @@ class Simulator(nn.Module, ABC):
         self.config = config
 
     def register_parameter(self, name: str, param: nn.Parameter | None) -> None:
-        """Register a parameter. A parameter that the config fixes is not trained."""
+        """Register a parameter. If the configuration lists it in ``fixed``, it is not trained."""
         known = self.ranges[name].name if name in self.ranges else name
         if param is not None and known in self.config.fixed:
             param.requires_grad_(False)
@@ -118,54 +124,58 @@ class Simulator(nn.Module, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int | None:
-        """Return the receptive radius in pixels; None if a pixel depends on the whole image."""
+        """Return the receptive radius in pixels, or None if each pixel depends on the whole layout."""
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile of a model whose result depends on the size of the image; None for other models."""
+        """Return the tile size of a model whose result depends on the size of its input, or None for other
+        models.
+        """
         return None
 
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Return the height in µm of the pixels that are farther than ``reach_px`` from the edge. The result
-        is (b, 1, y - 2r, x - 2r), where r is ``reach_px``.
+        """Return the height, µm, of the pixels that are at least ``reach_px`` from the edge of the layout.
+        For a layout of shape (batch, 1, ny, nx), the result has shape (batch, 1, ny - 2r, nx - 2r), where r
+        is ``reach_px``.
 
-        A model without a receptive radius receives a whole image or one tile, and returns heights of the same
-        size.
+        A model without a receptive radius receives a whole layout or one tile of it, and returns heights of
+        the same shape.
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field. Beyond the edge of the layout, its outermost pixels are
-        repeated.
+        """Return the height of the whole layout, µm. For this, the layout is continued beyond its edge by
+        repeating its outermost pixels.
         """
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Return the result of ``forward`` with ``border_px`` cropped on each side, µm.
+        """Return the height, µm, that ``forward`` gives, with ``border_px`` pixels cropped on each side.
 
-        A model without a receptive radius overrides this method if it need not compute the border. For other
-        models, ``predict_inside`` computes only the pixels that are needed.
+        A model without a receptive radius overrides this method if it can leave out the computation of the
+        border. For models with a receptive radius, ``predict_inside`` computes only the pixels that are
+        needed.
         """
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """Return the model without its part for the microscope, or the model itself if it has no such
-        part.
+        """Return the model of the printer alone. This is the model itself, unless it also contains a model of
+        the microscope.
         """
         return self
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Return the ranges of the values that are limited. Each key is the name of the parameter that holds
-        the value as one raw number. Other parameters are not limited.
+        """Return the allowed ranges of the model's physical values. Each key is the name of the parameter
+        that stores the value as one unlimited (raw) number. Parameters without a key have no range.
         """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Return the values that lie on a bound of their range, as a dict from the name of the value to this
-        bound.
+        """Return the physical values that lie on a bound of their range. The dict maps the name of the value
+        to this bound.
         """
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
@@ -178,27 +188,27 @@ class Simulator(nn.Module, ABC):
 
     @property
     def reach_um(self) -> float | None:
-        """Return the receptive radius in µm; None if a pixel depends on the whole image."""
+        """Return the receptive radius in µm, or None if each pixel depends on the whole layout."""
         return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
 
     @property
     def parameter_count(self) -> int:
-        """Return the number of trained values."""
+        """Return the number of values in all parameters, fixed ones included."""
         return sum(parameter.numel() for parameter in self.parameters())
 
 
 def is_small(model: nn.Module) -> bool:
-    """Return whether the model has at most ``SMALL_PARAMETERS`` trainable parameters.
+    """Return True if the model has at most ``SMALL_PARAMETERS`` trainable values.
 
-    Small models are fitted by least squares, unless the paper's recipe is used. The loop fits a small model
-    together with the effects. Other models are trained by stochastic gradient descent, and the loop does not
-    refit them.
+    Small models are fitted by least squares, unless the paper's recipe is used. The closed loop fits a small
+    base model together with the effects that it adds. Larger models are trained by stochastic gradient
+    descent, and the closed loop leaves them unchanged.
     """
     return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 
 
 def crop_border(field: Tensor, border_px: int) -> Tensor:
-    """Crop ``border_px`` from all four sides of a field (..., y, x)."""
+    """Crop ``border_px`` pixels from all four sides of a field of shape (..., ny, nx)."""
     if border_px == 0:
         return field
     return field[..., border_px:-border_px, border_px:-border_px]

@@ -1,1 +1,3 @@
-"""Boards: stores from the virtual fab with hidden causes, and a judge for the answers of a loop."""
+"""Blind boards. A board is a set of dataset stores simulated by the virtual fab with hidden causes. A judge
+compares the answers of a loop with these causes.
+"""

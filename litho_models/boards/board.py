@@ -1,4 +1,6 @@
-"""Make a board on which any loop can be judged: stores, a record of their hidden causes, and the judge."""
+"""Make a blind board and judge a loop on it. A board consists of simulated dataset stores and a record of
+their hidden causes; a loop is any program that names causes.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,9 @@ from litho_models.boards.own_loop import own_loop
 from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
-# All printers of singles are Physics models. Mixtures also have other printers, so the loop chooses the best
-# base model for them.
+# Base model that the loop corrects. On the board ``singles``, the Physics model can represent every printer.
+# The board ``mixtures`` also has printers that it cannot represent, so there the loop chooses the best base
+# model.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
 # A function that maps a dataset store and an empty working folder to the loop's answer.
@@ -39,7 +42,7 @@ def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str
     Raises:
         InputError: no trials can be drawn with these settings, or the fields cannot be printed.
     """
-    # This call refuses impossible fields now, before a trial fails on them.
+    # This call raises an error for impossible field sizes now, before a trial fails on them.
     Plan(n_scans, (size_px, size_px))
     trials = draw_board(board, seed)
     return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
@@ -54,20 +57,22 @@ def new_board(
     n_scans: int = 12,
     size_px: int = 256,
 ) -> Draws:
-    """Make the stores of a board in ``out/stores`` and write their causes to ``out/hidden``; resumable.
+    """Make the dataset stores of a board in ``out/stores`` and write their causes to ``out/hidden``. An
+    interrupted call resumes.
 
     Args:
         out: folder of the board.
-        board: ``singles`` (one cause per trial) or ``mixtures`` (two to four); ``seed``: determines all
-            draws.
-        trials: number of drawn trials to make, starting with the first; None: all.
-        n_scans: scans in each store; ``size_px``: side of a layout.
+        board: ``singles`` (one cause per trial) or ``mixtures`` (two to four causes per trial); some trials
+            of either board have none. ``seed``: determines all random draws.
+        trials: number of trials to make, starting with the first drawn; None makes all.
+        n_scans: number of scans in each store; ``size_px``: side of a layout, in pixels.
 
     Raises:
         InputError: no trials can be drawn with these settings, or ``out`` holds another board.
     """
     drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
-    # Trials in measured prints are left out, because they need a store of measured prints.
+    # Trials that plant causes into measured prints are left out, because they need a store of measured
+    # prints.
     kept = [draw for draw in drawn.trials if draw.kind != "measured"][:trials]
     draws = drawn.model_copy(update={"trials": kept})
     facts = draws.model_dump(mode="json", exclude={"schema_"})
@@ -96,15 +101,18 @@ def judge_board(
     name: str | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> Scoreboard:
-    """Give every store of a board to a loop, judge its answers, and write ``scoreboard.json`` and its table.
+    """Give every store of a board to a loop, judge the answers of the loop, and write ``scoreboard.json`` and
+    ``scoreboard.csv``.
 
-    An error inside the loop fails only that trial. Interrupted runs resume.
+    If the loop raises an error, only the current trial fails. An interrupted call resumes.
 
     Args:
-        board: folder of ``new_board``.
-        out: folder of the trials; each trial keeps the files that the loop wrote.
-        loop: function that maps a store and an empty folder to an answer; by default our closed loop.
-        name: name of the loop; an ``out`` with the trials of another loop is refused.
+        board: folder written by ``new_board``.
+        out: folder for the results; the files that the loop writes are kept in one folder per trial.
+        loop: function that receives the path of a store and of an empty folder and returns an answer; by
+            default the closed loop of this package.
+        name: name of the loop, written to the scoreboard. If ``out`` holds the trials of a loop with another
+            name, an error is raised.
         report: function that receives the progress messages of the default loop.
 
     Raises:
@@ -132,12 +140,12 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """Wrap a command as a loop. The command receives STORE and FOLDER as its last arguments and writes
-    FOLDER/answer.json.
+    """Turn a shell command into a loop function. The command receives the paths STORE and FOLDER as its last
+    two arguments and writes its answer to FOLDER/answer.json.
 
     Raises:
-        InputError: the command cannot be run. The returned loop also raises this error, if the exit code is
-            not 0 or the answer is missing.
+        InputError: the command cannot be run. The returned function raises the same error if the exit code of
+            the command is not 0 or if the answer is missing.
     """
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
@@ -166,24 +174,24 @@ def _trial(draw: Draw, draws: Draws, board: Path, folder: Path, loop: Loop) -> T
 
 
 def name_of(draw: Draw) -> str:
-    """Return the name of a trial's files and folders: two digits."""
+    """Return the name of the files and folders of a trial: its number, with two digits."""
     return f"{draw.number:02d}"
 
 
 def store_of(board: Path, draw: Draw) -> Path:
-    """Return the path of the store that a loop receives."""
+    """Return the path of the store that the loop receives for this trial."""
     return board / STORES / f"{name_of(draw)}.zarr"
 
 
 def cpu_s() -> float:
-    """Return the CPU time, in seconds, of this process and its finished children."""
+    """Return the CPU time, in seconds, that this process and its finished child processes have used."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def trial_line(trial: Trial) -> str:
-    """Describe a trial in one line: the outcome of each cause, false names, the error, and the reason for a
-    failure.
+    """Describe a judged trial in one line: the outcome of each planted cause, the causes named wrongly, the
+    error of the corrected model, and the reason if the trial failed.
     """
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false name: {name}" for name in trial.false_names]

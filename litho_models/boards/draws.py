@@ -1,9 +1,10 @@
-"""Draw the causes to plant from all causes that the virtual fab can simulate.
+"""Draw at random which causes are planted in the trials of a board. They are drawn from all causes that the
+virtual fab can simulate.
 
-One seed determines all draws, which are made before any run.
+One seed determines all draws. They are made before the loop runs on any trial.
 
-There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. This module
-does not read the loop's catalogue of effects.
+There are two boards: ``singles`` with one cause per trial, and ``mixtures`` with two to four. Some trials of
+either board have no cause. This module does not read the catalogue of effects that the loop searches.
 """
 
 from __future__ import annotations
@@ -19,21 +20,23 @@ from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest and largest drawn size. Strengths are set on four scans. On all scans, a size may be 13 % smaller,
-# and the cause must still count.
+# Smallest and largest drawn size of a cause. The strength that gives this size is found on four scans.
+# Measured on all scans, the size may turn out 13 % smaller, and the cause must still be large enough to
+# count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
-# Numbers of mixtures with a linear slope loss by batch; an S-shaped axis in half of the scans; another cause
-# whose strength differs by batch or field; and a printer that the Physics model cannot imitate.
+# Number of mixtures of each kind: LINEAR have a linear slope loss whose strength differs by batch; S_SHAPED
+# have an S-shaped scanner axis in half of the scans; GROUPED have another cause whose strength differs by
+# batch or field; BEYOND_PHYSICS have a printer that the Physics model cannot imitate.
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
-# These are not drawn: the first is part of the default noise, and a refit leaves less than 10 nm of the
-# second.
+# These knobs are not drawn. Line roughness is part of the default noise. Of long-range proximity, less than
+# 10 nm remains after the base model is refitted.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# These causes differ randomly between scans, or do not change the height map, so a model of all scans cannot
-# contain them.
+# Some of these causes differ randomly between scans, and the others do not change the height map. One model
+# of all scans therefore cannot contain them.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -44,9 +47,11 @@ _OF_SINGLE_SCANS = {
 }
 # The measured prints may already have these causes, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
-# These knobs were added after the first boards. They are not drawn, so that those boards stay the same.
+# These knobs were added after the first boards were published. They are not drawn, so that a seed still gives
+# the same board.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
-# Ranges of the printers' parameters, around the fab's defaults and within the bounds of Physics.
+# Ranges from which the parameters of the printers are drawn. They lie around the defaults of the virtual fab
+# and within the bounds of the Physics model.
 _PRINTER_RANGES = {
     "threshold_dose": (0.2, 0.4),
     "threshold_steepness": (1.2, 3.0),
@@ -57,13 +62,14 @@ _PRINTER_RANGES = {
 
 
 def draw_board(board: Board, seed: int) -> list[Draw]:
-    """Draw the trials of a board, in random order, each with its own printer.
+    """Draw the trials of a board. They are in random order, and each has its own printer parameters.
 
-    Each knob or form is used once before any is used again. An ``alias`` is a knob that the base can imitate
-    or that scan terms absorb. Other knobs are ``in-form``. Sizes are drawn log-uniformly.
+    Each knob and each form is used once before any is used again. A trial is an ``alias`` if its cause is a
+    knob that the base model can imitate or that the per-scan terms absorb. A trial with any other knob is
+    ``in-form``. The sizes of the causes are drawn log-uniformly.
 
     Raises:
-        InputError: a negative seed.
+        InputError: the seed is negative.
     """
     if seed < 0:
         raise InputError("seed", got=seed, wanted="0 or more")
@@ -71,7 +77,9 @@ def draw_board(board: Board, seed: int) -> list[Draw]:
 
 
 def names_of(cause: str) -> tuple[str, ...]:
-    """Return the names of the catalogue that count as right for a knob or a form."""
+    """Return the names of effects in the loop's catalogue that count as the right answer for a knob or a
+    form.
+    """
     if cause in FORMS:
         return FORMS[cause].names
     effect = KNOBS[cause].effect
@@ -114,10 +122,10 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 
 
 def _draw_mixtures(rng: Rng) -> list[Draw]:
-    """Draw the trials of mixtures.
+    """Draw the trials of the board ``mixtures``.
 
-    For about half of the causes, the catalogue contains the form. No two causes of a trial share a right
-    name.
+    The loop's catalogue contains the form of about half of the causes. No two causes of a trial have a right
+    name in common.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -143,7 +151,7 @@ def _draw_mixtures(rng: Rng) -> list[Draw]:
             causes[0] = _in_groups(causes[0], at, rng)
         printer = _draw_printer(rng)
         if base and base.name == "hill-response":
-            # This form replaces the default response.
+            # This form replaces the logistic response, so the parameters of that response are not drawn.
             printer = {name: value for name, value in printer.items() if not name.startswith("threshold")}
         drawn.append(Draw(number=0, kind=kind, seed=0, causes=causes, printer=printer, base=base))
     return [
@@ -153,7 +161,9 @@ def _draw_mixtures(rng: Rng) -> list[Draw]:
 
 
 def _in_groups(cause: CauseDraw, at: int, rng: Rng) -> CauseDraw:
-    """Make the strength of the first causes of a mixtures board differ by batch or by field."""
+    """Make the strength of a cause differ by batch or by field if trial number ``at`` is among the first of
+    the board ``mixtures``.
+    """
     if at < LINEAR:
         return _by_batch(cause, rng)
     if at < LINEAR + S_SHAPED:
@@ -172,7 +182,7 @@ def _draw_printer(rng: Rng) -> dict[str, float]:
 
 
 def _by_batch(cause: CauseDraw, rng: Rng) -> CauseDraw:
-    """Make a cause weaker after a point near the middle of the printing order."""
+    """Make a cause weaker in the prints after a random point near the middle of the printing order."""
     place, weak = f"{rng.uniform(-0.2, 0.2):.3f}", round(rng.uniform(0.0, 0.6), 3)
     return cause.model_copy(update={"by": "batch", "place": place, "weak": weak})
 
@@ -191,8 +201,8 @@ def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Deal causes from a deck until there are ``size``, skipping causes with a right name that is refused or
-    taken.
+    """Draw causes from ``deck`` until there are ``size``, starting from those in ``started``. Skip a cause if
+    one of its right names is in ``refused`` or belongs to an earlier cause.
     """
     names = list(started)
     while len(names) < size:

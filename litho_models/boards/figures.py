@@ -1,4 +1,6 @@
-"""Make the scoreboard: all draws with their outcomes, and the headline results."""
+"""Make the scoreboard of a board: all drawn trials with their outcomes, and the headline results computed
+from them.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Outcome, Scoreboard, Trial, Verdict
 
-# Largest accepted error with the findings, as a multiple of the true models' error.
+# Largest accepted error of the model corrected with the findings, as a multiple of the error of the true
+# models.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -22,7 +25,9 @@ _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
 
 
 class Figure(NamedTuple):
-    """A headline result in words. ``wanted`` is the target set before the board was run, or empty."""
+    """A headline result in words. ``wanted`` is the target that was set before the board was run; it is empty
+    if there is none.
+    """
 
     what: str
     value: str
@@ -30,7 +35,9 @@ class Figure(NamedTuple):
 
 
 def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scoreboard:
-    """Make the scoreboard of a board from its finished trials; ``command`` reproduces it."""
+    """Make the scoreboard of a board from its finished trials. ``command`` is the command line that
+    reproduces the scoreboard.
+    """
     run = run_info([draws.seed], draws.n_scans)
     done = {trial.draw.number for trial in trials}
     return Scoreboard(
@@ -45,8 +52,8 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Format the number of hits and the total, with the exact 95 % confidence interval of the share (Clopper
-    and Pearson).
+    """Format how many values are True and how many there are, with the exact (Clopper-Pearson) 95 %
+    confidence interval of this share.
     """
     known = [*hits]
     if not known:
@@ -56,9 +63,9 @@ def share(hits: Iterable[bool]) -> str:
 
 
 def counted(trials: Iterable[Trial]) -> list[Outcome]:
-    """Return the outcomes of causes larger than 8 nm.
+    """Return the outcomes of the planted causes whose size (rms) is above ``COUNTS_FROM_RMS_NM``.
 
-    If a trial failed before the sizes were measured, the drawn sizes count.
+    If a trial failed before the sizes of its causes were measured, the drawn sizes are used.
     """
     found = []
     for trial in trials:
@@ -69,8 +76,8 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline results. In a failed trial, no cause counts as found, and the error counts as too
-    large.
+    """Compute the headline results. In a failed trial, no cause counts as found, and the error counts as
+    above its tolerance.
     """
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
@@ -87,7 +94,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
         ratio = np.median(bias[:, 1] / bias[:, 0])
         figures.append(
             Figure(
-                "error of the base's values without and with the findings; median ratio",
+                "error of the base model's values: without findings, with findings; median ratio of the two",
                 f"{100 * without:.1f} %, {100 * with_found:.1f} %; {ratio:.2f}",
                 "at most 1/3",
             )
@@ -95,7 +102,7 @@ def figures_of(scoreboard: Scoreboard) -> list[Figure]:
     minutes = [trial.dataset_cpu_s / 60 for trial in trials if trial.dataset_cpu_s is not None]
     if minutes:
         spent = f"{np.mean(minutes):.1f}, {max(minutes):.1f}"
-        figures.append(Figure("CPU minutes per data set: mean, longest", spent))
+        figures.append(Figure("CPU minutes per dataset: mean, longest", spent))
     return figures
 
 
@@ -108,7 +115,9 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Return whether the error with the findings is within the tolerance; False if the error is unknown."""
+    """Return True if the error of the model corrected with the findings is within the tolerance of this kind
+    of trial. Return False if the error is unknown.
+    """
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)
 
@@ -177,7 +186,9 @@ def _causes(what: str, causes: Iterable[Outcome], verdicts: Sequence[Verdict], w
 
 
 def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
-    """Return one row per planted cause and one per trial without causes; sizes in nm, empty if unknown."""
+    """Return a table with one row per planted cause and one row per trial without causes. Sizes are in nm;
+    unknown values are empty.
+    """
     rows: list[dict[str, Any]] = []
     for trial in scoreboard.trials:
         set_as = {one.draw.name: one for one in trial.planted}

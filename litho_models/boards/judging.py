@@ -1,6 +1,7 @@
-"""Compare a loop's answer with the planted causes, and its error with that of the true models.
+"""Compare the causes that a loop names with the planted causes, and the error of its corrected model with the
+error of the true models.
 
-The rules are stated in docs/blind_trials.md before a board is run.
+The rules were stated in docs/blind_trials.md before any board was run.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# For these forms, a name is right only if the interval of its exponent contains this value.
+# For these forms, a right name counts only if the confidence interval of the exponent found contains this
+# value.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # This form consists of line offsets, so a loop that reports line offsets has noticed it.
@@ -29,8 +31,8 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Leave out findings that the fab's default noise causes in every scan, such as datum, bow or line
-    offsets.
+    """Return the findings without those that the default noise of the fab causes in every scan, such as
+    datum, bow or line offsets.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
@@ -41,9 +43,9 @@ def judged(
     """Judge one trial.
 
     Args:
-        draw: the trial as drawn; ``planted``: result of `plant`.
-        answer: the loop's answer; ``used_s``: CPU time of the loop, s.
-        jobs: the printed fields; ``store``: the store that the loop got.
+        draw: the trial as drawn; ``planted``: causes at their strengths, as returned by `plant`.
+        answer: answer of the loop; ``used_s``: CPU time that the loop used, s.
+        jobs: the printed fields; ``store``: dataset store that the loop received.
     """
     locked = set(store.locked_ids)
     scans = [scan for scan in store.scans() if scan.id not in locked]
@@ -72,9 +74,9 @@ def judge(
 ) -> list[Outcome]:
     """Return one outcome per planted cause, in the order of the causes.
 
-    If nothing was planted, return one outcome for the whole trial.
+    If nothing was planted, the list has one outcome, which holds for the whole trial.
 
-    Each finding counts for at most one cause. Findings are assigned to larger causes first.
+    Each finding counts for at most one cause. Larger causes are matched with the findings first.
     """
     found = answer.found
     left = answer.left or bool(_beyond_noise(found))
@@ -105,8 +107,8 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the sets of causes that the loop named but that contain no planted cause. The form of the base
-    also counts as planted.
+    """Return the names that the loop gave wrongly: each is a finding whose set of names contains no planted
+    cause. The form that changes the printer (the draw's ``base``) also counts as planted.
     """
     return [
         " | ".join(named.names)
@@ -116,7 +118,7 @@ def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
 
 
 def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
-    """Return the planted causes, without the form of the base."""
+    """Return the planted causes without the form that changes the printer."""
     return [one for one in planted if one.draw in draw.causes]
 
 
@@ -130,8 +132,8 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Return whether the loop found a displacement along x in groups that do not mix strongly and weakly
-    displaced scans.
+    """Return True if the loop found a displacement along x that is shared by groups of scans, and none of
+    these groups mixes strongly and weakly displaced scans.
     """
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
@@ -143,8 +145,8 @@ def _displacement_is_shared(
     return False
 
 
-# A model of all scans cannot predict rounding, scars at random positions, or values that are drawn anew for
-# every scan or line. Bends are not listed, because the store's transform contains them.
+# One model of all scans cannot predict rounding, scars at random positions, or values that are drawn anew for
+# every scan or line. Bends of the scans are not listed, because the transforms in the store contain them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -161,11 +163,11 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Return the mean absolute error, nm, of the true models at k = 1.
+    """Return the mean absolute error, nm, of the true models, with one term (the datum) fitted to each scan.
 
-    The predictions are noise-free scans with all causes. Each is mapped onto the layout with the transform
-    (and bend) that the store contains for this scan. The error uses the same scans, pixels and per-scan terms
-    as the scores of the loop.
+    The predictions of the true models are noise-free scans that contain all planted causes. Each is mapped
+    onto the layout with the transform and the bend that the store contains for this scan. The error is
+    computed over the same scans and pixels as the scores of the loop, with the same per-scan terms.
     """
     by_id = {job.id: job for job in jobs}
     predictions = []
@@ -189,9 +191,10 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Return the median relative error of the base model's values, without and with the findings.
+    """Return the median relative error of the physical values fitted in the base model: first without, then
+    with the findings of the loop.
 
-    Return None if printer or base is not a Physics model.
+    Return None if the printer or the base model is not a Physics model.
     """
     if draw.base or draw.kind == "measured" or not answer.base_values:
         return None
@@ -199,7 +202,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # This is the standard deviation of the squared spot, if the base fits the spot.
+    # If the base model fits the spot, this is the standard deviation of the squared spot.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:
@@ -209,9 +212,9 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 
 
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
-    """Make the result of a trial that ended with an exception, and print the exception.
+    """Make the record of a trial that ended with an exception, and print the exception.
 
-    Paths are replaced by names, because results are published.
+    The paths in ``places`` are replaced by the given names in the reason, because results are published.
     """
     traceback.print_exception(error)
     reason = f"{type(error).__name__}: {error}"
@@ -221,7 +224,7 @@ def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping
 
 
 def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
-    """Make the result of a trial that did not finish."""
+    """Make the record of a trial that did not finish."""
     names = [one.name for one in draw.causes] or ["none"]
     return Trial(
         draw=draw,

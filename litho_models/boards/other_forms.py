@@ -1,7 +1,9 @@
-"""Causes whose form is not in the catalogue (other laws, axes, ranges, scales), and printers beyond Physics.
+"""Causes whose functional form is not in the loop's catalogue of effects, and printers that the Physics model
+cannot represent.
 
-Neither this module nor ``draws`` reads the loop's catalogue of effects. The seed of a trial determines the
-random values of its forms, such as a direction, a distance or a position.
+The forms differ from the catalogue in their law, axis, range or scale. Neither this module nor ``draws``
+reads the catalogue. The seed of a trial determines the random values of its forms, such as a direction, a
+distance or a position.
 """
 
 from __future__ import annotations
@@ -24,25 +26,27 @@ from litho_data.virtual_fab.geometry import ScanFrame
 Rng = np.random.Generator
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
-# A function that maps (field, strength, canvas or frame of the scan, job) to the changed field.
+# A function with the arguments (field, strength, canvas or frame of the scan, job). It returns the changed
+# field.
 Law = Callable[..., Array]
 Draw = Callable[[Rng], Law]
 
-# The spot of the fab: sd of the squared intensity, µm.
+# Spot size of the virtual fab: standard deviation of the squared intensity, µm.
 _SPOT_UM = 0.2
 _MOST_SCANS = 256
 
 
 @dataclass(frozen=True)
 class Form:
-    """One form of a cause; the function ``draw`` draws the random values of the form and returns its law.
+    """One functional form of a cause. Its function ``draw`` draws the random values of the form and returns
+    its law.
 
     Attributes:
-        limit: largest strength, in ``unit``; the law of a form changes nothing at strength 0.
-        meaning: the meaning of a strength of one unit, and the drawn values.
-        deck: boards that draw this form. A ``base`` form is not drawn as a cause, but belongs to the printer
-            of a mixture.
-        names: right names in the catalogue; most forms have none.
+        limit: largest strength, in ``unit``. At strength 0 the law changes nothing.
+        meaning: text that says what the strength is and which values are drawn.
+        deck: boards that draw this form. A ``base`` form is never drawn as a cause; it changes the printer of
+            a mixture.
+        names: names in the loop's catalogue that count as a right answer. Most forms have none.
     """
 
     name: str
@@ -59,7 +63,9 @@ FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """Several forms with their strengths. At each stage, the fab applies the forms one after the other."""
+    """Several forms with their strengths, as one cause of the virtual fab. The fab applies the forms of each
+    stage (dose, surface, scan) one after the other.
+    """
 
     def __init__(self, strengths: Mapping[str, float], seed: int):
         self._laws = [
@@ -91,7 +97,9 @@ def _number(name: str) -> int:
 def _form(
     name: str, stage: Stage, unit: str, limit: float, deck: Deck = "both", names: tuple[str, ...] = ()
 ) -> Callable[[Draw], Draw]:
-    """Register a drawing function as a form, whose meaning is the docstring of the function."""
+    """Return a decorator that registers a drawing function as a form. The docstring of the function becomes
+    the form's ``meaning``.
+    """
 
     def enter(draw: Draw) -> Draw:
         meaning = " ".join((draw.__doc__ or "").split())
@@ -106,7 +114,9 @@ def _form(
 
 @_form("far-copy", "dose", "1", 0.6)
 def _far_copy(rng: Rng) -> Law:
-    """Relative dose of a copy displaced by 6–15 µm in a random direction."""
+    """Dose of a copy of the exposure, relative to the exposure itself; the copy is displaced by 6–15 µm in a
+    random direction.
+    """
     distance_um, direction = rng.uniform(6, 15), rng.uniform(0, 2 * np.pi)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -122,7 +132,7 @@ def _far_copy(rng: Rng) -> Law:
 
 @_form("oriented-ringing", "dose", "1", 2.0)
 def _oriented_ringing(rng: Rng) -> Law:
-    """Relative gain at one period (2–5 µm) along one direction, ringing over 2–5 µm."""
+    """Relative gain of the dose at one period (2–5 µm) along one direction; the ringing fades over 2–5 µm."""
     period_um, decay_um, direction = rng.uniform(2, 5), rng.uniform(2, 5), rng.uniform(0, np.pi)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -160,7 +170,9 @@ def _halo_ring(rng: Rng) -> Law:
 
 @_form("fast-axis-memory", "dose", "1", 0.6)
 def _fast_axis_memory(rng: Rng) -> Law:
-    """Share of the dose lost by earlier writing in the same hatch line; fades over 3–8 µm."""
+    """Share of the dose that is lost because of earlier writing in the same hatch line; the loss fades over
+    3–8 µm.
+    """
     decay_um = rng.uniform(3, 8)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -172,7 +184,7 @@ def _fast_axis_memory(rng: Rng) -> Law:
 
 @_form("crowding", "dose", "1", 4.0)
 def _crowding(rng: Rng) -> Law:
-    """Relative gain of the dose with the cube of the density over 2.5–5 µm."""
+    """Relative gain of the dose per cube of the dose averaged over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
     return lambda dose, strength, canvas, job: (
         dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
@@ -181,7 +193,7 @@ def _crowding(rng: Rng) -> Law:
 
 @_form("alternate-slices", "dose", "1", 2.0)
 def _alternate_slices(rng: Rng) -> Law:
-    """Surplus or missing slices in every second level; the sign is random."""
+    """Number of slices that are surplus or missing in every second level; the sign is random."""
     odd, sign = rng.integers(2), rng.choice([-1, 1])
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -193,7 +205,9 @@ def _alternate_slices(rng: Rng) -> Law:
 
 @_form("focus-step", "dose", "µm", 2.0)
 def _focus_step(rng: Rng) -> Law:
-    """Blur (sd) added to the spot, starting at a random print near the middle."""
+    """Blur (standard deviation) added to the spot in all prints after a random one near the middle of the
+    printing order.
+    """
     first = rng.uniform(-0.25, 0.25)
     return lambda dose, strength, canvas, job: (
         blur(dose, canvas.pitch_um, strength) if job.order > first else dose
@@ -222,8 +236,9 @@ def _diagonal_slope_loss(rng: Rng) -> Law:
 
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: Rng) -> Law:
-    """Height lost per slope, only on flanks that fall in one direction."""
-    # This equals a loss of half the amount on both flanks plus a displacement, which registration removes.
+    """Height lost per slope, only on flanks that fall along one direction."""
+    # This equals a loss of half the amount on all flanks plus a displacement. Registration removes the
+    # displacement.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -232,7 +247,7 @@ def _lee_side_loss(rng: Rng) -> Law:
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: Rng) -> Law:
-    """Share of the height lost between two heights 0.15–0.25 µm apart; 1 makes a plateau."""
+    """Share of the height lost between two heights that are 0.15–0.25 µm apart; 1 makes a plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
     return lambda surface, strength, canvas, job: (
         surface - strength * np.clip(surface - lower_um, 0.0, width_um)
@@ -241,7 +256,7 @@ def _plateau(rng: Rng) -> Law:
 
 @_form("fringes", "surface", "nm", 150.0)
 def _fringes(rng: Rng) -> Law:
-    """Amplitude of an error periodic in the height, with period 0.12–0.3 µm."""
+    """Amplitude of an error that is periodic in the height, with a period of 0.12–0.3 µm."""
     period_um, phase = rng.uniform(0.12, 0.3), rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + 1e-3 * strength * np.sin(2 * np.pi * surface / period_um + phase)
@@ -250,7 +265,7 @@ def _fringes(rng: Rng) -> Law:
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: Rng) -> Law:
-    """Gain of detail finer than 0.6–1.2 µm, so that edges overshoot."""
+    """Gain of detail that is finer than 0.6–1.2 µm, so that edges overshoot."""
     reach_um = rng.uniform(0.6, 1.2)
     return lambda surface, strength, canvas, job: (
         surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
@@ -259,7 +274,7 @@ def _overshoot(rng: Rng) -> Law:
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
 def _blur_with_height(rng: Rng) -> Law:
-    """Share of a surface blurred by 0.5–1 µm, growing with the height."""
+    """Share, per µm of height, of the surface that is replaced by the surface blurred over 0.5–1 µm."""
     reach_um = rng.uniform(0.5, 1)
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -274,7 +289,9 @@ def _blur_with_height(rng: Rng) -> Law:
 
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: Rng) -> Law:
-    """Share of a surface blurred by 0.7–1.2 µm at one side of the field, 0 at the other."""
+    """Share of the surface that is replaced by the surface blurred over 0.7–1.2 µm at one side of the field;
+    the share falls to 0 at the opposite side.
+    """
     reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -315,7 +332,7 @@ def _seam_in_place(rng: Rng) -> Law:
 
 @_form("rim", "surface", "1", 1.0)
 def _rim(rng: Rng) -> Law:
-    """Relative gain of the height at the layout's edge, fading over 1.5–3 µm."""
+    """Relative gain of the height at the edge of the layout; the gain fades over 1.5–3 µm."""
     reach_um = rng.uniform(1.5, 3)
 
     def law(surface: Array, strength: float, canvas: Canvas, job: Job) -> Array:
@@ -331,7 +348,7 @@ def _rim(rng: Rng) -> Law:
 
 @_form("periodic-lines", "scan", "nm", 150.0)
 def _periodic_lines(rng: Rng) -> Law:
-    """Amplitude of line offsets of period 6–20 lines; each scan has a new phase."""
+    """Amplitude of line offsets that repeat every 6–20 lines; each scan has its own phase."""
     period, phases = rng.uniform(6, 20), rng.uniform(0, 2 * np.pi, _MOST_SCANS)
 
     def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
@@ -341,7 +358,7 @@ def _periodic_lines(rng: Rng) -> Law:
     return law
 
 
-# Known from the measured prints; part of every mixtures board
+# Effects found in the measured prints; every mixtures board contains them
 
 
 @_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
@@ -354,7 +371,7 @@ def _linear_slope_loss(rng: Rng) -> Law:
 
 @_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
 def _s_shaped_axis(rng: Rng) -> Law:
-    """Displacement along x, quadratic and cubic in x with random shares."""
+    """Amplitude of a displacement along x that is quadratic and cubic in x, in random proportion."""
     share = rng.uniform(np.pi / 6, np.pi / 3)
 
     def law(height: Array, strength: float, frame: ScanFrame, job: Job) -> Array:
@@ -372,7 +389,7 @@ def _s_shaped_axis(rng: Rng) -> Law:
 
 @_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
 def _two_part_spot(rng: Rng) -> Law:
-    """Share of the spot in a second part with sd 0.5–0.9 µm."""
+    """Share of the dose in a second part of the spot, blurred with standard deviation 0.5–0.9 µm."""
     width_um = rng.uniform(0.5, 0.9)
     return lambda dose, strength, canvas, job: (
         (1 - strength) * dose + strength * blur(dose, canvas.pitch_um, width_um)
@@ -383,17 +400,19 @@ def _two_part_spot(rng: Rng) -> Law:
     "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
 )
 def _hill_response(rng: Rng) -> Law:
-    """Weight of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) against the logistic one."""
+    """Weight of a Hill curve (exponent 1.5–2.5, half of its maximum at a dose of 0.4–0.7) in the response;
+    the rest is the logistic curve.
+    """
     exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
 
     def law(dose: Array, strength: float, canvas: Canvas, job: Job) -> Array:
-        # These are the doses at which the default printer's logistic curve gives the same conversion as the
-        # Hill curve does at ``dose``.
+        # Compute the dose at which the logistic curve of the default printer gives the same conversion as the
+        # Hill curve gives at ``dose``.
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
-        # For a sum of doses the Hill curve may give more than full conversion, which a logistic curve never
-        # reaches.
+        # For a sum of doses, the Hill curve may exceed full conversion. The logistic curve never reaches full
+        # conversion.
         response = np.minimum(low + (high - low) * hill, 0.99)
         return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
 
@@ -402,7 +421,7 @@ def _hill_response(rng: Rng) -> Law:
 
 @_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
 def _elliptical_blur(rng: Rng) -> Law:
-    """Blur (sd) added to the spot along one direction."""
+    """Blur (standard deviation) added to the spot along one direction."""
     direction = rng.uniform(0, np.pi)
     return lambda dose, strength, canvas, job: apply_transfer(
         dose, np.exp(-2 * (np.pi * strength * _frequency_along(canvas, direction)) ** 2)
@@ -410,7 +429,9 @@ def _elliptical_blur(rng: Rng) -> Law:
 
 
 def _spread(dose: Array, strength: float, transfer: Array) -> Array:
-    """Mix the dose with the dose spread by a transfer function (1 at f = 0), with weight ``strength``."""
+    """Mix the dose, with weight 1, and the dose filtered by a transfer function, with weight ``strength``.
+    The transfer function is 1 at zero frequency. The weights are scaled to a sum of 1.
+    """
     return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
@@ -425,22 +446,23 @@ def _slope_along(surface: Array, canvas: Canvas, direction: float) -> Array:
 
 
 def _across(canvas: Canvas, axis: int) -> Array:
-    """Return the position on the layout along an axis (0: y, 1: x), from 0 at the first edge to 1 at the
-    last.
+    """Return the position of each pixel along one axis (0: y, 1: x), from 0 at the first edge of the layout
+    to 1 at the last.
     """
     at_um = (canvas.y_um, canvas.x_um)[axis]
     return np.broadcast_to(at_um / canvas.size_um[axis], canvas.level.shape)
 
 
 def _seam(rng: Rng) -> tuple[int, float]:
-    """Draw a side and the place of a seam through the field, for ``_beyond``."""
+    """Draw the arguments ``side`` and ``place`` of ``_beyond``, which define a seam through the field."""
     return int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
 
 def _beyond(canvas: Canvas, side: int, place: float) -> Array:
     """Return a mask that is True on one side of a seam.
 
-    ``side`` encodes both the axis across the seam (0, 1: y; 2, 3: x) and the side (odd: after the seam).
+    The number ``side`` encodes the axis across the seam (0 and 1: y; 2 and 3: x) and the masked side (even:
+    before the seam; odd: after it).
     """
     across = _across(canvas, axis=side // 2)
     return across > place if side % 2 else across < place

@@ -1,4 +1,4 @@
-"""Run our closed loop on the stores of a board."""
+"""Run the closed loop of this package on the stores of a board."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from litho_models.loop.run import close_loop
 def own_loop(
     store: Path, folder: Path, *, base: str, report: Callable[[str], None] = lambda message: None
 ) -> Answer:
-    """Run our closed loop on a store, with results in ``folder/loop``; ``base`` is the model to correct."""
+    """Run the closed loop of this package on a store and return its answer. The results of the loop are
+    written to ``folder/loop``; ``base`` is the model that it corrects.
+    """
     return answer_of(close_loop(store, folder / "loop", base=base, report=report))
 
 
 def answer_of(result: CloseLoop) -> Answer:
-    """Convert the result of our closed loop to a board's answer."""
+    """Convert the result of the closed loop of this package to the answer that a board expects."""
     added = [
         Found(
             names=[one.name, *one.confusable_with],

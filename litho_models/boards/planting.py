@@ -1,8 +1,9 @@
-"""Plant the causes of a trial at their strengths, and print its fields.
+"""Find the strengths of the causes of a trial, and simulate its prints and scans with these causes.
 
-The size of a cause is the rms of the change that remains after the base is refitted. To find the size, the
-Physics model, which can represent the fab without causes, is fitted to noise-free scans that contain the
-cause. Datum, gain, tilt, bow and an affine registration error are free in each scan.
+The size of a cause is the rms of the residual that remains after the base model is refitted to prints with
+this cause. To find it, the Physics model is fitted to noise-free scans that contain the cause. (Without
+causes, this model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine registration
+error are fitted to each scan at the same time.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# The search for a strength uses four scans, spread over the printing order and with both cut-offs. The size
-# is then measured on all scans.
+# The search for a strength uses four scans, spread over the printing order and over both cut-off frequencies
+# of the layouts. The size of the cause is then measured on all scans.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
@@ -43,12 +44,14 @@ def printer_of(draw: Draw) -> Printer:
 
 
 def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
-    """Make the fields of a trial as ``litho-data simulate`` makes them with this seed."""
+    """Make the fields of a trial. They are the fields that ``litho-data simulate`` makes with the seed of the
+    trial.
+    """
     return tuple(random_jobs(Plan(n_scans, (size_px, size_px)), printer_of(draw), draw.seed))
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """Return the strength of a cause in a scan, as a share of its full strength."""
+    """Return the strength that a cause has in one scan, as a share of its full strength."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -68,9 +71,9 @@ def fab_of(
 
     Args:
         draw: the trial as drawn.
-        planted: result of `plant`.
-        noise, microscope: replace the defaults.
-        without: causes to leave out.
+        planted: causes at their strengths, as returned by `plant`.
+        noise, microscope: if given, they replace the defaults of the virtual fab.
+        without: names of causes to leave out.
     """
     strength = {one.draw.name: one.strength * share_of(one.draw, job) for one in planted}
     strength = {name: own for name, own in strength.items() if name not in without}
@@ -87,22 +90,24 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Find the strength at which each cause, planted alone, has its drawn size on these fields.
+    """For each drawn cause, find the strength at which the cause, planted alone in these fields, has its
+    drawn size.
 
-    The form of the base comes first in the result.
+    If the draw has a form that changes the printer (``base``), this form comes first in the result.
 
-    A cause that cannot reach its size gets its largest strength, and the size that it reaches is recorded. No
-    other cause is drawn in its place. For an alias, the size is the change of the scans before a refit,
-    because the refit absorbs most of this change.
+    A cause that cannot reach its drawn size gets its largest strength, and the size that it reaches is
+    recorded. No other cause is drawn in its place. For a trial of kind ``alias``, the strength is chosen by
+    the change of the scans before the refit, because the refit absorbs most of this change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [_sized(one, jobs, draw) for one in drawn]
 
 
 def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
-    """Print and scan all fields, and write the raw files; return the path of their card.
+    """Simulate the prints and scans of all fields, and write the raw files. Return the path of the dataset
+    card (the TOML file that describes the raw files).
 
-    The card states only the required facts.
+    The card contains only the required entries.
     """
     (folder / "scans").mkdir(parents=True)
     for job in jobs:
@@ -123,7 +128,9 @@ def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folde
 
 
 def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> list[np.ndarray]:
-    """Return scans (y, x) without noise and on the layout's grid, µm."""
+    """Return one noise-free scan per field: heights in µm on the grid of the layout, as arrays of shape (ny,
+    nx).
+    """
     found = []
     for job in jobs:
         fab = fab_of(draw, planted, job, noise=Noise.off(), microscope=Microscope.aligned())
@@ -135,12 +142,11 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
 
 
 def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer) -> float:
-    """Return the rms residual of noise-free prints, nm, after a refit of the Physics model and the scan
-    terms.
+    """Fit the Physics model and the per-scan terms to noise-free scans, and return the rms residual, nm.
 
     Args:
-        heights_um: (y, x) on the layout's grid, µm, one per job.
-        printer: printer whose values are the starting values of the fit.
+        heights_um: one array of shape (ny, nx) per job: heights on the grid of the layout, µm.
+        printer: printer whose parameters are the starting values of the fit.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
     model = plain_model(printer)
@@ -153,14 +159,14 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
 
 class _Refit(ModelProblem):
-    """Fit the model together with orthonormal terms of each scan by least squares."""
+    """The least-squares problem of a model and the terms of each scan, which are made orthonormal."""
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]
 
 
 def plain_model(printer: Printer) -> Simulator:
-    """Return the Physics model with the values that reproduce the plain fab."""
+    """Return the Physics model with the values that reproduce the virtual fab without causes."""
     return build_model(
         "physics",
         pitch_um=printer.pitch_um,

@@ -1,4 +1,4 @@
-"""The records of a board: draws, hidden causes, answers, judged trials, scoreboard."""
+"""The records of a board: drawn trials, hidden causes, answers, judged trials and the scoreboard."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from litho_data.foundation.results import Record, Result
 
 Board = Literal["singles", "mixtures"]
 Kind = Literal["in-form", "alias", "other-form", "empty", "mixture", "measured"]
-# Causes with a smaller rms are listed but not counted.
+# Causes whose size (rms) is not above this value are listed, but do not count in the headline results.
 COUNTS_FROM_RMS_NM = 8.0
 Verdict = Literal[
     "right",
@@ -26,9 +26,10 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A cause as drawn: a knob of the virtual fab or another form, and the size that it should have.
+    """A cause as drawn: the name of a knob of the virtual fab or of another form, and the size that the cause
+    should have.
 
-    The size is that of `Planted.rms_nm`.
+    The size is defined as in `Planted.rms_nm`.
 
     Attributes:
         by: the scans that have only ``weak`` times the strength: none (``all``), those after ``place`` in the
@@ -46,9 +47,9 @@ class Draw(Record):
     """One trial as drawn.
 
     Attributes:
-        seed: determines layouts, noise and the random values of knobs.
-        printer: parameters that differ from those of the default printer; ``base``: a form that the Physics
-            model cannot imitate.
+        seed: determines the layouts, the noise, and the random values of knobs and forms.
+        printer: parameters that differ from those of the default printer; ``base``: form that changes the
+            printer so that the Physics model cannot imitate it.
     """
 
     number: int
@@ -60,7 +61,9 @@ class Draw(Record):
 
 
 class Draws(Result):
-    """All trials of a board, written before any trial runs; ``base`` is the model that loops correct."""
+    """All drawn trials of a board, written before any trial runs. ``base`` is the model that the loop
+    corrects.
+    """
 
     SCHEMA = "litho-models/blind-trial-draws/2"
     FILE_NAME = "draws.json"
@@ -74,14 +77,14 @@ class Draws(Result):
 
 
 class Planted(Record):
-    """A knob or a form as planted.
+    """A knob or a form with the strength at which it is planted.
 
     Attributes:
-        names: right names in the catalogue of effects.
-        strength: strength in ``unit``; ``at_limit``: whether the drawn size was out of reach, so that the
-            strength is the largest possible one.
-        rms_nm: rms of the residual that this cause alone leaves in noise-free scans after a refit of the
-            base, the scan terms and the registration.
+        names: names in the loop's catalogue of effects that count as a right answer.
+        strength: strength, in ``unit``; ``at_limit``: True if the drawn size could not be reached, so that
+            the strength is the largest allowed.
+        rms_nm: rms of the residual that this cause alone leaves in noise-free scans after the base model, the
+            per-scan terms and the registration are refitted.
     """
 
     draw: CauseDraw
@@ -113,9 +116,10 @@ class Outcome(Record):
 
 
 class TrialErrors(Record):
-    """Mean absolute errors of base, corrected model and true models on held-out scans, k = 1.
+    """Mean absolute errors, nm, on held-out scans, with one term (the datum) fitted to each scan: of the base
+    model, of the corrected model, and of the true models.
 
-    The true models of measured prints are unknown.
+    ``floor_nm``, the error of the true models, is None for measured prints, whose true models are unknown.
     """
 
     before_nm: float
@@ -132,9 +136,10 @@ class Found(Record):
     """One finding of a loop.
 
     Attributes:
-        names: name of the finding in the catalogue, then the names of effects that look the same.
-        by: grouping of the scans, if the strength differs between groups; ``scan``: one strength per scan;
-            ``all``: one strength for all scans.
+        names: name of the effect in the loop's catalogue, then the names of effects that cannot be told from
+            it.
+        by: how the strength varies. ``all``: one strength for all scans; ``scan``: one strength per scan;
+            otherwise the name of the grouping of scans that has one strength per group.
         exponents: confidence intervals of the exponent, if the finding is a power law.
     """
 
@@ -150,12 +155,13 @@ class Answer(Result):
     Attributes:
         found: causes, laws and descriptions.
         left: whether the residual has structure that the loop cannot explain.
-        absorbed: names of effects that its base absorbs.
-        displaced_by: groupings of scans that share a displacement along x, each as in `Found.by`.
+        absorbed: names of effects that the loop's base model absorbs.
+        displaced_by: names of the groupings, as in `Found.by`, whose groups of scans share a displacement
+            along x.
         before_nm, after_nm: mean absolute error without and with the findings, over the scans that are not
-            locked. Each scan is predicted by a fit that did not use it, with one free offset. None: not
-            stated.
-        base_values, corrected_values: values of the Physics model, without and with the findings.
+            locked. Each scan is predicted by a fit that did not use this scan, and one offset is fitted to
+            the scan. None if the loop does not state the error.
+        base_values, corrected_values: fitted values of the Physics model, without and with the findings.
     """
 
     SCHEMA = "litho-models/board-answer/1"
@@ -171,15 +177,17 @@ class Answer(Result):
     corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
-# Older results also contain the loop's verdict and its base.
+# Older results also contain the verdict of the loop and its base model; both are ignored.
 class Trial(Result, extra="ignore"):
-    """The result of one trial. A failed trial has no errors; ``failure`` says why it failed.
+    """The result of one judged trial. For a failed trial, ``errors`` is None and ``failure`` says why it
+    failed.
 
     Attributes:
-        false_names: sets of causes that the loop named but that contain no planted cause.
-        bias: median relative error of the base's values, without and with the findings; None if the printer
-            or the chosen base is not a Physics model.
-        dataset_cpu_s: CPU time of build and loop, s.
+        false_names: findings named wrongly: each is a set of names without any planted cause.
+        bias: median relative error of the base model's values, without and with the findings; None if the
+            printer or the base model is not a Physics model.
+        dataset_cpu_s: CPU time that the loop used, s. In the published boards, it includes the time to build
+            the store.
     """
 
     SCHEMA = "litho-models/blind-trial/2"
@@ -197,8 +205,8 @@ class Trial(Result, extra="ignore"):
 
 
 class Scoreboard(Result):
-    """All trials of a board; ``pending`` trials were drawn but not run, and ``command`` reproduces the
-    scoreboard.
+    """All judged trials of a board. ``pending`` lists the numbers of trials that were drawn but not run, and
+    ``command`` is the command line that reproduces the scoreboard.
 
     ``loop`` is the name of the judged loop, and ``draws_sha256`` is the hash of the judged board's
     ``draws.json``.

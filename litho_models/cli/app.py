@@ -1,4 +1,4 @@
-"""The command line ``litho-models``: every command parses arguments and calls one public function."""
+"""The command line ``litho-models``. Every command parses its arguments and calls one public function."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ from litho_models.cli.board import board
 from litho_models.cli.loop import FixOption, FreeOption, check, close_loop, next_print
 from litho_models.cli.noise import noise
 
-app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
+app = new_app("Train, judge and correct models of the printer. Lengths are in µm and height errors in nm.")
 app.command("close-loop")(close_loop)
 app.command("next-print")(next_print)
 app.command()(noise)
@@ -32,18 +32,18 @@ zoo = typer.Typer(help="List or show the models that come with the package.", no
 app.add_typer(zoo, name="zoo")
 app.add_typer(board, name="board")
 
-ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME")]
+ModelName = Annotated[str, argument("folder of a frozen model, or zoo:NAME for a model of the package")]
 StorePath = Annotated[Path, argument("dataset store made by `litho-data build`")]
 Out = Annotated[Path, option("folder for the result; a folder with other contents is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"] | None,
-    option("terms fitted to each scan for its datum-free error; by default offset, but none for films"),
+    option("terms fitted to each scan before its error is computed; by default offset, but none for films"),
 ]
-_BACKGROUND_HELP = "training: add to the predictions the smooth background that the training scans share"
+_BACKGROUND_HELP = "training: add the smooth background shared by the training scans to the predictions"
 BackgroundOption = Annotated[Literal["training", "none"] | None, option(_BACKGROUND_HELP)]
 SharedOption = Annotated[
     Literal["training", "shared", "none"] | None,
-    option(f"{_BACKGROUND_HELP}; shared: add the whole fitted measurement model"),
+    option(f"{_BACKGROUND_HELP}; shared: apply the whole fitted measurement model to them"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -51,14 +51,17 @@ NoiseOption = Annotated[
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    option("training recipe: fast takes minutes; paper runs 4,000 epochs of Adam"),
+    option("training recipe: fast takes minutes; paper takes 4,000 epochs with the optimiser Adam"),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
-    option("default: our own settings; paper: those in the paper; authors: those of the authors' code"),
+    option(
+        "settings of the model: default (those of this package), paper (as printed in the paper) or authors "
+        "(as in the code of its authors)"
+    ),
 ]
-Steps = Annotated[int | None, option("optimiser steps; by default those of the recipe", min=1)]
-Seed = Annotated[int, option("seed of weights and splits", min=0)]
+Steps = Annotated[int | None, option("number of optimiser steps; by default that of the recipe", min=1)]
+Seed = Annotated[int, option("seed of the initial weights and of the splits", min=0)]
 SetOption = Annotated[
     list[str] | None,
     option(
@@ -88,10 +91,10 @@ def train(
     free: FreeOption = None,
     use_lock_box: Annotated[
         bool,
-        option("also train on the locked scans; this leaves none for a final test", "--use-lock-box"),
+        option("also train on the locked scans; no scan is then left for a final test", "--use-lock-box"),
     ] = False,
 ) -> None:
-    """Train a model on all scans except the locked ones; resumable.
+    """Train a model on all scans except the locked ones. An interrupted run resumes.
 
     Example: litho-models train prints.zarr --model pbl --out run
     """
@@ -129,7 +132,7 @@ def evaluate(
         ),
     ] = False,
 ) -> None:
-    """Score one frozen model on a store, without the locked scans if the store is its training dataset.
+    """Score one frozen model on a store. If the model was trained on this dataset, locked scans are left out.
 
     Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
     """
@@ -157,7 +160,8 @@ def benchmark(
     store: StorePath,
     out: Out,
     split: Annotated[
-        Literal["grouped", "paper", "leave-one-print-out"], option("what is held out")
+        Literal["grouped", "paper", "leave-one-print-out"],
+        option("what is held out in each fold: a group of scans, random quadrants, or a whole print"),
     ] = "grouped",
     models: Annotated[str | None, option("names of models, separated by commas; by default all")] = None,
     recipe: RecipeOption = "fast",
@@ -179,7 +183,8 @@ def benchmark(
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """For each fold, train every model on the other folds and score it on this fold; resumable.
+    """Cross-validate models: for each fold, train every model on the other folds and score it on this fold.
+    An interrupted run resumes.
 
     Example: litho-models benchmark prints.zarr --models affine,physics,pbl --out benchmark
     """
@@ -217,13 +222,16 @@ def benchmark(
 @app.command()
 def predict(
     model: ModelName,
-    layout: Annotated[Path, argument("layout: TIFF, PNG, BMP or NPY of levels, or any exported file")],
-    out: Annotated[Path, option("file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
+    layout: Annotated[
+        Path,
+        argument("layout: a TIFF, PNG, BMP or NPY file of levels, or any file that litho-design exported"),
+    ],
+    out: Annotated[Path, option("file for the height in µm: .gsf (opens in Gwyddion) or .npy")],
     extrapolate: Annotated[
         bool, option("accept levels beyond the calibrated range", "--extrapolate")
     ] = False,
 ) -> None:
-    """Predict the printed height of a layout that is sampled at the pitch of the model.
+    """Predict the printed height of a layout. The layout must be sampled at the pitch of the model.
 
     Example: litho-models predict zoo:pbl layout.png --out height.gsf
     """
@@ -238,8 +246,10 @@ def predict(
 @app.command()
 def export(
     model: ModelName,
-    out: Annotated[Path, option("file to write: .pt2 (torch.export) or .onnx (extra onnx)")],
-    size_px: Annotated[int, option("side of the layouts that the exported program accepts", min=1)] = 512,
+    out: Annotated[Path, option("file to write: .pt2 (for torch.export) or .onnx (needs the extra onnx)")],
+    size_px: Annotated[
+        int, option("side, in pixels, of the layouts that the exported program accepts", min=1)
+    ] = 512,
 ) -> None:
     """Write a frozen model as a program for layouts of one size, which runs without this package.
 
@@ -250,7 +260,8 @@ def export(
     frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
-        f"{out} accepts layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm. Its heights differ "
+        f"{out} accepts float32 layouts of {size_px} x {size_px} px in µm, shape (1, 1, ny, nx). Its heights "
+        "differ "
         f"from those of the model by at most {NM_PER_UM * difference_um:.2g} nm"
     )
 
@@ -284,10 +295,11 @@ def show_zoo(name: Annotated[str, argument("name of a model of the zoo")]) -> No
 
 @app.command()
 def compare(
-    first: Annotated[Path, argument("benchmark.json or evaluation.json")],
+    first: Annotated[Path, argument("benchmark.json or evaluation.json of the first result")],
     second: Annotated[Path, argument("another result with the same protocol")],
 ) -> None:
-    """Compare two results scan by scan; results with different data, folds or per-scan terms are refused.
+    """Compare the errors of two results scan by scan. Both results must have the same data, folds and
+    per-scan terms.
 
     Example: litho-models compare one/benchmark.json other/benchmark.json
     """
@@ -297,19 +309,21 @@ def compare(
 @app.command()
 def freeze(
     run: Annotated[
-        str, argument("output of `train` or `close-loop`, or a frozen model (a folder or zoo:NAME)")
+        str, argument("output folder of `train` or `close-loop`, or a frozen model (a folder or zoo:NAME)")
     ],
     out: Out,
     attribute: Annotated[
         list[str] | None,
         option(
-            "attribute effects of undetermined role to the printer or to the microscope: all of them, or "
+            "attribute effects of undetermined role to the printer or to the microscope: all of these "
+            "effects, or "
             "only EFFECT; repeatable",
             metavar="[EFFECT=]microscope|printer",
         ),
     ] = None,
 ) -> None:
-    """Freeze only the process model: write its weights, its card and a page for readers.
+    """Freeze the process model of a run, without the measurement model. Its weights, its card (card.json) and
+    a page for readers (README.md) are written.
 
     Example: litho-models freeze run --out printer
     """
@@ -318,7 +332,9 @@ def freeze(
 
 
 def _attribution(given: Sequence[str]) -> Any:
-    """Parse the attribution: one side for all effects, or a side for each named effect."""
+    """Parse the uses of ``--attribute``. They give one side (printer or microscope) for all effects, or one
+    side for each named effect.
+    """
     if len(given) == 1 and "=" not in given[0]:
         return given[0]
     if wrong := [text for text in given if "=" not in text]:
@@ -336,8 +352,10 @@ def main() -> None:
 
 
 def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
-    """Collect the settings of a training from the given options and ``--set``."""
+    """Combine the settings of a training that are given by options with those given by ``--set``."""
     found = assigned(words or ())
     if twice := sorted(found.keys() & options.keys()):
-        raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="only one of the two")
+        raise InputError(
+            "--set", got=f"{twice[0]}, which another option also sets", wanted="each setting only once"
+        )
     return {name: value for name, value in options.items() if value is not None} | found

@@ -1,5 +1,5 @@
-"""The commands `litho-models board new` and `judge`: make stores with hidden causes, and judge a loop on
-them.
+"""The commands `litho-models board new` and `litho-models board judge`. The first makes stores with hidden
+causes, the second judges a loop on these stores.
 """
 
 from __future__ import annotations
@@ -12,22 +12,25 @@ import typer
 from litho_data.commands.app import argument, option
 from litho_data.commands.progress import say
 
-board = typer.Typer(help="Blind boards: can a loop name the hidden causes?", no_args_is_help=True)
+board = typer.Typer(
+    help="Blind boards: simulated stores that show whether a loop can name hidden causes.",
+    no_args_is_help=True,
+)
 
 
 @board.command("new")
 def new(
     out: Annotated[Path, option("folder for the board")],
     kind: Annotated[
-        Literal["singles", "mixtures"], option("one cause per store, or two to four")
+        Literal["singles", "mixtures"], option("singles: one hidden cause per store; mixtures: two to four")
     ] = "singles",
     seed: Annotated[int, option("seed of all random draws", min=0)] = 0,
     trials: Annotated[int | None, option("number of stores; by default all (about 40)", min=1)] = None,
     scans: Annotated[int, option("scans in each store", min=2)] = 12,
-    size_px: Annotated[int, option("side of a layout, pixels of 0.1 µm")] = 256,
+    size_px: Annotated[int, option("side of a layout, in pixels of 0.1 µm")] = 256,
 ) -> None:
-    """Print and scan fields with hidden causes in the virtual fab. The loop gets only the stores; the judge
-    also gets the causes.
+    """Simulate prints and scans with hidden causes in the virtual fab. A loop receives only the stores, and
+    the judge also the causes.
 
     Example: litho-models board new --trials 8 --out board
     """
@@ -42,17 +45,17 @@ def new(
 
 @board.command("judge")
 def judge(
-    board: Annotated[Path, argument("folder of `board new`")],
-    out: Annotated[Path, option("folder for the trials, the scoreboard and its table")],
+    board: Annotated[Path, argument("folder that `board new` wrote")],
+    out: Annotated[Path, option("folder for the results of all trials, the scoreboard and its table")],
     loop: Annotated[
         str | None,
         option(
-            "command of the loop; it gets STORE and FOLDER as its last arguments and writes "
+            "command that runs the loop; it receives STORE and FOLDER as its last arguments and writes "
             "FOLDER/answer.json; by default close-loop of this package"
         ),
     ] = None,
 ) -> None:
-    """Run a loop on every store of a board, and judge the causes that it names; resumable.
+    """Run a loop on every store of a board, and judge the causes that it names. An interrupted run resumes.
 
     Example: litho-models board judge board --loop "python my_loop.py" --out judged
     """

@@ -1,4 +1,4 @@
-"""The commands `close-loop`, `next-print` and `check`: correct a model, plan prints, monitor a printer."""
+"""The commands `close-loop` (correct a model), `next-print` (plan prints) and `check` (monitor a printer)."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,10 +12,11 @@ from litho_data.commands.settings import assigned
 from litho_data.reports.paper import with_paper_copies
 
 FixOption = Annotated[
-    list[str] | None, option("parameter of the model to hold fixed, such as eta; repeatable", "--fix")
+    list[str] | None, option("parameter of the model that is not fitted, such as eta; repeatable", "--fix")
 ]
 FreeOption = Annotated[
-    list[str] | None, option("parameter to fit that is usually fixed; repeatable", "--free")
+    list[str] | None,
+    option("parameter of the model that is fitted although it is fixed by default; repeatable", "--free"),
 ]
 
 
@@ -24,48 +25,55 @@ def close_loop(
     stores: Annotated[
         list[Path],
         argument(
-            "dataset store made by litho-data build; further stores may add later prints of the same "
+            "dataset store made by litho-data build; more stores may be given, with later prints of the same "
             "printer that decide the questions left open by the first store"
         ),
     ],
-    out: Annotated[Path, option("folder for the result, report, tables and corrected model")],
+    out: Annotated[Path, option("folder for the result, the report, the tables and the corrected model")],
     base: Annotated[
         str,
-        option("model to correct: a name, a frozen model (a folder or zoo:NAME), or auto for the best"),
+        option("model to correct: a name, a frozen model (a folder or zoo:NAME), or auto for the best one"),
     ] = "auto",
     set_: Annotated[
         list[str] | None,
-        option("setting FIELD=VALUE of a small base, such as spot.sigma_um=0.3; repeatable", "--set"),
+        option("setting FIELD=VALUE of a small base model, such as spot.sigma_um=0.3; repeatable", "--set"),
     ] = None,
     fix: FixOption = None,
     free: FreeOption = None,
-    folds: Annotated[int, option("number of folds into which scans are divided", min=2)] = 5,
+    folds: Annotated[int, option("number of folds into which the scans are divided", min=2)] = 5,
     nested: Annotated[
         Literal["folds", "prints"] | None,
         option(
-            "also leave out each fold (or print) in turn, repeat all choices without it, and judge them "
+            "also leave out each fold (or print) in turn, repeat the whole search without it, and score the "
+            "result "
             "on it; slow"
         ),
     ] = None,
     inject: Annotated[
         list[str] | None,
         option(
-            "plant NAME=AMOUNT (in the unit of the effect) in copies of the data to see whether it is found"
+            "add the effect NAME with strength AMOUNT (in its unit) to copies of the data, to see whether it "
+            "is found"
         ),
     ] = None,
     open_lock_box: Annotated[
         bool, option("also score the locked scans; do this only once", "--open-lock-box")
     ] = False,
-    steps: Annotated[int | None, option("optimiser steps per fold, if the base is a network", min=1)] = None,
+    steps: Annotated[
+        int | None, option("number of optimiser steps per fold, if the base model is a network", min=1)
+    ] = None,
     cache: Annotated[
         Path | None,
-        option("folder for the trained networks of each fold; by default a folder next to --out"),
+        option("folder that keeps the networks trained for each fold; by default a folder next to --out"),
     ] = None,
-    seed: Annotated[int, option("seed of folds and bootstrap, not of the lock box", min=0)] = 0,
+    seed: Annotated[
+        int, option("seed of the folds and the bootstrap; it does not change which scans are locked", min=0)
+    ] = 0,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
-    """Find the effects that a model lacks on measured prints, add them, and report the held-out error (nm).
+    """Find the effects in measured prints that a model lacks, add them to the model, and report its error on
+    held-out scans in nm.
 
     Example: litho-models close-loop prints.zarr --out loop
     """
@@ -107,25 +115,31 @@ EXIT_ALARM = 3
 def check(
     model: Annotated[str, argument("folder of a frozen model, or zoo:NAME")],
     store: Annotated[Path, argument("dataset store of the new prints")],
-    out: Annotated[Path, option("folder for check.json, report and tables")],
+    out: Annotated[Path, option("folder for check.json, the report and the tables")],
     reference: Annotated[
         Path | None,
-        option("store of prints from before any change; by default the prints in the model's card"),
+        option(
+            "store of prints made before any change of the printer; by default the values in the model's card"
+        ),
     ] = None,
     new: Annotated[
         list[str] | None,
         option("id of a new print in STORE; the other prints are the reference; repeatable"),
     ] = None,
     false_alarms: Annotated[
-        float, option("accepted share of data sets that raise an alarm although the printer is unchanged")
+        float, option("accepted share of datasets that raise an alarm although the printer has not changed")
     ] = 0.005,
     tolerance: Annotated[
         float | None,
-        option("largest accepted drift of a monitored value (0.05: 5 %); by default three times its spread"),
+        option(
+            "largest accepted drift of a monitored value, as a fraction (0.05: 5 %); by default three times "
+            "its spread"
+        ),
     ] = None,
     strict: Annotated[bool, option(f"exit with code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
-    """Tell whether new prints differ from the reference prints of a model, and when to measure again.
+    """Tell whether new prints differ from the reference prints of a model, and when to measure the next
+    prints.
 
     Example: litho-models check printer new-prints.zarr --out check
     """
@@ -149,17 +163,24 @@ def check(
 
 def next_print(
     loop: Annotated[Path, argument("folder written by litho-models close-loop")],
-    out: Annotated[Path, option("folder for the plan: card, layouts, table of scans, sheets, report")],
-    prints: Annotated[int, option("prints to plan, not counting references", min=1)] = 4,
+    out: Annotated[
+        Path,
+        option("folder for the plan: dataset card, layouts, table of scans, instruction sheets and report"),
+    ],
+    prints: Annotated[int, option("number of prints to plan, not counting reference prints", min=1)] = 4,
     field_um: Annotated[float, option("side of a print, µm", min=1.0)] = 51.2,
     layouts: Annotated[
         Literal["optimised", "random"],
-        option("random: plan the same scans of random layouts, as a control"),
+        option(
+            "optimised: search for layouts that decide the questions; random: plan the same scans of random "
+            "layouts, as a control"
+        ),
     ] = "optimised",
-    seed: Annotated[int, option("seed of the random layouts to start from", min=0)] = 0,
-    steps: Annotated[int, option("steps of the ascent for each tile", min=0)] = 40,
+    seed: Annotated[int, option("seed of the random layouts from which the search starts", min=0)] = 0,
+    steps: Annotated[int, option("number of gradient steps for each tile of a layout", min=0)] = 40,
 ) -> None:
-    """Plan the prints and scans that decide the open questions of a closed loop; resumable.
+    """Plan the prints and scans that decide the questions left open by close-loop. An interrupted run
+    resumes.
 
     Example: litho-models next-print loop --out plan
     """

@@ -1,4 +1,6 @@
-"""The command `litho-models noise`: estimate the error that no model of the printer can predict."""
+"""The command `litho-models noise`: estimate the noise, which is the part of the error that no model of the
+printer can predict.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,20 +14,21 @@ from litho_data.foundation.errors import InputError
 
 
 def noise(
-    out: Annotated[Path, option("folder for noise.json, report and tables")],
+    out: Annotated[Path, option("folder for noise.json, the report and the tables")],
     store: Annotated[
-        Path | None, argument("dataset store; its scans marked substrate, flat or steps are used")
+        Path | None,
+        argument("dataset store; only its scans that are marked substrate, flat or steps are used"),
     ] = None,
     substrate: Annotated[Path | None, option("scan of the bare substrate, instead of a store")] = None,
     flat: Annotated[Path | None, option("scan of a flat print, instead of a store")] = None,
     steps: Annotated[Path | None, option("scan of a step print, instead of a store")] = None,
-    unit: Annotated[str | None, option("height unit of these scans, for files that state none")] = None,
+    unit: Annotated[str | None, option("height unit of the scan files, if they do not state it")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
-        option("size of these scans in µm, for files that state none", metavar="Y X"),
+        option("size of the scans in µm, if the files do not state it", metavar="Y X"),
     ] = None,
     level_height_um: Annotated[
-        float | None, option("nominal step of the step print, µm; 0.1 by default")
+        float | None, option("nominal height of one step of the step print, µm; 0.1 by default")
     ] = None,
     residuals: Annotated[
         str | None,
@@ -34,11 +37,13 @@ def noise(
             "zoo:NAME (for σ(x) only)"
         ),
     ] = None,
-    model: Annotated[str | None, option("which model of the benchmark; by default the best")] = None,
-    seed: Annotated[int, option("seed for the choice of pixels", min=0)] = 0,
+    model: Annotated[
+        str | None, option("model of the benchmark whose residuals are used; by default the best")
+    ] = None,
+    seed: Annotated[int, option("seed for the random choice of pixels", min=0)] = 0,
 ) -> None:
-    """Estimate the roughness, the dose matrix, the noise budget and a calibrated σ(x); lengths in µm, noise
-    in nm.
+    """Estimate the roughness, the dose matrix, the noise budget and σ(x), a calibrated noise level at each
+    pixel. Lengths are in µm, noise in nm.
 
     Example: litho-models noise prints.zarr --residuals benchmark --out noise
     """

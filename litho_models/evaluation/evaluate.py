@@ -39,27 +39,28 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    If the model was trained on these prints (on this store or on another store from the same raw files),
-    locked scans are scored only if ``open_lock_box`` is set. Scans are locked if this store locks them, or if
-    they were locked when the model was made. A model made from other prints is scored on all scans. The
-    result states which scans were locked, and whether any of them was scored.
+    A scan counts as locked if this store locks it, or if it was locked when the model was trained. If the
+    model was trained on these prints (on this store or on another store made from the same raw files), locked
+    scans are scored only if ``open_lock_box`` is set. A model trained on other prints is scored on all scans.
+    The result states which scans are locked and whether any of them was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances to remove from each scan; by default ``offset``, or ``none`` for films.
-        background: ``training`` adds the background in the model's card to the predictions (the default), and
-            ``none`` does not (the default for films). If the card has no background, or one for fields of
-            another size, none is added, and the result says so.
-        noise: ``noise.json`` of this dataset, or the folder of this file. Its noise floor is shown beside the
-            errors.
-        extrapolate: accept layouts beyond the model's calibrated range.
-        open_lock_box: also score the locked scans of the prints that the model was trained on.
+        policy: nuisance terms fitted to each scan before its datum-free error is computed; by default
+            ``offset``, or ``none`` for films.
+        background: ``training`` (the default) adds the background stored in the model's card to the
+            predictions; ``none`` (the default for films) does not. If the card has no background, or only one
+            for fields of another size, none is added, and the result says so.
+        noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor in this file is
+            shown beside the errors.
+        extrapolate: accept layouts with heights beyond the model's calibrated range.
+        open_lock_box: also score the locked scans if the model was trained on these prints.
 
     Raises:
-        InputError: the model or the store cannot be read, their geometries differ, or the noise analysis is
-            of other data.
+        InputError: the model or the store cannot be read, their pitch or level height differs, no scan is
+            left to score, or the noise analysis belongs to other data.
     """
     dataset = open_store(store)
     film = dataset.instrument == "sem"

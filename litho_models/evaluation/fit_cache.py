@@ -1,6 +1,8 @@
-"""Cache the fits of a benchmark, each with its predictions of held-out scans, its record and its diagnostics.
+"""Cache the fits of a benchmark. The cache stores the record of each fit and the heights that it predicts for
+its held-out scans.
 
-Each (model, fold) has its own folder, named by the hash of everything that determines the fit.
+Each fit (one model on one fold) has its own folder. The name of the folder contains a hash of everything that
+determines the fit.
 """
 
 from collections.abc import Sequence
@@ -28,14 +30,15 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-# Older results have more fields, which are ignored: the cost of a prediction, and its change in another crop.
+# Older results have two more fields, which are ignored: the cost of a prediction, and the change of a
+# prediction in another crop.
 class FitDiagnostics(Record, extra="ignore"):
-    """Errors of one fitted model on its training scans and on held-out scans.
+    """Errors of one fitted model on its training, validation and held-out scans.
 
-    Each error is the datum-free error of the policy ``offset``, averaged over scans and computed without a
-    background. Differences between the three errors therefore show over-fitting. ``inner_validation_nm`` is
-    None without validation scans. ``measurement`` is the measurement model learned with the fit, if it was
-    removed from the training scans.
+    Each error is the datum-free error with the policy ``offset``, averaged over scans and computed without a
+    background. All three are computed in the same way, so their differences show over-fitting.
+    ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the measurement model
+    that was learned together with the fit, if there is one.
     """
 
     background: Background
@@ -49,8 +52,8 @@ _FIT, _PREDICTION = "fit.json", "prediction_{:03d}.npy"
 
 
 class FitRecord(FitFacts):
-    """The record of one fit: its scans, its cost, and its errors in nm. Validation errors are None without
-    validation scans.
+    """The record of one fit: its scans, its duration, and its errors in nm after each round of training. A
+    validation error is None if there are no validation scans.
     """
 
     model: str
@@ -66,15 +69,15 @@ class FitRecord(FitFacts):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, measured: bool
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """Read a fit from the cache, or fit the model now. Return the record of the fit and the heights (ny, nx),
-    µm, that it predicts for the held-out scans.
+    """Read a fit from the cache. If it is not there, fit the model now and add it. Return the record of the
+    fit and the heights, µm, that it predicts for the held-out scans, as one array of shape (ny, nx) per scan.
 
     Args:
-        measured: whether to learn the measurement model from a first fit, subtract it from the training
-            scans, repeat the fit, and learn the measurement model again.
+        measured: also learn a measurement model. It is learned from a first fit and removed from the training
+            scans; then the fit is repeated and the measurement model is learned again.
 
     Raises:
-        InputError: a cached fit that cannot be read.
+        InputError: the cached fit cannot be read.
     """
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
@@ -90,7 +93,9 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Learn the measurement model from this model's predictions, and remove it from the training scans."""
+    """Learn a measurement model from the scans and the predictions of ``model``. Return the scans with this
+    measurement model removed.
+    """
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
     return [learned.freed(scan, height) for scan, height in zip(scans, heights, strict=True)]
@@ -99,8 +104,8 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Return the predicted scan: the printed height (ny, nx), µm, combined with the measurement model or the
-    background learned from the training scans.
+    """Combine a predicted print with the background or the measurement model that the fit learned from its
+    training scans. Return the result, which predicts the scan.
     """
     found = record.diagnostics
     if background == "none":
@@ -111,15 +116,16 @@ def expected(
 
 
 def fit_folder(cache: Path, name: str, key: str) -> Path:
-    """Return the folder in which a fit is cached."""
+    """Return the folder in which the fit with this key is cached."""
     return cache / f"{name}-{key[:16]}"
 
 
 def kept_fit(folder: Path) -> tuple[FitRecord, list[np.ndarray]]:
-    """Read the record of a fit and the heights (ny, nx), µm, that it predicts for ``held_out_ids``.
+    """Read the record of a fit and the heights, µm, that it predicts for the scans in the record's
+    ``held_out_ids``. There is one array of shape (ny, nx) per scan.
 
     Raises:
-        InputError: files that are missing or damaged.
+        InputError: a file is missing or damaged.
     """
     with reading_kept(folder):
         record = FitRecord.model_validate_json((folder / _FIT).read_bytes())

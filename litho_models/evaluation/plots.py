@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
-# A function that maps the scores of one model to a list of x values and one or two lists of y values.
+# A function that receives the scores of one model. It returns a list of x values, followed by one or two
+# lists of y values.
 Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
 def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
-    """Draw both headline errors of each model with their confidence intervals, the noise floor and the
-    paper's error.
+    """Draw both headline errors of each model (with nothing fitted, and with terms fitted to each scan) with
+    their confidence intervals. Lines mark the noise floor and the error reported in the paper.
     """
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
@@ -64,8 +65,8 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
 
 
 def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the measured height of one scan and the residual of each model: the measured minus the predicted
-    height, after the scan's terms are removed.
+    """Draw the measured height of one scan and the residual map of each model. A residual is the measured
+    minus the predicted height, after the terms fitted to the scan are removed.
     """
     panels = len(residuals_um) + 1
     columns = min(4, panels)
@@ -93,7 +94,9 @@ def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the middle row of one scan: layout, measurement, and the models with the scan's terms added."""
+    """Draw the middle row of one scan: the layout, the measured height, and the prediction of each model with
+    the terms fitted to the scan added.
+    """
     figure = new_figure(10, 3.4)
     axes = figure.subplots()
     row = scan.shape[0] // 2
@@ -108,7 +111,7 @@ def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def level_bias(scores: Sequence[ModelScores]) -> Figure:
-    """Draw the bias and the spread of the datum-free error for each printed level."""
+    """Draw the mean (bias) and the standard deviation of the datum-free error for each layout level."""
 
     def of(name: str) -> Lines:
         return lambda score: [[getattr(one, key) for one in score.by_level] for key in ("level", name)]
@@ -118,8 +121,8 @@ def level_bias(scores: Sequence[ModelScores]) -> Figure:
 
 
 def transfer(scores: Sequence[ModelScores]) -> Figure:
-    """Draw transfer, coherence and error density against spatial frequency, along x (solid) and y
-    (dashed).
+    """Draw the transfer function, the coherence and the power spectral density of the error against spatial
+    frequency, along x (solid lines) and y (dashed lines).
     """
 
     def of(name: str) -> Lines:
@@ -139,8 +142,8 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
 
 
 def _curves(rows: Sequence[Any], x_label: str, panels: Mapping[str, Lines]) -> Figure:
-    """Draw one panel for each label. Each model has a solid line against x in its colour and, if a second y
-    is given, a dashed line.
+    """Draw one panel for each label. In each panel, a model has a solid line in its colour and, if its
+    function returns a second list of y values, a dashed line.
     """
     figure = new_figure(max(8.5, 4.2 * len(panels)), 3.4)
     grid = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -33,14 +33,14 @@ _SPLIT_TEXT = {
 def write_evaluation_report(
     result: Evaluation, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], out: str | Path
 ) -> Path:
-    """Write the report of an evaluation into ``out``; return its path."""
+    """Write the report of an evaluation into the folder ``out``, and return the path of the report."""
     scores = result.scores
     page = _page(f"{result.model.name} on {result.dataset.name}", result, {"model": result.model.sha256})
     page.verdict(evaluation_verdict(result))
     if count := len(result.trained_on_scored_scans):
         page.note(f"The model was trained on {count} of the scored scans, so this is not a held-out error.")
     if result.model.extrapolated:
-        page.note("Layouts beyond the calibrated range were accepted (option extrapolate).")
+        page.note("Layouts with heights beyond the calibrated range were accepted (option extrapolate).")
     _errors(page, result, [scores], "Mean error over scans.", "headline.csv")
     page.paragraph(lock_box_text(result.split))
     worst = int(np.nanargmax(list(scores.leading_of_scans_nm.values())))
@@ -55,8 +55,8 @@ def write_benchmark_report(
     predictions_um: Mapping[str, Sequence[np.ndarray]],
     out: str | Path,
 ) -> Path:
-    """Write the report of a benchmark into ``out``; return its path. ``predictions_um`` contains the map that
-    each model predicts for each scan.
+    """Write the report of a benchmark into the folder ``out``, and return the path of the report.
+    ``predictions_um`` contains, for each model, the height map that it predicts for each scan.
     """
     scores, split = sorted(result.scores, key=lambda s: -s.leading_nm), result.split
     best = scores[-1]
@@ -73,7 +73,8 @@ def write_benchmark_report(
     page.heading("Which differences exceed chance?", folded=True)
     page.table(
         result.paired,
-        "Error of one model minus that of another, over the same scans and with the same terms fitted.",
+        "Error of one model minus the error of another model, for the same scans and with the same terms "
+        "fitted.",
         "pairs.csv",
         digits=3,
     )
@@ -114,7 +115,9 @@ def _errors(
     page.figure(
         plots.error_bars(scores, floor.mae_at(result.nuisance.policy), held_out_on_paper_data), caption
     )
-    page.table(tables.headline_table(scores, result.nuisance, floor), "The values of this plot.", csv_name)
+    page.table(
+        tables.headline_table(scores, result.nuisance, floor), "The values shown in this plot.", csv_name
+    )
 
 
 def _one_scan(
@@ -126,7 +129,7 @@ def _one_scan(
 ) -> None:
     residuals = {name: residual_um(scan, own, protocol) for name, own in predictions_um.items()}
     page.heading(title, folded=True)
-    page.figure(plots.residual_maps(scan, residuals), f"{scan.id}: measured height and error.")
+    page.figure(plots.residual_maps(scan, residuals), f"{scan.id}: measured height, and error of each model.")
     last = dict(list(residuals.items())[-2:])
     page.figure(plots.line_profiles(scan, last), "The middle row of this scan.")
 
@@ -138,14 +141,15 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
     page.heading("With other terms fitted", folded=True)
     page.table(
         tables.policy_table(scores, result.nuisance, result.noise_floor),
-        "Mean absolute error in nm for each set of terms fitted to a scan, with and without background.",
+        "Mean absolute error in nm, for each set of terms that may be fitted to a scan, with and without the "
+        "background.",
         "policies.csv",
     )
     for sentence in said("protocol", protocol=result.nuisance, floor=result.noise_floor):
         page.paragraph(sentence)
     page.heading("By level and frequency", folded=True)
     page.figure(plots.level_bias(scores), "Error by printed level.")
-    page.figure(plots.transfer(scores), "Transfer, coherence and error by spatial frequency.")
+    page.figure(plots.transfer(scores), "Transfer function, coherence and error by spatial frequency.")
     page.heading("By scan and by level", folded=True)
     page.table(tables.scan_table(scores), "By scan.", "scans.csv")
     page.table(tables.level_table(scores), "By level.", "levels.csv")
@@ -157,7 +161,7 @@ def _numbers(page: Page, result: Evaluation | Benchmark, scores: Sequence[ModelS
 def lock_box_text(split: ScoredSplit) -> str:
     """Return a sentence that says whether the locked scans of the dataset were scored."""
     if not split.lock_box:
-        return "The dataset is too small for locked scans."
+        return "The dataset is too small to lock any scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
         return f"{len(split.lock_box)} locked scans, on which no model is trained, are not scored."

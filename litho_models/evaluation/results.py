@@ -1,4 +1,4 @@
-"""The records ``evaluation.json`` and ``benchmark.json``, and a comparison of two of them."""
+"""The records ``evaluation.json`` and ``benchmark.json``, and a function that compares two such records."""
 
 from __future__ import annotations
 
@@ -67,14 +67,16 @@ class Benchmark(Result):
 
 
 def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
-    """Compare the datum-free MAE of two results (``benchmark.json`` or ``evaluation.json``), paired by scan.
+    """Compare the datum-free mean absolute errors of two results, scan by scan. Each result is a
+    ``benchmark.json`` or an ``evaluation.json``.
 
-    Benchmarks are compared model by model; an evaluation has only one model. A negative difference means that
-    the first is better.
+    Models that both results contain are compared with each other. If each result contains only one model,
+    these two are compared, whatever their names. A negative difference means that the model of the first
+    result is better.
 
     Raises:
-        InputError: a file cannot be read; the results have different data, folds, scans or nuisances; or only
-            one of the models was trained on scored scans.
+        InputError: a file cannot be read; the results differ in data, folds, scored scans or nuisance terms;
+            in only one of them was the model trained on scored scans; or no model is in both results.
     """
     import pandas as pd
 
@@ -84,7 +86,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
             raise InputError(
                 f"cannot compare {first} with {second}: {key} differs",
                 got=f"{_short(value)} and {_short(other[key])}",
-                wanted="the same protocol in both results",
+                wanted="two results with the same protocol",
             )
     pairs = [(left[name], right[name]) for name in left if name in right]
     if len(left) == len(right) == 1:
@@ -93,13 +95,15 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
         raise InputError(
             "models of the two results",
             got=f"{', '.join(left)} and {', '.join(right)}",
-            wanted="at least one in common",
+            wanted="at least one model that both results contain",
         )
     return pd.DataFrame([_row(*pair) for pair in pairs])
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Return the facts that must be the same in two compared results, and this result's scores by model."""
+    """Read a result. Return the facts that must be the same in two results that are compared, and the scores
+    of this result by model name.
+    """
     file = Path(path)
     if file.is_dir():
         names = [name for name in (Benchmark.FILE_NAME, Evaluation.FILE_NAME) if (file / name).exists()]
@@ -143,6 +147,6 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """Shorten a hash to its first digits, which are enough to show a difference."""
+    """Return a value as text. A hash is shortened to its first digits, which suffice to tell two apart."""
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

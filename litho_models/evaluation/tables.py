@@ -1,4 +1,4 @@
-"""Make the tables in the reports of an evaluation and a benchmark."""
+"""Make the tables for the reports of evaluations and benchmarks."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Rows = list[dict[str, Any]]
 def headline_table(
     scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
 ) -> pd.DataFrame:
-    """Return one row per model, with both errors and their confidence intervals, the excess over the noise
-    floor, the RMS error and the bias.
+    """Return the main table of a report. Each row states the two errors of one model with their confidence
+    intervals, the excess over the noise floor, the RMS error and the bias.
 
-    The last row is the noise floor. In each column, it is computed with the same scan terms as the errors.
-    For films the table lists errors of edges and features instead.
+    The last row is the noise floor. In each column, the floor is computed with the same per-scan terms as the
+    errors above it. For films, the table lists errors of edges and features instead, without a floor.
     """
     import pandas as pd
 
@@ -75,8 +75,8 @@ def _film_row(score: ModelScores) -> dict[str, Any]:
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
-    """Return one row per model and background and one column per policy. For the policy with line offsets, a
-    second column states the number of terms.
+    """Return the mean absolute errors with one row per model and background and one column per policy. For
+    the policy with line offsets (``full+rows``), a second column states the effective number of terms.
 
     The last row is the noise floor under each policy.
     """
@@ -100,7 +100,9 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
 
 
 def metric_table(scores: Sequence[ModelScores]) -> Rows:
-    """Return one row per model, with the phase error and all metrics of ``metric_registry``."""
+    """Return one row per model, with the phase error and all metrics of ``metric_registry`` that were
+    computed.
+    """
     keys = _measured(scores)
     return [
         {
@@ -137,12 +139,12 @@ def level_table(scores: Sequence[ModelScores]) -> Rows:
 
 
 def interval_text(interval: Interval) -> str:
-    """Format an interval as text; a dash if there is none."""
+    """Format an interval as text. If there is no interval, return a dash."""
     return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
 
 
 def metric_text(scores: Sequence[ModelScores]) -> str:
-    """Explain the columns of ``metric_table``."""
+    """Return sentences that explain the columns of ``metric_table``."""
     return (
         f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes through the "
         f"print (index step {INDEX_STEP:g}). {metrics_text(_measured(scores))}"

@@ -1,4 +1,4 @@
-"""Describe results in words, from templates: verdicts, protocol and limits."""
+"""Describe results in sentences, which are filled into templates: the verdict, the protocol and the notes."""
 
 from pathlib import Path
 
@@ -6,16 +6,16 @@ from litho_data.reports.page import filled
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scoring.records import ModelScores
 
-# A difference is more than chance if its confidence interval excludes zero and its sign-flip p is at most
-# this value.
+# A difference counts as more than chance if its confidence interval excludes zero and the p value of its
+# sign-flip test is at most this value.
 _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """State which model predicts best, by how much, whether the difference is more than chance, and the noise
-    floor.
+    """Return sentences that state which model predicts best, by how much, whether the difference is more than
+    chance, and the noise floor.
 
-    If there are several prints, the difference is tested over prints instead of scans.
+    If the scans come from several prints, the difference is tested over prints instead of over scans.
     """
     best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
     assert best is not None
@@ -25,7 +25,9 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """State the error of the model, with and without the terms fitted to each scan, and the noise floor."""
+    """Return sentences that state the error of the model, with and without terms fitted to each scan, and the
+    noise floor.
+    """
     return _verdict(result, result.scores)
 
 
@@ -35,5 +37,5 @@ def _verdict(result: Benchmark | Evaluation, best: ModelScores, **more: object) 
 
 
 def said(name: str, **values: object) -> list[str]:
-    """Return the lines of a template: ``verdict``, ``protocol``, ``notes`` or ``paper``."""
+    """Fill a template (``verdict``, ``protocol``, ``notes`` or ``paper``) and return its lines."""
     return filled(Path(__file__).with_name(f"{name}.jinja"), **values).splitlines()

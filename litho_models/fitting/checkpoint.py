@@ -1,4 +1,6 @@
-"""Store checkpoints of a training run: weights, optimiser moments, best weights, history."""
+"""Write and read the checkpoints of a training run. A checkpoint contains the present weights, the best
+weights so far, the state of the optimiser, and the history.
+"""
 
 import json
 from collections.abc import Iterator
@@ -18,7 +20,7 @@ from litho_models.simulator import Simulator
 
 
 class RoundRecord(Record):
-    """One round of training; the validation error is None without validation scans."""
+    """The record of one round of training. The validation error is None if there are no validation scans."""
 
     step: int
     training_mae_nm: float
@@ -28,7 +30,9 @@ class RoundRecord(Record):
 
 @dataclass
 class TrainingState:
-    """The model, its optimiser, the rounds so far, and the best weights."""
+    """The state of a training run: the model, its optimiser, the records of the rounds so far, and the best
+    weights.
+    """
 
     model: Simulator
     optimiser: torch.optim.Optimizer
@@ -37,11 +41,13 @@ class TrainingState:
 
     @property
     def step(self) -> int:
-        """Return the number of optimiser steps done."""
+        """Return the number of optimiser steps taken so far."""
         return self.history[-1].step if self.history else 0
 
     def record(self, record: RoundRecord) -> None:
-        """Add a round; keep its weights if it is the best, or if no round has a validation error."""
+        """Add the record of a round. The present weights become the best weights if this round has the
+        smallest validation error so far, or if there are no validation errors.
+        """
         errors = [entry.validation_mae_datum_free_nm for entry in self.history]
         error = record.validation_mae_datum_free_nm
         if error is None or all(one is None or error < one for one in errors):
@@ -51,11 +57,11 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Raise an InputError if the block cannot read the files that an earlier run stored in ``folder``. Such
-    files are always written as a whole.
+    """Convert any error of the block, which reads files that an earlier run stored in ``folder``, to an
+    InputError. Such files are always written as a whole, so unreadable files are damaged.
 
     Raises:
-        InputError: a missing or damaged file.
+        InputError: a file is missing or damaged.
     """
     try:
         yield
@@ -72,7 +78,8 @@ def reading_kept(folder: Path) -> Iterator[None]:
 
 
 class CheckpointFolder:
-    """A folder that always contains the last complete checkpoint; ``key`` names the run to which it belongs.
+    """A folder that always contains the last complete checkpoint of one run. ``key`` is a hash that
+    identifies the run.
 
     Raises:
         InputError: the checkpoint in the folder is damaged, or belongs to another model, configuration or
@@ -98,7 +105,7 @@ class CheckpointFolder:
         """Load the checkpoint into ``state``, if there is one.
 
         Raises:
-            InputError: its tensors are damaged.
+            InputError: the tensors of the checkpoint are damaged.
         """
         if self._kept:
             with reading_kept(self.path):

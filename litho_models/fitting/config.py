@@ -1,4 +1,4 @@
-"""Define the settings of a training run, an immutable record that every run saves."""
+"""Define the settings of a training run. They are an immutable record, which every run saves."""
 
 from typing import Any, Literal, Self, get_args
 
@@ -13,22 +13,25 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
-# In the default PBL, the steps train only the chain, which the feature networks then correct. A short
-# training is therefore enough, and no validation scan is needed to choose between rounds.
+# In the default PBL, the optimiser steps train only the chain of blurs and small networks. Feature networks,
+# fitted afterwards, correct what the chain misses. A short training is therefore enough, and no validation
+# scans are needed to choose the best round.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
-# Settings on which a fit by least squares depends.
+# Names of the settings on which a fit by least squares depends.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance"}
-# Upper limit on all counts. No real case needs more, and sums over larger counts lose digits or overflow.
+# Upper limit of all settings that are counts. No real case needs more, and sums over larger counts lose
+# digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
 class TrainingConfig(Record):
-    """Settings of one fit. Fits by least squares use only the seed and the nuisances.
+    """Settings of one fit. A fit by least squares uses only those in ``LEAST_SQUARES_FIELDS``; the other
+    settings apply to stochastic gradient descent.
 
-    ``nuisance`` names the per-scan terms that are fitted jointly with the model and are never part of it. The
-    gain is not among them, because part of it depends on the layout. The offset is pinned to a mean of zero
-    over the training scans.
+    ``nuisance`` is the policy that names the per-scan terms fitted together with the model. These terms never
+    become part of the model. The gain of a scan is not fitted in training, because part of it depends on the
+    layout. The offsets of the training scans are constrained to a mean of zero.
     """
 
     FORMER = frozenset({"free_gain"})
@@ -36,21 +39,21 @@ class TrainingConfig(Record):
 
     recipe: Recipe = "fast"
     variant: Variant = "default"
-    model: dict[str, Any] = Field(default_factory=dict, description="settings of the model that is trained")
+    model: dict[str, Any] = Field(default_factory=dict, description="settings of the model to be trained")
     seed: int = Field(0, ge=0, lt=2**63)
     steps: int = Field(1000, ge=1, le=_MOST, description="optimiser steps")
     rounds: int = Field(
         4,
         ge=1,
         le=_MOST,
-        description="number of rounds; after each, nuisances are estimated again and a checkpoint is written",
+        description="number of rounds; per-scan terms are estimated anew in each, and a checkpoint ends it",
     )
-    batch: int = Field(4, ge=1, le=_MOST, description="crops per step")
+    batch: int = Field(4, ge=1, le=_MOST, description="number of crops in each step")
     crop_px: int = Field(
         128,
         ge=8,
         le=_MOST,
-        description="side of the scored part of a crop, px; models on tiles use their tile size",
+        description="side of the scored part of a crop, px; a model that runs on tiles uses its tile size",
     )
     crops: Literal["random", "quadrants"] = "random"
     optimiser: Literal["adamw", "adam"] = "adamw"
@@ -59,21 +62,23 @@ class TrainingConfig(Record):
     weight_decay: float = Field(1e-3, ge=0, le=_MOST)
     nuisance: Policy = "full+rows"
     validation_scans: int = Field(
-        2, ge=0, le=_MOST, description="training scans used only to choose the checkpoint"
+        2, ge=0, le=_MOST, description="number of training scans used only to choose the best round"
     )
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
-        """Return the settings of a named recipe for a model; ``settings`` override individual fields.
+        """Return the settings that a named recipe has for a model. Values in ``settings`` replace individual
+        fields.
 
-        The recipe ``paper`` minimises the L1 loss with Adam, in batches of 4, over 4,000 epochs of 72
-        quadrants. It uses the learning rates of the paper and no per-scan terms. The recipe ``fast`` uses
-        AdamW with a one-cycle schedule, random crops and jointly fitted per-scan terms. Its number of steps
-        is in ``FAST_STEPS``; ``FAST_CHAIN`` contains the settings of the default PBL.
+        The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
+        of 72 quadrants. It uses the learning rates of the paper and fits no per-scan terms. The recipe
+        ``fast`` uses AdamW with a one-cycle schedule and random crops, and fits per-scan terms together with
+        the model. Its numbers of steps are in ``FAST_STEPS``, and its settings for the default PBL are in
+        ``FAST_CHAIN``.
 
         Raises:
-            InputError: unknown recipe.
+            InputError: the recipe is unknown.
         """
         require_known("recipe", recipe, RECIPES)
         if recipe == "fast":
@@ -97,16 +102,18 @@ class TrainingConfig(Record):
         return cls(**{"recipe": recipe, **paper, **settings})
 
     def takes_steps(self, model: Simulator) -> bool:
-        """Return whether the model is trained by stochastic gradient descent rather than by least squares.
+        """Return True if the model is trained by stochastic gradient descent, and False if it is fitted by
+        least squares.
 
-        Large models are trained by gradient descent unless they are linear in their parameters. Small models
-        are trained by gradient descent only in the paper's recipe.
+        A large model is trained by gradient descent unless it is linear in its parameters. A small or linear
+        model is trained by gradient descent only in the recipe ``paper``, and only if the paper states its
+        learning rate.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
 
     def used_by(self, model: Simulator) -> dict[str, Any]:
-        """Return the settings on which a fit of ``model`` depends, for the record of the fit."""
+        """Return the settings on which a fit of ``model`` depends. The record of the fit contains them."""
         if self.takes_steps(model):
             return self.model_dump(mode="json")
         optimiser = "gauss-newton" if is_small(model) else "ridge"

@@ -1,4 +1,6 @@
-"""Choose crops of scans, and cut them with their surroundings."""
+"""Choose the crops on which a model is trained, and cut them out of layouts and scans, with a margin if
+needed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +12,16 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# Largest number of pixels per pass. A network keeps hundreds of bytes per pixel to compute its gradient.
+# Largest number of pixels that go through the network at once. To compute its gradient, a network stores
+# hundreds of bytes per pixel.
 _PASS_PX = 256**2
 
 
 @dataclass(frozen=True)
 class Window:
-    """A square of side ``size_px`` in scan number ``scan``, with its first pixel at (y, x)."""
+    """A square window in a scan. ``scan`` is the number of the scan, ``y`` and ``x`` are the indices of the
+    window's first pixel, and ``size_px`` is its side.
+    """
 
     scan: int
     y: int
@@ -25,8 +30,8 @@ class Window:
 
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
-    """Cut a window with a margin of ``margin_px`` on each side out of a field (ny, nx). Beyond the edge of
-    the field, its outermost pixels are repeated.
+    """Cut a window with a margin of ``margin_px`` on each side out of a field of shape (ny, nx). If the
+    margin extends beyond the field, the outermost pixels of the field are repeated there.
     """
     (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
     ny, nx = field.shape
@@ -39,14 +44,16 @@ def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
 
 
 def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
-    """Cut each window from the field of its scan and stack the crops as a float32 batch (b, 1, y, x)."""
+    """Cut each window out of the field of its scan, and stack the crops. The result is float32 of shape
+    (windows, 1, size, size), where size is that of a window with its margin.
+    """
     crops = [cut(fields[window.scan], window, margin_px) for window in windows]
     return torch.from_numpy(np.stack(crops)[:, None].astype(np.float32))
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """Choose the windows of one optimiser step. They depend only on seed and step, so that a resumed run
-    gives the same result.
+    """Choose the windows of one optimiser step. For given scan shapes and settings, they depend only on the
+    seed and the number of the step, so a resumed run gives the same result.
     """
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
@@ -61,10 +68,10 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 
 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
-    """Group the windows of a step; the groups go through the network one after the other.
+    """Divide the windows of a step into groups, which go through the network one after the other.
 
-    On a CPU, a group has at most ``_PASS_PX`` pixels, unless one window is larger. This limits the memory and
-    takes no extra time. On other devices all windows form one group.
+    On a CPU, a group has at most ``_PASS_PX`` pixels, unless a single window is larger. This limits the
+    memory and takes no extra time. On other devices, all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":
@@ -73,8 +80,8 @@ def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Wind
 
 
 def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:
-    """Return all whole squares of a regular grid on each scan, such as the four quadrants of 256 px of a 512
-    px scan.
+    """Divide each scan into squares of side ``size_px``, and return those that lie completely inside. A scan
+    of 512 px, for example, has four quadrants of 256 px.
     """
     return [
         Window(scan, y, x, size_px)
@@ -98,7 +105,9 @@ def _from_permuted_quadrants(
 
 
 def grid_pixels(scan: PrintedScan, count: int) -> np.ndarray:
-    """Return the flat indices of the measured pixels on a square grid of about ``count`` pixels."""
+    """Choose about ``count`` pixels on a square grid over the scan. Return the flat indices of those that
+    were measured.
+    """
     step = max(1, round((scan.usable.size / count) ** 0.5))
     grid = np.zeros_like(scan.usable)
     grid[::step, ::step] = True

@@ -1,4 +1,4 @@
-"""Fit any model to printed scans, for commands, benchmark and loop."""
+"""Fit any model to measured scans. The commands, the benchmark and the closed loop all use this module."""
 
 import time
 from collections.abc import Sequence
@@ -27,16 +27,17 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# A model that is fitted in closed form and is close to the data. Its predictions give the first estimate of
-# the scan terms for a network.
+# This small model is fitted first, by least squares. Its predictions are close to the data and give the first
+# estimate of the per-scan terms when a network is trained.
 FIRST_MODEL = "linear"
 
 
 class FitFacts(Record):
-    """The scans on which a model was trained and validated, its number of parameters, and the time of the
-    fit.
+    """Facts about a fit: the number of parameters of the model, the ids of its training and validation scans,
+    and the duration of the fit.
 
-    ``at_bounds`` maps each fitted value that lies on a bound of its range to this bound.
+    ``at_bounds`` contains the fitted values that lie on a bound of their range: it maps the name of each to
+    this bound.
     """
 
     parameters: int
@@ -47,7 +48,9 @@ class FitFacts(Record):
 
 
 class Fitted(NamedTuple):
-    """A fitted model and the history of its fit, which is empty for models without rounds."""
+    """A fitted model, the facts of its fit, and the records of its training rounds. A fit by least squares
+    has no rounds.
+    """
 
     model: Simulator
     facts: FitFacts
@@ -57,17 +60,19 @@ class Fitted(NamedTuple):
 def fit(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, checkpoint: Path | None = None
 ) -> Fitted:
-    """Fit a model to scans and return it in eval mode.
+    """Fit a model to scans. The returned model is in eval mode.
 
     Args:
-        model_name: one of ``litho_models.models.MODELS``.
+        model_name: a name in ``litho_models.models.MODELS``.
         scans: training scans, all with the same pitch, level height and number of levels.
-        config: recipe, variant, seed, nuisances, settings of the model.
-        checkpoint: folder of checkpoints, from which an interrupted run continues.
+        config: settings of the training and of the model.
+        checkpoint: folder for checkpoints. If it holds the checkpoint of an interrupted run, this run
+            continues.
 
     Raises:
-        InputError: an unknown model, no scans, scans that differ in these properties, or a checkpoint that is
-            damaged or belongs to another run.
+        InputError: the model is unknown; there are no scans, or their pitch, level height or number of levels
+            differs; a setting contradicts the scans; the training diverged; or the checkpoint is damaged or
+            belongs to another run.
     """
     geometry = common_geometry(scans)
     started = time.monotonic()
@@ -77,7 +82,8 @@ def fit(
             f"setting {name}", got=config.model[name], wanted=f"{geometry[name]}, as in the scans"
         )
     model = build_model(model_name, config.variant, **geometry, **config.model)
-    # The folder is checked even if this model writes no checkpoint: it may contain that of another model.
+    # The folder is checked even if this model writes no checkpoint, because it may contain the checkpoint of
+    # another model.
     folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
@@ -101,7 +107,7 @@ def fit(
         parameters=model.parameter_count,
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
-        # This time includes the part of the training before an interruption.
+        # The sum over the history includes the rounds before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
         at_bounds=model.at_bounds,
     )
@@ -111,10 +117,10 @@ def fit(
 def fit_in_cache(
     model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
 ) -> Fitted:
-    """Fit as ``fit`` does, but keep the checkpoints in a folder of ``cache`` that is named after the fit's
-    key.
+    """Fit a model as ``fit`` does. Checkpoints are kept in a folder inside ``cache``, whose name contains the
+    key of the fit (see ``run_key``).
 
-    A benchmark and a loop that train the same model on the same scans thus reuse each other's fits.
+    A benchmark and a closed loop that train the same model on the same scans thus share one training.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
@@ -122,8 +128,8 @@ def fit_in_cache(
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Fit a small model to the scans, and return the heights that it predicts. The first scan terms of a
-    network are estimated from these heights.
+    """Fit ``FIRST_MODEL`` to the scans, and return the heights, µm, that it predicts for them. The first
+    per-scan terms in the training of a network are estimated from these heights.
     """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
@@ -134,8 +140,8 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
 def run_key(
     model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
 ) -> str:
-    """Return the hash of everything that determines a fit: model, hyper-parameters, settings, training scans
-    and held-out scans.
+    """Return the key of a fit: a hash of the model, its hyper-parameters, the settings of the training, the
+    training scans and the ids of the held-out scans.
     """
     record = {
         "held_out_ids": list(held_out_ids),
@@ -148,7 +154,7 @@ def run_key(
 
 
 def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, str]:
-    """Return the SHA-256 of each scan, by scan id."""
+    """Return the SHA-256 of each scan, as a dict with scan ids as keys."""
     return {scan.id: scan_sha256(scan) for scan in scans}
 
 
@@ -156,7 +162,7 @@ def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:
     """Return the pitch, level height and number of levels that all scans share.
 
     Raises:
-        InputError: no scans, or scans that differ.
+        InputError: there are no scans, or they differ in one of these values.
     """
     if not scans:
         raise InputError("training scans", got="none", wanted="at least one")

@@ -1,10 +1,10 @@
-"""Fit small models by least squares: a damped Gauss-Newton method that also solves for the terms of each
-scan.
+"""Fit small models by a damped Gauss-Newton method. The terms of each scan are solved for together with the
+parameters of the model.
 
-The loss is a sum of squares or a sum of absolute values. Absolute values are minimised as squares with the
-weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals and derivatives of a model: a model of the zoo,
-or the model of the loop with its effects. It also provides the ``room``: the smallest and largest step
-allowed for each parameter.
+The loss is a sum of squared or of absolute residuals r. Absolute residuals are minimised as squares that have
+the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their derivatives. It also
+provides the ``room``, which is the smallest and largest step allowed for each parameter. The model is a
+process model, or the base model of the closed loop with its effects.
 """
 
 from __future__ import annotations
@@ -21,22 +21,24 @@ from litho_data.foundation.kinds import Array
 Loss = Literal["absolute", "squares"]
 Room = tuple[Array, Array]
 
-# δ: for smaller residuals, the loss is nearly quadratic. δ is far below the noise of a print (16 nm).
+# The width δ. For residuals smaller than δ, the loss is nearly quadratic. δ is far below the noise of a
+# measured print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# A combination of unit columns with a smaller squared norm is rounding error.
+# A combination of normalised columns whose squared norm is below this value is taken for rounding error.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """One scan, linearised at given parameters: values in µm at n pixels.
+    """One scan with its prediction linearised at given parameters. All values are in µm, at n pixels of the
+    scan.
 
     Attributes:
-        residual: measured minus predicted, (n,).
-        jacobian: derivatives of the prediction, (p, n).
-        basis: free terms of the scan, (k, n).
+        residual: measured minus predicted height; shape (n,).
+        jacobian: derivatives of the predicted height with respect to p parameters; shape (p, n).
+        basis: the k terms that are fitted to this scan; shape (k, n).
     """
 
     residual: Array
@@ -45,16 +47,18 @@ class Linearised:
 
 
 class Problem(Protocol):
-    """The interface that a model must provide to be fitted, scan by scan."""
+    """The interface through which a model is fitted to scans. ``vector`` contains the p parameters."""
 
     def linearise(self, vector: Array) -> list[Linearised]:
-        """Linearise all scans at these parameters."""
+        """Return all scans, linearised at the parameters ``vector``."""
 
     def residuals(self, vector: Array) -> list[Array]:
-        """Return the measured minus predicted heights (n,) of all scans, µm."""
+        """Return the measured minus predicted heights, µm: for each scan an array of shape (n,)."""
 
     def room(self, vector: Array) -> Room | None:
-        """Return the smallest and largest step (p,) allowed from here; None if any step is allowed."""
+        """Return the smallest and the largest step allowed from ``vector``, each of shape (p,). Return None
+        if any step is allowed.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,20 @@ class Rules:
     """Settings of a fit.
 
     Attributes:
-        loss: the quantity that is minimised.
-        term_weight: with ``squares``, the weight of the part of a residual that scan terms can explain. This
-            weight is large enough to determine the common part of the terms, which is the datum. It is small
-            enough that no single scan biases the parameters.
-        pinned: with ``absolute``, the number of leading scan terms whose mean over the scans is held at zero.
+        loss: whether the sum of absolute residuals or of squared residuals is minimised.
+        term_weight: weight, with the loss ``squares``, of the part of a residual that the terms of the scan
+            can explain. The weight is large enough to determine what these terms have in common in all scans,
+            which is the common datum. It is small enough that no single scan biases the parameters.
+        pinned: number of scan terms, with the loss ``absolute``, whose mean over the scans is held at zero.
+            They are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
-        relative_gain: the fit ends after a step that gains less than this fraction of the loss.
-        tries: largest number of attempts at one step. Each attempt has ten times the damping of the previous
+        relative_gain: the fit ends after a step that reduces the loss by less than this fraction.
+        tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
             one.
-        lowest_damping: lower limit on the damping.
-        kept_above: derivatives are reused while the gain of a step is at least this fraction of the predicted
-            gain. With None, they are never reused.
+        lowest_damping: lower limit of the damping.
+        kept_above: the derivatives are reused for the next step as long as a step reduces the loss by at
+            least this fraction of the predicted reduction. With None, they are computed anew after every
+            step.
     """
 
     loss: Loss
@@ -88,7 +94,9 @@ class Rules:
 
 @dataclass(frozen=True)
 class LeastSquaresFit:
-    """The fitted parameters (p,), the scans linearised at them, and the loss after each step."""
+    """The result of a fit: the fitted parameters, of shape (p,), the scans linearised at these parameters,
+    and the loss after each step.
+    """
 
     vector: Array
     linear: list[Linearised]
@@ -98,8 +106,8 @@ class LeastSquaresFit:
 def fit_least_squares(
     problem: Problem, start: Array, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
 ) -> LeastSquaresFit:
-    """Fit the parameters of a problem, beginning at ``start`` and keeping its dtype. ``shown`` may wrap the
-    range of the steps to show progress.
+    """Fit the parameters of a problem, beginning at the vector ``start``, whose dtype is kept. ``shown`` may
+    wrap the range of the step numbers to show progress.
     """
     vector, linear = start, problem.linearise(start)
     if not len(start):
@@ -127,7 +135,7 @@ def fit_least_squares(
         vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
         losses.append(loss)
         small = gained < rules.relative_gain * loss
-        # A small gain shows convergence only if the derivatives were not reused from an earlier point.
+        # A small gain means convergence only if the derivatives belong to the present parameters.
         ends = small and fresh
         if rules.kept_above is None:
             kept = False
@@ -145,10 +153,12 @@ def fit_least_squares(
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations. The first rows are those of the parameters, the next are those of the scan terms, and
-    the last are the conditions that pin leading terms.
+    """The normal equations of one step. The first ``count`` rows belong to the parameters, and the next rows
+    to the terms of the scans. The last rows are the conditions that hold the mean of each pinned term at
+    zero.
 
-    With ``squares``, the terms of the scans are eliminated, and only rows for the parameters remain.
+    With the loss ``squares``, the terms of the scans are eliminated beforehand, so only the rows of the
+    parameters are there.
     """
 
     matrix: Array
@@ -159,7 +169,9 @@ class NormalEquations:
 
     @classmethod
     def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
-        """Set up the equations for linearised scans with the present ``terms`` (scans, k)."""
+        """Set up the equations from the linearised scans and the present values of their terms. ``terms`` has
+        shape (scans, k); with the loss ``squares`` it is None.
+        """
         count = len(linear[0].jacobian)
         if terms is None:
             matrix, right, squares = eliminated_sum(linear, rules.term_weight)
@@ -182,8 +194,8 @@ class NormalEquations:
         return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
 
     def solve(self, damping: float, room: Room | None) -> tuple[Array, Array]:
-        """Return the step of the parameters, which stays within their room, and the changes of the terms
-        (scans, k).
+        """Return the step of the parameters and the change of the scan terms. The step, of shape (p,), stays
+        within ``room``. The change has shape (scans, k).
         """
         count = self.count
         if room is not None:
@@ -194,8 +206,8 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # The terms are solved for again with the limited step, because those of the unlimited step do not
-        # match it.
+        # The terms are solved for again with the limited step, because the terms found with the unlimited
+        # step do not match it.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -204,7 +216,9 @@ class NormalEquations:
         return step, terms[: scans * each].reshape(scans, each)
 
     def _parameters_only(self) -> tuple[Array, Array]:
-        """Eliminate the terms of the scans from the equations."""
+        """Eliminate the terms of the scans from the equations. Return the remaining matrix and right side,
+        which belong to the parameters.
+        """
         count = self.count
         if len(self.matrix) == count:
             return self.matrix, self.right
@@ -215,35 +229,37 @@ class NormalEquations:
 
 
 def promised_gain(matrix: Array, right: Array, step: Array) -> float:
-    """Return the reduction of the sum of squares that the normal equations, (p, p) and (p,), predict for a
-    step (p,).
+    """Return the reduction of the sum of squares that the normal equations predict for a step. ``matrix`` has
+    shape (p, p); ``right`` and ``step`` have shape (p,).
     """
     return float(2 * right @ step - step @ matrix @ step)
 
 
 def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[Linearised]:
-    """Return all scans with new residuals (n,), µm, and unchanged derivatives."""
+    """Return the linearised scans with the residuals in ``left`` (µm, one array of shape (n,) per scan) and
+    unchanged derivatives.
+    """
     return [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
-    """Return the normal matrix, right side and weighted sum of squares of one scan, after eliminating its own
-    terms.
+    """Return the normal matrix, the right side and the weighted sum of squares of one scan, after its terms
+    are eliminated. The part of each column that the terms can explain has the weight ``term_weight``.
     """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
 
 
 def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[Array, Array, float]:
-    """Return the results of ``eliminated``, summed over scans."""
+    """Return the three results of ``eliminated``, each summed over the scans."""
     parts = [eliminated(part, term_weight) for part in linear]
     normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
     return normal, right, sum(p[2] for p in parts)
 
 
 def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], term_weight: float) -> float:
-    """Return the sum of squares of the residuals (n,) of these scans. The part that the terms of a scan can
-    explain has the weight ``term_weight``.
+    """Return the sum of squared residuals over all scans. ``residuals`` contains one array of shape (n,) per
+    scan. The part of a residual that the terms of its scan can explain has the weight ``term_weight``.
     """
     return sum(
         float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
@@ -252,16 +268,17 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 
 
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
-    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box. Parameters that have no effect are
-    allowed.
+    """Find the damped step x within its limits: minimise x·A·x / 2 - b·x + damping · x·diag(A)·x / 2. A may
+    be singular, because some parameters may have no effect.
 
-    If the unlimited step were computed first and then cut to its bounds, the other parameters would still be
-    those of the uncut step, and fits with an optimum on a bound would converge slowly.
+    The limits are part of the minimisation. If the unlimited step were cut to the limits afterwards, the
+    other parameters would still be those of the uncut step. Fits whose optimum is on a bound would then
+    converge slowly.
 
     Args:
-        normal, right: A (p, p), positive semi-definite, and b (p,).
-        damping: relative to the diagonal.
-        room: lowest and highest allowed x, two arrays (p,); by default, there are no limits.
+        normal, right: the positive semi-definite matrix A, of shape (p, p), and the vector b, of shape (p,).
+        damping: strength of the damping relative to the diagonal of A.
+        room: smallest and largest allowed x, each of shape (p,); by default, there are no limits.
     """
     diagonal = np.diag(normal).copy()
     floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
@@ -272,15 +289,15 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
         return step
     factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
     target = np.linalg.solve(factor, right / scale)
-    # lsq_linear needs distinct bounds; a parameter without room is not changed.
+    # lsq_linear needs distinct bounds. A parameter whose bounds coincide hardly moves.
     width = np.maximum(room[1] - room[0], 1e-12)
     box = (room[0] * scale, (room[0] + width) * scale)
     return lsq_linear(factor.T, target, box, method="bvls").x / scale
 
 
 def orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis (n, k') of the span of the columns, which may be zero or linearly
-    dependent.
+    """Return an orthonormal basis of the span of the given columns, which may be zero or linearly dependent.
+    For columns of shape (n, k), the basis has shape (n, rank).
     """
     if not columns.shape[1]:
         return columns
@@ -291,14 +308,17 @@ def orthonormal(columns: Array) -> Array:
 
 
 def gram(columns: Array, basis: Array, weight_in_basis: float = 0.0) -> Array:
-    """Return inner products (m, m) of the columns (n, m), with the part inside the basis (n, k) multiplied by
-    ``weight_in_basis``.
+    """Return the inner products of the columns. The contribution of the part of each column that lies in the
+    span of an orthonormal basis is multiplied by ``weight_in_basis``. ``columns`` has shape (n, m), ``basis``
+    has shape (n, k), and the result has shape (m, m).
     """
     return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
 
 
 def gram_inside(columns: Array, basis: Array) -> Array:
-    """Return the inner products (m, m) of the columns after projection onto an orthonormal basis (n, k)."""
+    """Return the inner products of the columns after their projection onto an orthonormal basis. ``columns``
+    has shape (n, m), ``basis`` has shape (n, k), and the result has shape (m, m).
+    """
     inside = basis.T @ columns
     return inside.T @ inside
 

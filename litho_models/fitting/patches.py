@@ -1,4 +1,6 @@
-"""Draw patches for your own training loop from the unlocked scans of a store, as a PyTorch ``Dataset``."""
+"""A PyTorch ``Dataset`` of patches for your own training loop, drawn from the scans of a store that are not
+locked.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +17,8 @@ from litho_models.fitting.crops import Window, cut
 
 
 class Patch(TypedDict):
-    """One patch: the layout with its margin, the measured height, the mask of valid pixels, the scan's id,
-    and the patch's corner.
+    """One patch: the layout with its margin, the measured height, the mask of valid pixels, the id of the
+    scan, and the indices of the patch's first pixel in the scan.
     """
 
     layout_um: Tensor
@@ -28,23 +30,25 @@ class Patch(TypedDict):
 
 
 class PatchDataset(Dataset[Patch]):
-    """Square patches drawn at random from the scans of a store. Each patch depends only on the seed and on
-    its index.
+    """Square patches at random positions in the scans of a store. The position of a patch depends only on the
+    seed and on the index of the patch.
 
-    ``layout_um`` (1, s + 2m, s + 2m) float32 has a margin m of the layout around the patch, so that a model
-    sees the surroundings of the patch. ``height_um`` (1, s, s) float32 is 0 where nothing was measured, and
-    ``valid`` (1, s, s) bool marks the valid pixels. Patches are neither rotated nor flipped, because the two
-    axes of a print differ, and a lag of the beam or the microscope acts in one direction only.
+    For a patch of side s and a margin of width m, ``layout_um`` is float32 of shape (1, s + 2m, s + 2m). The
+    margin shows a model the layout around the patch. ``height_um`` is float32 of shape (1, s, s), with 0
+    where nothing was measured. ``valid`` is a boolean mask of shape (1, s, s) that marks the measured pixels.
+    Patches are neither rotated nor flipped: the two axes of a print differ, and a lag of the beam or the
+    microscope acts in one direction only.
 
     Args:
         store: dataset store or its path. Locked scans are left out.
-        size_px: side s of a patch; ``margin_px``: width m of the margin.
-        per_scan: number of patches from each scan.
-        ids: scans to draw from; by default all that are not locked.
+        size_px: side s of a patch, in pixels; ``margin_px``: width m of the margin, in pixels.
+        per_scan: number of patches drawn from each scan.
+        ids: ids of the scans to draw from; by default all scans that are not locked.
         seed: seed of the random positions of the patches.
 
     Raises:
-        InputError: unknown or locked ids, or a patch that is larger than a scan.
+        InputError: a scan id is unknown or locked, no scan is left, a patch is larger than a scan, or a size
+            is out of range.
     """
 
     def __init__(
@@ -73,7 +77,7 @@ class PatchDataset(Dataset[Patch]):
 
     @property
     def ids(self) -> list[str]:
-        """Return the scans from which patches are drawn."""
+        """Return the ids of the scans from which patches are drawn."""
         return [scan.id for scan in self._scans]
 
     def __len__(self) -> int:

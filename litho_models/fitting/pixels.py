@@ -1,4 +1,6 @@
-"""Fit networks on fixed features, pixel by pixel. The features are computed once for each scan."""
+"""Fit the feature networks of a PBL model pixel by pixel. The features have no parameters, so they are
+computed only once for each scan.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,16 +22,18 @@ from litho_models.models.pbl import Pbl
 from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 
-# Number of fitted pixels in all scans together, on a square grid in each scan. Their features take 100 MB.
+# Number of fitted pixels in all scans together. In each scan, they lie on a square grid. Their features take
+# 100 MB.
 FITTED_PX = 2**18
 EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
-# Number of passes over all pixels between estimates of the scan terms.
+# Number of passes over all fitted pixels between two estimates of the per-scan terms.
 EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """The fitted pixels of one scan: the features of all networks (n, k), the measured height minus the
-    height that the chain predicts (n,), µm, and the maps of the scan terms (m, n).
+    """The n fitted pixels of one scan. ``features`` are the k features of all networks together, of shape (n,
+    k). ``rest_um`` is the measured height minus the height that the chain predicts, µm, of shape (n,).
+    ``terms`` are the maps of the m per-scan terms, of shape (m, n).
     """
 
     features: Tensor
@@ -40,14 +44,14 @@ class _Pixels(NamedTuple):
 def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
-    """Fit the feature networks of ``model`` in place to the residual of the chain, minimising the mean
-    absolute error.
+    """Fit the feature networks of ``model`` in place. They learn the residual of its chain (blurs and small
+    networks); the mean absolute error is minimised.
 
-    Line offsets are left out of the terms of the scans, because they average out.
+    Line offsets are not among the per-scan terms of this fit, because they average out.
 
     Returns:
-        The record of one round, with the error after the terms of the scans are removed. ``validation`` scans
-        do not influence the fit.
+        The record of this fit as one round, with errors computed after the per-scan terms are removed. The
+            ``validation`` scans do not influence the fit.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance)
@@ -94,8 +98,8 @@ def fit_feature_networks(
 
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
-    """Return the heights that the networks should add at the fitted pixels, one vector for all scans, µm. The
-    scan terms are removed from these heights.
+    """Return the heights, µm, that the networks should learn at the fitted pixels, with the per-scan terms
+    removed. The result is one vector for the pixels of all scans.
     """
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]

@@ -1,4 +1,6 @@
-"""Share a training among the processes of ``torchrun``; without torchrun, there is only one process."""
+"""Divide a training among the processes that ``torchrun`` started. Without ``torchrun``, there is only one
+process.
+"""
 
 import os
 from collections.abc import Iterable
@@ -9,11 +11,11 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Join the processes of torchrun. They use gloo on CPUs and NCCL on GPUs; on GPUs, each process has its
-    own GPU.
+    """Connect this process with the others that torchrun started, if there are any. They communicate through
+    gloo on CPUs and NCCL on GPUs. With GPUs, each process uses its own GPU.
 
     Returns:
-        The number of this process, counted from 0, and the number of processes.
+        The rank of this process, counted from 0, and the number of processes.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return 0, 1
@@ -25,7 +27,9 @@ def joined() -> tuple[int, int]:
 
 
 def add_over_processes(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over the processes, which must pass the tensors in the same order."""
+    """Replace each tensor by its sum over all processes. Every process must pass its tensors in the same
+    order.
+    """
     if joined()[1] > 1:
         for tensor in tensors:
             dist.all_reduce(tensor)

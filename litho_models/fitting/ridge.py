@@ -1,4 +1,6 @@
-"""Fit models that are linear in many features by ridge regression, with one scan in memory at a time."""
+"""Fit models that are linear in many features by ridge regression. The scans are processed one at a time, to
+limit the memory.
+"""
 
 from collections.abc import Sequence
 
@@ -14,29 +16,32 @@ from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
 from litho_models.scan_terms.policies import smooth_training_terms
 
-# Strength of the ridge relative to the mean square of each feature, after the terms of the scans are removed.
-# It affects only weights that the scans cannot distinguish. On the measured prints, all values from 1e-6 to
-# 1e-4 give the same result.
+# Strength of the ridge penalty, relative to the mean square of each feature after the per-scan terms are
+# removed. The penalty affects only combinations of weights that the scans do not determine. On the measured
+# prints, all values from 1e-6 to 1e-4 give the same result.
 RIDGE = 1e-5
-# Number of fitted pixels of each scan, on a square grid. Twice as many do not improve the predictions of the
-# measured prints. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept if those of all scans take
-# at most KEPT_BYTES; otherwise each pass computes them again. The maps of one tile need another 0.3 GB.
+# Number of fitted pixels of each scan, which lie on a square grid. Twice as many pixels do not improve the
+# predictions of the measured prints. The features of one scan take 94 MB (16,384 pixels × 716 features × 8
+# bytes). They are kept in memory if those of all scans take at most KEPT_BYTES; otherwise each pass computes
+# them again. The feature maps of one tile need another 0.3 GB.
 FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
-# The first pass minimises squares. The second reweights them to absolute values, so that blobs have little
-# influence.
+# The first pass minimises squared residuals. The second pass reweights them so that absolute residuals are
+# minimised, and dirt on a print has little influence.
 PASSES = 2
-# Weight of the part of a residual that scan terms can explain. It determines the common datum.
+# Weight of the part of a residual that the per-scan terms can explain. This part determines the datum that
+# all scans have in common.
 _TERM_WEIGHT = 1e-3
 
 
 def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
-    """Fit the weights of ``model`` in place, minimising the mean absolute error.
+    """Fit the weights of ``model`` in place. The mean absolute error is minimised.
 
     Args:
-        model: the model; ``scans``: training scans.
-        policy: terms that are fitted to each scan. Line offsets are left out, because they average out.
+        model: the model to fit; ``scans``: training scans.
+        policy: names the terms that are fitted to each scan. Line offsets are left out, because they average
+            out.
     """
     terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):
@@ -73,8 +78,8 @@ def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
 
 
 def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, FloatMap, FloatMap]:
-    """Return features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted
-    pixels.
+    """Return three arrays for the n fitted pixels of a scan: the k features, of shape (k, n); the measured
+    height, µm, of shape (n,); and the m per-scan terms, of shape (m, n).
     """
     at = grid_pixels(scan, FITTED_PX)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
@@ -82,7 +87,9 @@ def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, F
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
-    """Return features (k, n) at flat indices ``at`` of a scan, computed tile by tile."""
+    """Return the k features at the n pixels of a scan whose flat indices are in ``at``. They are computed
+    tile by tile. The result has shape (k, n).
+    """
     reach = model.reach_px
     layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)
     place = np.stack(np.divmod(at, scan.shape[1]))

@@ -1,4 +1,4 @@
-"""Train a model on a store and write a run folder. Interrupted runs resume."""
+"""Train a model on the scans of a store and write a run folder. Interrupted runs resume."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -34,7 +34,7 @@ CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(FitFacts, Result):
-    """The record of a training run, ``run.json``."""
+    """The record of a training run, written as ``run.json``."""
 
     SCHEMA = "litho-models/run/1"
     FILE_NAME = "run.json"
@@ -57,18 +57,21 @@ def train(
     settings: dict[str, Any] | None = None,
     use_lock_box: bool = False,
 ) -> TrainingRun:
-    """Train a model on a store and write it to a run folder; repeating the call continues an interrupted run.
+    """Train a model on the scans of a store, and write the model and its record to a run folder. Repeating
+    the call continues an interrupted run.
 
-    The scans of the lock box are left out unless ``use_lock_box`` is set. Under ``torchrun``, the processes
-    share each step, and only the first one writes files.
+    Locked scans are left out unless ``use_lock_box`` is set. Under ``torchrun``, the processes divide the
+    crops of each step among themselves, and only the first process writes files.
 
     Args:
-        store: dataset store; ``model``: name of a model; ``out``: run folder.
-        recipe, variant: see ``TrainingConfig`` and the model's config.
-        settings: fields of ``TrainingConfig`` whose values override those of the recipe.
+        store: dataset store; ``model``: name of a model; ``out``: folder for the run.
+        recipe, variant: recipe of ``TrainingConfig``, and variant of the model.
+        settings: values for fields of ``TrainingConfig`` or of the model, which replace those of the recipe
+            and the variant.
 
     Raises:
-        InputError: unknown names or settings, or a folder that holds another run.
+        InputError: the recipe, variant, model or a setting is unknown, the store cannot be read, or ``out``
+            holds another run.
     """
     config = training_config(recipe, model, {"variant": variant, **(settings or {})})
     dataset = open_store(store)
@@ -118,18 +121,21 @@ def train(
                 "lock_box_sha256": ids_sha256(locked),
                 "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
             },
-            limitations=["Training does not evaluate the model; an evaluation gives its error."],
+            limitations=[
+                "The error of this model is not known, because training does not evaluate it; run "
+                "`litho-models evaluate`."
+            ],
         )
         record.write(folder)
     return record
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """Return the checked settings of a recipe. Settings that are not fields of ``TrainingConfig`` are passed
-    to the model.
+    """Return the settings of a training, after checking them. Entries of ``settings`` that are not fields of
+    ``TrainingConfig`` must be fields of the model and become its settings.
 
     Raises:
-        InputError: unknown recipe, unknown field, or a value out of range.
+        InputError: the recipe, the model or a field is unknown, or a value is out of range.
     """
     own = {name: value for name, value in settings.items() if name not in TrainingConfig.model_fields}
     known = [*TrainingConfig.model_fields, *model_class(model).Config.model_fields]
@@ -146,13 +152,15 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the share of pixels printed with each level."""
+    """Return, for each level, the share of the pixels of all scans that are printed with this level."""
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the shares of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
+    """Return the shares of pairs of neighbouring pixels whose levels differ by 0, 1, 2 and so on. Pairs along
+    rows and along columns are counted together.
+    """
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )

@@ -1,4 +1,4 @@
-"""Fit small models of the zoo to one window of each scan, with forward-mode derivatives."""
+"""Fit small models to one window of each scan by least squares. Derivatives are computed in forward mode."""
 
 import copy
 from collections.abc import Sequence
@@ -18,24 +18,25 @@ from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
-# One quadrant of each scan is enough to fit a small model; successive scans use different quadrants.
+# A window of this side, placed in one corner of each scan, is enough to fit a small model. Successive scans
+# use different corners.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Largest step of a parameter, which is a height in µm or the raw number of a range. The linearisation is not
-# valid for larger steps.
+# Largest step of a parameter, whose unit is µm for a height and 1 for the raw number of a range. The
+# linearisation is not valid for larger steps.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
 
 def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Policy) -> list[float]:
-    """Fit ``model`` in place, minimising the mean absolute error on every second row and column of one window
-    per scan.
+    """Fit ``model`` in place. The mean absolute error is minimised at every second row and column of one
+    window per scan.
 
-    Line offsets of ``full+rows`` are left out, because they average out over a scan and hardly affect a small
-    model.
+    If the policy contains line offsets (``full+rows``), they are not fitted, because they average out over a
+    scan and hardly affect a small model.
 
     Returns:
-        The mean absolute residual after each step, µm, with the terms of the scans removed.
+        The mean absolute residual after each step, µm, with the per-scan terms removed.
     """
     if not any(parameter.requires_grad for parameter in model.parameters()):
         return []
@@ -48,10 +49,12 @@ def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Poli
 
 
 class ModelProblem:
-    """The problem of fitting a model to windows of scans. It works on its own copy of the model.
+    """The least-squares problem of fitting a model to one window of each scan. It works on a copy of the
+    model.
 
     Args:
-        model: the model; ``scans``: training scans; ``terms``: free terms of each scan.
+        model: the model to fit; ``scans``: training scans; ``terms``: names of the terms that are fitted to
+            each scan.
     """
 
     def __init__(self, model: Simulator, scans: Sequence[PrintedScan], terms: Terms):
@@ -60,25 +63,26 @@ class ModelProblem:
         self._terms = terms
 
     def linearise(self, vector: Array) -> list[Linearised]:
-        """Linearise all scans at these parameters."""
+        """Return all scans, linearised at the parameters ``vector``."""
         _load(self._model, vector)
         return [sample.linearise(self._model, self._terms) for sample in self._samples]
 
     def residuals(self, vector: Array) -> list[Array]:
-        """Return the measured minus predicted heights of all scans, µm."""
+        """Return the measured minus predicted heights, µm: for each scan an array of shape (n,)."""
         _load(self._model, vector)
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
     def room(self, vector: Array) -> Room | None:
-        """Return the smallest and largest step within the ranges of the model; None for a linear model, which
-        may take any step.
+        """Return the smallest and largest step that keep all values inside the ranges of the model. Return
+        None for a linear model, which may take any step.
         """
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
-    """Return the smallest and largest step (p,) allowed by ``STEP_LIMIT`` and by the ranges of the trainable
-    numbers of a model.
+    """Return the smallest and the largest step from ``vector`` that ``STEP_LIMIT`` and the ranges of the
+    model allow. ``vector`` and both results have shape (p,), with one entry per trainable number of the
+    model.
     """
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)
@@ -93,7 +97,7 @@ def parameter_room(model: nn.Module, vector: Array) -> Room:
 
 
 class _Sample:
-    """Every second row and column of one window of a scan."""
+    """The fitted pixels of one scan: those in every second row and column of one window."""
 
     def __init__(self, scan: PrintedScan, number: int):
         size = min(WINDOW_PX, *scan.shape)
@@ -109,7 +113,7 @@ class _Sample:
         self._expansion: tuple[Array, Array, Array] | None = None
 
     def linearise(self, model: Simulator, terms: Terms) -> Linearised:
-        """Linearise the scan at the model's present parameters; a linear model is differentiated only
+        """Linearise the scan at the present parameters of the model. A linear model is differentiated only
         once.
         """
         if model.is_linear and self._expansion is not None:
@@ -122,7 +126,7 @@ class _Sample:
         return Linearised(self.residual(height), self._thinned(jacobian), basis)
 
     def height_um(self, model: Simulator) -> Array:
-        """Return the height of the window (y, x), µm, float64."""
+        """Return the predicted height of the window, µm, as a float64 array of shape (ny, nx)."""
         if model.is_linear and self._expansion is not None:
             here, value, jacobian = self._expansion
             return value + np.tensordot(_vector(model) - here, jacobian, axes=1)
@@ -130,13 +134,15 @@ class _Sample:
             return self.predict(model).double().numpy()
 
     def predict(self, model: Simulator) -> Tensor:
-        """Predict the height of the window, (y, x) µm, from the layout of the window and its surroundings."""
+        """Predict the height of the window, µm, from the layout of the window and its surroundings. The
+        result has shape (ny, nx).
+        """
         if model.reach_px is None:
             return model(stack([self._layout_um], [self._window]))[0, 0]
         return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
 
     def residual(self, height_um: Array) -> Array:
-        """Return measured minus predicted heights at the used pixels, µm."""
+        """Return measured minus predicted heights at the fitted pixels, µm, of shape (n,)."""
         return self._height - self._thinned(height_um)
 
     def _thinned(self, fields: Array) -> Array:
@@ -144,8 +150,8 @@ class _Sample:
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> Array:
-    """Return the derivatives (parameters, y, x) of the window, float64, for all parameters in one
-    forward-mode pass.
+    """Return the derivatives of the window's predicted height with respect to all parameters, computed in one
+    forward-mode pass. The result is float64 of shape (parameters, ny, nx).
     """
     prediction = _WindowPrediction(model, sample)
     named = {f"model.{name}": one for name, one in model.named_parameters() if one.requires_grad}
@@ -174,8 +180,8 @@ def _load(model: Simulator, vector: Array) -> None:
 
 
 class _WindowPrediction(nn.Module):
-    """Wrap ``sample.predict`` as a module, because torch can replace parameters by tangents only in
-    modules.
+    """A module that calls ``sample.predict``. For forward-mode derivatives, torch must replace the parameters
+    of the model, and it can do so only in modules.
     """
 
     def __init__(self, model: Simulator, sample: _Sample):

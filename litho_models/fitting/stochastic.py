@@ -1,9 +1,11 @@
 """Train models with many parameters by stochastic gradient descent on random crops, in rounds.
 
-Between rounds, the scan terms are estimated from whole-scan predictions, the inner validation scans are
-scored, and a checkpoint is written. Within a round, the targets are fixed. Random choices depend only on seed
-and step, so an interrupted run gives the same result after it is continued. Processes share the crops of each
-step and add their gradients. Between rounds, every process does the same computations.
+Before each round, the per-scan terms are estimated from predictions of whole scans and are removed from the
+measured heights, which are then the targets of the round. After each round, the validation scans are scored
+and a checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and
+continued run gives the same result as an uninterrupted one. If there are several processes, they divide the
+crops of each step among themselves and add their gradients. Between rounds, every process does the same
+computations.
 """
 
 import math
@@ -43,11 +45,13 @@ def train_network(
     first_predictions_um: Callable[[], Sequence[np.ndarray]],
     checkpoints: CheckpointFolder | None = None,
 ) -> list[RoundRecord]:
-    """Train ``model`` in place, on a GPU if there is one, and give it the weights of the best round.
+    """Train ``model`` in place, on a GPU if there is one. At the end, the model has the weights of the best
+    round.
 
-    The best round is the one with the smallest error on ``validation``; without validation scans, it is the
-    last round. ``first_predictions_um`` computes the heights of a small model on the training scans, from
-    which the first scan terms are estimated. A continued run needs no first predictions.
+    The best round is the one with the smallest error on the ``validation`` scans, or the last round if there
+    are none. ``first_predictions_um`` returns the heights, µm, that a small model predicts for the training
+    scans; the per-scan terms of the first round are estimated from them. It is not called if the run
+    continues after its first round.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -93,7 +97,9 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Raise an InputError if weights of the model became infinite or NaN in the steps up to ``last``."""
+    """Raise an InputError if weights of the model become infinite or NaN in the block, which contains the
+    steps up to number ``last``.
+    """
     try:
         yield
         error = None
@@ -115,11 +121,11 @@ def _diverged(model: Simulator, step: int) -> InputError:
 
 
 class _Targets:
-    """The layouts of the training scans, and their heights without scan terms; unmeasured pixels have no
-    weight.
+    """What the model learns in one round: the layouts of the training scans, their measured heights without
+    the per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
 
-    Each layout is extended by ``overhang_px`` on each side by repeating its outermost pixels. The added
-    pixels have weight zero.
+    Each layout is extended by ``overhang_px`` pixels on each side, where its outermost pixels are repeated.
+    The added pixels have weight zero, too.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
@@ -136,8 +142,8 @@ class _Targets:
 def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
-    """Take one optimiser step. Return the weighted absolute error, µm, and the weight as one tensor (2,),
-    which a GPU may still be computing.
+    """Take one optimiser step. Return the weighted absolute error, µm, and the mean weight as one tensor of
+    shape (2,). A GPU may still be computing this tensor.
     """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
@@ -146,7 +152,7 @@ def _step(
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    # A process that has no crop in this step computes the gradients of another crop with weight 0.
+    # A process that has no crop of its own in this step computes the gradients of another crop with weight 0.
     for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
         share = len(some) / len(batch) if own else 0.0
@@ -160,11 +166,11 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows and, for the record, a tensor (2,) with their weighted absolute error,
-    µm, and their weight.
+    """Return the loss of some windows, µm. For the record, also return a tensor of shape (2,) with this loss
+    and the mean weight of the pixels.
 
-    A random crop is predicted with its surroundings or, if the model runs on tiles, as one tile. A quadrant
-    is treated as a separate image.
+    A random crop is predicted together with its surroundings or, if the model runs on tiles, as one tile. A
+    quadrant is treated as a separate layout without surroundings.
     """
     tile = model.tile if config.crops == "random" else None
     # The receptive radius changes during training if the width of a blur is learned.
@@ -178,15 +184,15 @@ def _losses(
             (targets.weights, 0),
         )
     )
-    # Layouts and heights are float32, whatever the precision inside the network.
+    # Layouts and heights are float32, even if the network computes in a lower precision.
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # Each pixel gets the same weight as in the blended field.
+        # Each pixel gets the weight that it has when predicted tiles are blended.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # The mean is taken over all pixels, valid or not, so that every crop has the same weight, whatever the
-    # size of its group.
+    # The mean is taken over all pixels, measured or not. Every crop thus has the same weight, whatever the
+    # number of crops in its group.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 
@@ -195,7 +201,7 @@ def _crops(
     fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int, device: torch.device
 ) -> Tensor:
     crops = stack(fields, windows, margin_px)
-    # A copy from pinned memory runs without waiting for the GPU to finish its current work.
+    # A copy from pinned memory starts at once, without waiting for the GPU to finish its current work.
     return crops.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else crops.to(device)
 
 
@@ -204,8 +210,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
-    """Return the number of pixels by which tiles may extend beyond a scan. It is at least as large as in
-    prediction, and large enough for one tile to fit.
+    """Return the number of pixels by which tiles may extend beyond a scan in training. It is at least the
+    overlap of the tiles, as in prediction, and large enough for one tile to fit into the extended scan.
     """
     if model.tile is None or config.crops != "random":
         return 0
@@ -214,8 +220,8 @@ def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: Trainin
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:
-    """Return the learning rate of one step. It is constant, or it rises along a cosine during the first tenth
-    of the steps and then falls along a cosine.
+    """Return the learning rate of one step. With the schedule ``constant`` it is always the same. With
+    ``one-cycle`` it rises along a cosine during the first tenth of the steps and then falls along a cosine.
     """
     if config.schedule == "constant":
         return config.learning_rate
@@ -228,7 +234,9 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 
 def validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
-    """Return the mean datum-free error over scans, nm; None without scans."""
+    """Return the datum-free error of the model, nm, averaged over the scans. Return None if there are no
+    scans.
+    """
     return mean_error_nm(scans, (predict_scan(model, scan) for scan in scans)) if scans else None
 
 

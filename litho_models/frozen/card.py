@@ -1,4 +1,6 @@
-"""The card of a frozen model: its use, its origin, and its errors."""
+"""The card of a frozen model (``card.json``), which states how to use the model, how it was made, and its
+errors.
+"""
 
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -16,19 +18,21 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
-# How an error was scored: on training scans, or on held-out scans.
+# Texts that say on which scans an error was scored: on the training scans, or on held-out scans.
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
-# The side to which an effect of undetermined role is attributed.
+# Side to which an effect of undetermined role is attributed.
 Attribution = Literal["printer", "microscope"]
 
-# Code reads only these lists in `training` and `split`; all other entries there are free-form.
+# The package reads only these lists from `training` and `split`. All other entries there are only for
+# readers.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class CardMetric(Record):
-    """One reported error or other value, with the scans, nuisances and background for which it holds.
+    """One reported error or other value. ``split``, ``policy`` and ``background`` say on which scans it was
+    computed, with which nuisance terms fitted and with which background added.
 
     ``ci95`` is the 95 % confidence interval over scans.
     """
@@ -43,20 +47,21 @@ class CardMetric(Record):
 
     @property
     def text(self) -> str:
-        """Format the error with its interval."""
+        """Return the value with its unit and its confidence interval, as text."""
         between = f" ({self.ci95[0]:.2f} … {self.ci95[1]:.2f})" if self.ci95 else ""
         return f"{self.value:.2f} {self.unit}{between}"
 
 
 class ModelCard(RunFacts, Result):
-    """Everything needed to load, use and judge a frozen model.
+    """The card of a frozen model. It contains everything that is needed to load, use and judge the model.
 
-    ``background`` is the mean contribution of the microscope to the training scans. This background is used
-    only for comparisons with measured maps and is never part of the model's height. ``at_bounds`` maps each
-    fitted value that lies on a bound of its range to this bound. ``baseline`` contains the gain and error
-    (``ScanFigures``) of the scans from which the model was made; ``litho-models check`` compares new prints
-    with these values. ``attributed`` maps each effect of undetermined role to the side, printer or
-    microscope, to which it was attributed when the model was frozen.
+    ``background`` is the mean contribution of the microscope to the training scans. It is used only for
+    comparisons with measured heights and is never part of the height that the model predicts. ``at_bounds``
+    contains the fitted values that lie on a bound of their range: it maps the name of each to this bound.
+    ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on which the model was
+    trained; ``litho-models check`` compares new prints with these values. ``attributed`` maps effects of
+    undetermined role to the side (printer or microscope) to which they were attributed when the model was
+    frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -96,8 +101,8 @@ class ModelCard(RunFacts, Result):
 
     @property
     def held_out(self) -> CardMetric | None:
-        """Return the error on held-out scans; None if the card has none, because the model was not
-        benchmarked.
+        """Return the error on held-out scans. Return None if the model was not benchmarked, so that the card
+        states no such error.
         """
         return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 
@@ -112,10 +117,10 @@ class ModelCard(RunFacts, Result):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read the card in a folder.
+        """Read the card from the folder of a frozen model.
 
         Raises:
-            InputError: no card in the folder, or a card that is damaged or of another schema.
+            InputError: the folder or its card does not exist, or the card is damaged or has another schema.
         """
         if not Path(path).exists():
             raise InputError(
@@ -134,12 +139,16 @@ class ModelCard(RunFacts, Result):
 
     @property
     def page(self) -> str:
-        """Return the card as Markdown with a Hugging Face front matter."""
+        """Return the content of the card as a Markdown page. It begins with the metadata block that the
+        Hugging Face Hub reads.
+        """
         page = Path(__file__).with_name("readme.md.jinja")
         return filled(page, card=self, bounds=bounds_text(self.at_bounds))
 
 
 def bounds_text(at_bounds: dict[str, float]) -> str:
-    """Return a sentence that names the fitted values that lie on their bounds."""
+    """Return a sentence that lists the fitted values on a bound of their range."""
     named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
-    return f"These values lie on a bound of their range, so the best fit may lie outside: {named}."
+    return (
+        f"These fitted values lie on a bound of their range, so the best values may lie beyond it: {named}."
+    )

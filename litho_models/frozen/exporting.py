@@ -1,4 +1,6 @@
-"""Export a frozen model as a stand-alone program for one size of layout, by ``torch.export`` or ONNX."""
+"""Export a frozen model as a stand-alone program for layouts of one size, in the format of ``torch.export``
+or ONNX.
+"""
 
 from __future__ import annotations
 
@@ -22,27 +24,28 @@ if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
 SUFFIXES = (".pt2", ".onnx")
-# Largest difference between an exported program and its model, 0.01 nm.
+# Largest allowed difference between the heights of an exported program and of its model (0.01 nm).
 LARGEST_DIFFERENCE_UM = 1e-5
 _ITEM = torch.ops.aten._local_scalar_dense.default
 _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um")
 
 
 def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) -> float:
-    """Write a frozen model as a program for layouts of one size; return its largest deviation from the model,
-    µm.
+    """Write a frozen model as a program for layouts of one size. Return the largest difference, µm, between
+    the heights that the program and the model predict for a random layout.
 
-    The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. The program
-    checks neither pitch nor range, but its metadata contains both (``card.json`` of a ``.pt2``,
-    ``metadata_props`` of ONNX).
+    The program receives a layout in µm, float32 of shape (1, 1, size_px, size_px), and returns the printed
+    height in µm with the same shape. It checks neither the pitch nor the range of the heights. Its metadata
+    states both, in the extra file ``card.json`` of a ``.pt2`` file or the ``metadata_props`` of an ONNX file.
 
     Args:
-        out: output file: ``.pt2``, for ``torch.export.load``, or ``.onnx``, which needs the extra ``onnx``.
-        size_px: side of the layout.
+        out: output file. Its suffix is ``.pt2`` (read by ``torch.export.load``) or ``.onnx`` (needs the extra
+            ``onnx``).
+        size_px: side of the layouts, in pixels.
 
     Raises:
-        InputError: the suffix is different; ``onnx`` is not installed; the format lacks an operation of the
-            model; or the program does not predict the same heights as the model.
+        InputError: the suffix is neither of the two; ``onnx`` is not installed; the format does not support
+            an operation of the model; or the heights of program and model differ by more than 0.01 nm.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:
@@ -70,10 +73,11 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 
 
 class _Numbers(TorchDispatchMode):
-    """The Python numbers that a model reads from tensors, recorded in one run and replayed in another.
+    """A mode that records the Python numbers that a model reads from tensors (``Tensor.item``) in one run,
+    and replays them in another run.
 
-    These numbers are the radii of kernels, which follow from the widths of the kernels, and the end points of
-    tables. They depend only on the weights, so a program may contain them as constants.
+    These numbers are the radii of blur kernels and the end points of tables. They depend only on the weights,
+    so a program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):
@@ -101,7 +105,11 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
             simulator(layout)
         noted.append(numbers.noted)
     if noted[0] != noted[1]:
-        raise InputError("model to export", got="operations that depend on the layout", wanted="fixed ones")
+        raise InputError(
+            "model to export",
+            got="operations that depend on the layout",
+            wanted="the same operations for every layout",
+        )
 
     def run(layout_um: Tensor) -> Tensor:
         with _Numbers(noted[0]):
@@ -112,7 +120,7 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
 
 
 class _Program(nn.Module):
-    """A module that gives the input of a program the name ``layout_um``."""
+    """A module that wraps a traced model so that the input of the program is called ``layout_um``."""
 
     def __init__(self, traced: Callable[[Tensor], Tensor]):
         super().__init__()
@@ -135,7 +143,7 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
         raise InputError(
             "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
         ) from None
-    # The exporter warns about packages that no model here needs.
+    # The exporter warns about packages that none of these models needs. Such warnings are hidden.
     with quiet("torch.onnx", "onnxscript", "onnx_ir", above=logging.WARNING):
         try:
             written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)

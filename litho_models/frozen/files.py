@@ -1,8 +1,8 @@
-"""Write and load frozen models: folders with weights and a card. Loading a model runs no code from its
-folder.
+"""Write and load frozen models. A frozen model is a folder with weights and a card. Loading it runs no code
+from the folder.
 
-``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card in readable
-form. Only numbers and names of known classes are read; nothing is unpickled.
+``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card as a page for
+readers. Only numbers, texts and names of known classes are read; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -42,26 +42,27 @@ def save_frozen(
     process_effects: EffectValues | None = None,
     **card_fields: Any,
 ) -> Path:
-    """Write a process model as a frozen model for design; return its folder.
+    """Write a process model as a frozen model, which can be used for design. Return its folder.
 
     Args:
         simulator: the fitted model.
-        folder: output folder; an older model in this folder is replaced completely.
-        name: name in reports; by default, the name of the model.
-        process_effects: effects of the printer that become part of the model, as a mapping from name to
-            parameter values.
-        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …); fields that
-            follow from the model are always computed from it.
+        folder: output folder. If it contains an older frozen model, this model is replaced completely.
+        name: name of the frozen model in reports; by default, the name of its class of model.
+        process_effects: effects of the printer that become part of the frozen model. The mapping contains the
+            parameter values of each effect by name.
+        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …). Fields that
+            follow from the model itself are computed from it, even if they are given here.
 
     Raises:
-        InputError: weights that are not finite or not float32, or unknown card fields.
+        InputError: weights are not finite or not float32; a card field is unknown or has a wrong value; or an
+            effect is not an effect of the printer.
     """
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
     _check_numbers(state, f"weights of {simulator.name}")
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
-        # The file has no metadata, because safetensors writes metadata in no fixed order, so that the hash
-        # would change.
+        # The file has no metadata: safetensors writes metadata in no fixed order, so the hash of the file
+        # would change from call to call.
         (temporary / WEIGHTS_FILE).write_bytes(save(state))
         try:
             own = {
@@ -88,17 +89,18 @@ def save_frozen(
 def load_frozen(
     source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
-    """Load a frozen model with its printer effects, in eval mode and without gradients for the weights.
+    """Load a frozen model together with its printer effects. The model is in eval mode, and its weights have
+    no gradients.
 
     Args:
-        source: folder that ``save_frozen`` wrote, ``zoo:NAME``, or ``hf://owner/name`` for a model that
-            ``push`` shared.
+        source: a folder that ``save_frozen`` wrote, ``zoo:NAME`` for a model of the package, or
+            ``hf://owner/name`` for a model that ``push`` shared.
         device: device on which the model is placed.
-        extrapolate: accept heights beyond the calibrated range.
+        extrapolate: accept layouts with heights beyond the calibrated range.
 
     Raises:
-        InputError: the folder or zoo model does not exist; the card or the weights are damaged or of another
-            format; or the card and the weights do not belong together.
+        InputError: there is no such folder, model of the zoo or repository; the card or the weights are
+            damaged or have another format; or the weights do not belong to the card.
     """
     path = zoo.model_folder(source)
     card = ModelCard.read(path)
@@ -114,25 +116,27 @@ def load_frozen(
 
 
 def push(source: str | Path, repository: str, *, private: bool = False) -> str:
-    """Share a frozen model on the Hugging Face Hub; return the address that ``load_frozen`` accepts.
+    """Share a frozen model on the Hugging Face Hub. Return its address, which ``load_frozen`` accepts.
 
     Args:
-        source: as for ``load_frozen``.
-        repository: ``owner/name``; created if it does not exist, as a private repository if ``private``.
+        source: the model to share, as for ``load_frozen``.
+        repository: ``owner/name`` of the repository. It is created if it does not exist, and is then private
+            if ``private`` is set.
 
     Raises:
-        InputError: ``load_frozen`` refuses the source, the repository refuses the upload, or huggingface_hub
-            is not installed.
+        InputError: ``load_frozen`` cannot load the model, the repository rejects the upload, or
+            huggingface_hub is not installed.
     """
     load_frozen(source)
     return hub.upload(zoo.model_folder(source), repository, private=private)
 
 
 def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
-    """Load the base model of a frozen folder without its effects, and check its weights against the card.
+    """Load the model in the folder of a frozen model without its printer effects, and check the weights
+    against the card.
 
     Raises:
-        InputError: weights that are missing, damaged, or not those of the model in the card.
+        InputError: the weights are missing or damaged, or do not belong to the model in the card.
     """
     weights = Path(folder) / WEIGHTS_FILE
     if not weights.is_file():
@@ -183,8 +187,8 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     try:
         return known(config)
     except (ArithmeticError, ValueError) as error:
-        # Each value is in its range, but some values do not fit together, such as a start beyond its upper
-        # bound.
+        # Each value is in its own range, but some values contradict each other. For example, a starting value
+        # may exceed the upper bound.
         raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
 
 
@@ -196,7 +200,9 @@ def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
 
 
 def _check_effects(card: ModelCard) -> None:
-    """Refuse names that are not process effects, and values that no printer can have."""
+    """Raise an InputError if the card names a process effect that is not an effect of the printer, or gives
+    it values out of range.
+    """
     from litho_models.effects import get_effect
 
     for name, values in card.process_effects.items():

@@ -1,4 +1,4 @@
-"""Freeze the process model of a run folder."""
+"""Freeze the process model that a training or a closed loop wrote."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,12 +9,14 @@ from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE, Attribution, ModelCard
 from litho_models.frozen.files import load_simulator, save_frozen
 
-# Folder of the model in the run folders of `train` and `close-loop`.
+# Name of the folder that holds the model in the output folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
-# Name, among the effects of undetermined role, of the part that `Simulator.printer` leaves out.
+# Name of the part of a model that `Simulator.printer` leaves out. It is listed among the effects of
+# undetermined role.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
-    f"The stated errors are those of a model that also has {SCAN_AXIS}, a part for measured maps. This model "
+    f"The stated errors are those of a model that also has {SCAN_AXIS}, a part for predicting measured maps. "
+    "This model "
     "was frozen without it."
 )
 
@@ -22,19 +24,20 @@ _WITHOUT_IT = (
 def freeze(
     source: str | Path, out: str | Path, attribute: Attribution | Mapping[str, Attribution] | None = None
 ) -> ModelCard:
-    """Write the process model of a run folder, or of a model folder, as a frozen model.
+    """Write the process model of a run folder, or of an already frozen model, as a frozen model.
 
     Args:
-        source: a folder that ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
-        out: folder of the frozen model.
-        attribute: the side to which effects of undetermined role are attributed: one side for all of them, or
-            a mapping from effect to side. Effects of the printer become part of the model; those of the
-            microscope do not. The card records the attribution. ``scan-axis`` is the part of a base model
+        source: a folder that ``train`` or ``close-loop`` wrote, or a frozen model (a folder or ``zoo:NAME``).
+        out: output folder for the frozen model.
+        attribute: side (``printer`` or ``microscope``) to which effects of undetermined role are attributed:
+            one side for all of these effects, or a mapping from the name of an effect to its side. Effects
+            attributed to the printer become part of the frozen model; those attributed to the microscope do
+            not. The card records the attribution. The name ``scan-axis`` stands for the part of a base model
             that acts along the lines of the scan.
 
     Raises:
-        InputError: ``source`` has no model, an effect is not among the undetermined ones, a side is unknown,
-            or ``scan-axis`` is attributed to the printer in a model that was frozen without it.
+        InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side
+            is unknown; or ``scan-axis`` is attributed to the printer, but the model was frozen without it.
     """
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER

@@ -1,4 +1,6 @@
-"""Fetch or share frozen models on the Hugging Face Hub: each is a repository of three files."""
+"""Download frozen models from the Hugging Face Hub, and upload them. Each model is a repository of three
+files.
+"""
 
 import re
 from collections.abc import Iterator
@@ -14,13 +16,13 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Download a model, unless the cache of huggingface_hub contains it, and return its folder.
+    """Return the folder of a model, after downloading it if the cache of huggingface_hub does not contain it.
 
     Args:
-        address: ``hf://owner/name``, or ``hf://owner/name@revision``.
+        address: ``hf://owner/name`` or, for a certain revision, ``hf://owner/name@revision``.
 
     Raises:
-        InputError: the address is not valid, the repository does not exist, or huggingface_hub is not
+        InputError: the address is not valid, the repository cannot be downloaded, or huggingface_hub is not
             installed.
     """
     repository, _, revision = address.removeprefix(ADDRESS).partition("@")
@@ -29,11 +31,11 @@ def fetched(address: str) -> Path:
 
 
 def upload(folder: Path, repository: str, *, private: bool) -> str:
-    """Upload the three files of a frozen model to a repository, which is created if necessary; return its
-    address.
+    """Upload the three files of a frozen model to a repository, which is created if necessary. Return the
+    address of the model.
 
     Raises:
-        InputError: the address is not valid, the repository refuses the upload, or huggingface_hub is not
+        InputError: the address is not valid, the repository rejects the upload, or huggingface_hub is not
             installed.
     """
     repository = repository.removeprefix(ADDRESS)
@@ -45,7 +47,7 @@ def upload(folder: Path, repository: str, *, private: bool) -> str:
 
 @contextmanager
 def _hub(repository: str) -> Iterator[Any]:
-    """Yield huggingface_hub, and convert each of its errors to a one-line InputError."""
+    """Yield the module huggingface_hub, and convert any error in the block to a one-line InputError."""
     what = f"model {ADDRESS}{repository}"
     if not _REPOSITORY.fullmatch(repository):
         raise InputError(what, wanted=f"{ADDRESS}OWNER/NAME")
@@ -55,6 +57,6 @@ def _hub(repository: str) -> Iterator[Any]:
         raise InputError(what, got=f"no {error.name}", hint="pip install 'litholoop[hub]'") from None
     try:
         yield huggingface_hub
-    # These are the errors of huggingface_hub, and those of the network library that it uses.
+    # The errors may come from huggingface_hub or from the network library that it uses.
     except Exception as error:
         raise InputError(what, got=str(error).strip().partition("\n")[0]) from error

@@ -1,4 +1,6 @@
-"""Apply a frozen model to a file of levels or to a store, and find the scans on which it was trained."""
+"""Apply a frozen model to a layout file or to the scans of a store, and find the scans on which it was
+trained.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,18 +16,18 @@ from litho_models.scan_terms.background import Background
 
 
 def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) -> np.ndarray:
-    """Predict the print of a layout of levels, and write its height to ``out``; return the height, (ny, nx)
-    µm.
+    """Predict the print of a layout file, and write its height to ``out``. Return the height in µm, as an
+    array of shape (ny, nx).
 
     Args:
-        layout: TIFF, PNG, BMP or NPY file of integer levels, or of grey values that represent levels, sampled
-            at the model's pitch. Any export of the design package is also accepted, because its sidecar
-            states the pitch and the level height.
-        out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
+        layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. It contains integer levels, or
+            grey values that represent levels. A file that ``litho-design`` exported is also accepted; the
+            file beside it states the pitch and the level height, which are checked.
+        out: file for the height: ``.gsf`` (opens in Gwyddion) or ``.npy``.
 
     Raises:
-        InputError: the layout cannot be read or has levels beyond the calibrated range, or ``out`` has
-            another suffix.
+        InputError: the layout cannot be read, has another pitch or has heights beyond the calibrated range,
+            or ``out`` has another suffix.
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])
@@ -36,37 +38,41 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
-    """Predict the height of a scan with a frozen model, float32 (ny, nx) µm."""
+    """Predict the printed height of the layout of a scan. The result is in µm, float32 of shape (ny, nx)."""
     model.check_geometry(scan.pitch_um, scan.level_height_um)
     return model.predict(scan.layout_um)
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
-    """Return the background in a model's card, if the card has one for scans of this size."""
+    """Return the background in the model's card, or None if the card has none for scans of this size."""
     stated = model.card["background"]
     learned = Background.model_validate(stated) if stated is not None else None
     return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
 
 
 def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
-    """Return the scans on which the model was trained; none if it was made from other prints."""
+    """Return the ids of the scans on which the model was trained. The set is empty if the model was trained
+    on other prints.
+    """
     return set(model.card["training"].get("scan_ids", [])) if made_of_these_prints(model, dataset) else set()
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Return whether a model was made from the prints in a store: from the same dataset, or with the same
-    locked scans.
+    """Return True if the model was trained on the prints in this store. That is so if its card names the same
+    dataset, or if the store contains scans that were locked when the model was trained.
     """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
 
 
 def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
-    """Return the scans of a store that were locked when the model was made, identified by their raw files.
+    """Return the ids of the scans in a store that were locked when the model was trained. The scans are
+    recognised by their raw files.
 
-    Another recipe or registration changes every height of a store, and an added or missing scan changes the
-    choice of locked scans. Neither changes a raw file. If a card lists no raw files, return the ids in its
-    lock box, but only for a dataset of the same name.
+    Raw files are compared because they stay the same if the store is built anew. Other settings for levelling
+    or registration change every height in the store, and an added or missing scan changes which scans are
+    locked. If the card lists no raw files, the scan ids in its lock box are returned, but only for a dataset
+    of the same name.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

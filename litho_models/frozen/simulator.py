@@ -1,4 +1,6 @@
-"""A frozen model for design, with fixed weights, and checks of geometry and calibrated range."""
+"""The class of loaded frozen models. It predicts prints with fixed weights, and checks the geometry and the
+heights of every layout.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# Rounding to float32 may put the highest level slightly out of the range; the next level exceeds it by 100
-# nm.
+# Tolerance of the calibrated range. Rounding to float32 may put the highest level slightly beyond the range,
+# while the next level would exceed it by a whole level height (100 nm in the first prints).
 _ROUNDING_UM = 1e-5
 
 
@@ -32,9 +34,10 @@ Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
 
 
 class FrozenSimulator(nn.Module):
-    """A process model for design, with fixed weights and with gradients only for its input.
+    """A process model for design. Its weights are fixed, and gradients flow only to its input.
 
-    ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
+    ``model(layout_um, pitch_um=0.1)`` returns the printed height of a layout. Layout and height are tensors
+    of shape (batch, 1, ny, nx), in µm.
     """
 
     def __init__(self, simulator: Simulator | EffectChain, card: ModelCard, sha256: str, extrapolate: bool):
@@ -43,7 +46,7 @@ class FrozenSimulator(nn.Module):
         self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
         self.sha256 = sha256
         self.extrapolate = extrapolate
-        # Receptive radius, µm; None if a pixel depends on the whole image.
+        # Receptive radius, µm, or None if the height of each pixel depends on the whole layout.
         self.reach_um = simulator.reach_um if isinstance(simulator, Simulator) else None
         self._lowest_um, self._highest_um = card.calibrated_range_um
         self._precision: Precision = "float32"
@@ -51,25 +54,27 @@ class FrozenSimulator(nn.Module):
 
     @property
     def name(self) -> str:
-        """Return the name in the card."""
+        """Return the name of the model, as stated in its card."""
         return self.card["name"]
 
     @property
     def pitch_um(self) -> float:
-        """Return the lateral sampling for which the model is made, µm."""
+        """Return the pixel pitch for which the model was made, µm."""
         return self.card["pitch_um"]
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile of a model whose result depends on the size of the image; None for all others."""
+        """Return the tile size of a model whose result depends on the size of its input, or None for other
+        models.
+        """
         return self.simulator.tile
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
-        """Predict in ``precision`` inside the block (see ``network_precision``). Outside such a block,
-        float32 is used.
+        """Let the model predict in the given precision inside the block (see ``network_precision``). Outside
+        such a block, it predicts in float32.
 
-        A line on stderr warns if this precision is slower than float32.
+        If this precision is slower than float32 on this processor, a line on stderr says so.
         """
         warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
         before, self._precision = self._precision, precision
@@ -79,24 +84,24 @@ class FrozenSimulator(nn.Module):
             self._precision = before
 
     def train(self, mode: bool = True) -> FrozenSimulator:
-        """Return the model unchanged, because frozen models stay in eval mode."""
+        """Do nothing and return the model, because frozen models always stay in eval mode."""
         return super().train(False)
 
     def forward(
         self, layout_um: Tensor, pitch_um: float | None = None, level_height_um: float | None = None
     ) -> Tensor:
-        """Predict the print of a layout; return its height (b, 1, y, x), µm.
+        """Predict the print of a layout. Return its height in µm, with the shape of the layout.
 
         Args:
-            layout_um: nominal height (b, 1, y, x), µm. Its dtype must be that of the weights: float32, or
-                float64 after ``double()``.
+            layout_um: nominal height, µm, as a tensor of shape (batch, 1, ny, nx). Its dtype must be that of
+                the weights: float32, or float64 after ``double()``.
             pitch_um: sampling of the layout; it is checked if given.
-            level_height_um: level height of the layout; it is checked if given.
+            level_height_um: height of one level of the layout, µm; it is checked if given.
 
         Raises:
             InputError: the pitch or the level height differs from that of the model; the layout is not a
-                tensor, or has the wrong shape or dtype; or heights lie beyond the calibrated range and
-                ``extrapolate`` is not set.
+                tensor, or has the wrong shape or dtype; or heights of the layout lie beyond the calibrated
+                range and the model was loaded without ``extrapolate``.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -104,18 +109,18 @@ class FrozenSimulator(nn.Module):
         return self._in_precision(self.simulator, layout_um)
 
     def predict(self, layout_um: Field, pitch_um: float | None = None) -> Field:
-        """Predict the print of a layout given as an array or tensor of any number of dimensions. Return the
-        height, µm, with the same type and shape.
+        """Predict the print of one layout or of a stack of layouts. Return the height, µm, as an array of the
+        same type and shape.
 
         Args:
-            layout_um: nominal height (..., y, x), µm, of any float type: a NumPy array, an xarray array, or a
-                tensor. If an xarray array has the coordinates y_um and x_um, they are checked. Gradients flow
-                through a tensor.
+            layout_um: nominal height, µm, of any float type and of shape (..., ny, nx): a NumPy array, an
+                xarray array, or a tensor. If an xarray array has the coordinates y_um and x_um, they are
+                checked against the pitch. If it is a tensor, gradients flow to it.
             pitch_um: sampling of the layout; it is checked if given.
 
         Raises:
-            InputError: as for ``forward``; also if the layout contains integers, which would be levels, or
-                has fewer than two dimensions.
+            InputError: as for ``forward``. An error is also raised if the layout contains integers, which
+                would be levels instead of heights, or has fewer than two dimensions.
         """
         self.check_geometry(pitch_um)
         if isinstance(layout_um, Tensor):
@@ -146,7 +151,7 @@ class FrozenSimulator(nn.Module):
             raise InputError("layout", got=f"shape {shape}", wanted="(..., y, x), with no empty dimension")
         dtype = next((weight.dtype for weight in self.parameters()), layout_um.dtype)
         fields = layout_um.to(dtype).reshape(-1, 1, 1, *layout_um.shape[-2:])
-        # Fields are predicted one after the other, so that a stack needs no more memory than one field.
+        # The layouts are predicted one after the other, so that a stack needs no more memory than one layout.
         return torch.cat([self(field) for field in fields]).reshape(layout_um.shape)
 
     def __repr__(self) -> str:
@@ -161,15 +166,15 @@ class FrozenSimulator(nn.Module):
         return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
-        """Predict as ``forward`` does, but crop ``border_px`` on each side; return (b, 1, y - 2 border, x - 2
-        border) µm.
+        """Predict as ``forward`` does, but return the height without a border of ``border_px`` pixels on each
+        side. The result is in µm and has shape (batch, 1, ny - 2 border_px, nx - 2 border_px).
 
-        If the border is at least as wide as the receptive radius, only the pixels that the result needs are
-        computed, and nothing is assumed about the layout beyond its edge. If the model runs on tiles, only
-        the needed pixels are computed as well.
+        If the border is at least as wide as the receptive radius, only the pixels of the result are computed,
+        and nothing is assumed about the layout beyond its edge. If the model runs on tiles, only the tiles
+        that the result needs are computed.
 
         Raises:
-            InputError: as for ``forward``, or a border that leaves no pixels.
+            InputError: as for ``forward``, or the border leaves no pixels.
         """
         self._check_layout(layout_um, pitch_um, None)
         if not 0 <= 2 * border_px < min(layout_um.shape[-2:]):
@@ -204,7 +209,7 @@ class FrozenSimulator(nn.Module):
                 got=f"shape {tuple(layout_um.shape)}",
                 wanted="(batch, 1, y, x), with no empty dimension",
             )
-        # A model without weights accepts a layout of any floating-point type.
+        # A model without weights accepts layouts of any floating-point type.
         own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
         wanted = next((weight.dtype for weight in self.parameters()), own)
         if layout_um.dtype != wanted:
@@ -218,10 +223,10 @@ class FrozenSimulator(nn.Module):
             self._check_range(layout_um)
 
     def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
-        """Refuse a pitch or level height that differs from the model's; None is not checked.
+        """Check that a pitch and a level height, µm, are those of the model. A value of None is not checked.
 
         Raises:
-            InputError: they differ.
+            InputError: one of them differs.
         """
         for name, given in (("pitch_um", pitch_um), ("level_height_um", level_height_um)):
             wanted = self.card[name]

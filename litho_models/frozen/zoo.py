@@ -1,7 +1,8 @@
-"""Names and folders of the frozen models in the package. These models are the ones in the benchmark table.
+"""Names and folders of the frozen models that come with the package (the zoo). They are the models in the
+benchmark table.
 
-``load_frozen("zoo:pbl")`` opens one of them, and ``load_frozen("zoo:best")`` the one that predicts held-out
-scans best.
+``load_frozen("zoo:pbl")`` loads the model ``pbl``, and ``load_frozen("zoo:best")`` loads the model with the
+smallest error on held-out scans.
 """
 
 import builtins
@@ -20,12 +21,13 @@ _CARD_FILE = "card.json"
 
 
 def list() -> builtins.list[str]:
-    """Return the sorted names of the models in the zoo; empty if the package contains none."""
+    """Return the sorted names of the models in the zoo. The list is empty if the package has no models."""
     return sorted(card.parent.name for card in ZOO_FOLDER.glob(f"*/{_CARD_FILE}"))
 
 
 def folder(name: str) -> Path:
-    """Return the folder of the zoo model with this name, or of the best one, for commands that take a folder.
+    """Return the folder of the zoo model with this name. The name ``best`` stands for the model with the
+    smallest error on held-out scans.
 
     Raises:
         InputError: no such model.
@@ -40,14 +42,14 @@ def folder(name: str) -> Path:
 
 
 def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
-    """Return the folder of a model, from a path, ``zoo:NAME`` or ``hf://owner/name``.
+    """Return the folder of a frozen model that is given as a path, as ``zoo:NAME`` or as ``hf://owner/name``.
 
     Args:
-        source: the path or name that the user typed.
-        other: further names that the caller accepts, which the error message lists too.
+        source: path or name that the user typed.
+        other: further names that the caller accepts; the error message also lists them.
 
     Raises:
-        InputError: no such folder, no such model in the zoo, or one that cannot be fetched.
+        InputError: there is no such folder or model in the zoo, or the model cannot be downloaded.
     """
     text = str(source)
     if text.startswith(hub.ADDRESS):
@@ -61,8 +63,8 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
 
 def card(name: str) -> dict[str, Any]:
-    """Return the card of a zoo model as a dictionary, with the keys of ``ModelCard``; the weights are not
-    read.
+    """Return the card of a zoo model as a dictionary whose keys are the fields of ``ModelCard``. The weights
+    are not read.
 
     Raises:
         InputError: no such model.
@@ -72,6 +74,6 @@ def card(name: str) -> dict[str, Any]:
 
 
 def _held_out_nm(name: str) -> float:
-    """Return the first metric of a card: the error on held-out scans."""
+    """Return the error of a zoo model on held-out scans, nm. It is the first metric of the card."""
     metrics = card(name)["metrics"]
     return metrics[0]["value"] if metrics else float("inf")

@@ -1,7 +1,8 @@
-"""Blur with a separable, normalised Gaussian, cut at four sigma and differentiable in its width.
+"""A blur by a normalised Gaussian. The kernel is separable and ends at four standard deviations, and the blur
+is differentiable in the width of the kernel.
 
-Along each axis, blocks of pixels are multiplied by a band matrix of the kernel. For fields up to a few
-thousand pixels, this is faster than a Fourier transform and needs no periodic padding.
+Along each axis, blocks of pixels are multiplied by a band matrix that contains the kernel. For fields up to a
+few thousand pixels wide, this is faster than a Fourier transform, and it needs no periodic padding.
 """
 
 import math
@@ -14,17 +15,20 @@ from torch.nn import functional
 from litho_data.foundation.errors import InputError
 
 SUPPORT_SIGMAS = 4.0
-# At this smallest sigma the weight of the next pixel is negligible (exp(-50)), and 1/sigma stays finite.
+# Smaller standard deviations are replaced by this value. The weight of the next pixel is then negligible
+# (exp(-50)), and 1/sigma stays finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Block sizes in pixels for kernels with a radius below 64 px, and for wider ones. Wider blocks multiply more
-# zeros of the band matrix; products of narrower blocks are slower.
+# Size of the blocks for kernels with a radius below _WIDE_BLOCK_PX, and for kernels of this radius or more.
+# With wider blocks, more zeros of the band matrix are multiplied; with narrower blocks, the matrix products
+# are slower.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
-# No printed field is wider than this radius, and a larger one would exhaust memory.
+# Largest radius of a kernel. No printed field is wider, and a larger radius would exhaust the memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# The radius of a kernel is four sigma or, as in the authors' code, three sigma rounded down to whole pixels.
+# Rule for the radius of a kernel: four sigma or, as in the code of the paper's authors, three times sigma
+# rounded down to whole pixels.
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -36,21 +40,26 @@ def gaussian_blur(
     edge: Edge | None = "replicate",
     radius_px: int | tuple[int, int] | None = None,
 ) -> Tensor:
-    """Blur ``field`` (..., y, x) with a Gaussian of standard deviation ``sigma_um``.
+    """Blur a field with a Gaussian of standard deviation ``sigma_um``. The field has shape (..., ny, nx).
 
-    The kernel g(d) ∝ exp(-d²/2σ²) is normalised over its support of at least 4σ on each side.
+    The kernel is proportional to exp(-d²/2σ²), where d is the distance. Its sum over all pixels within the
+    radius is 1.
 
     Args:
-        field: floating-point tensor (..., y, x).
-        sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. If it is a tensor,
-            gradients flow to it.
-        pitch_um: sampling of the field, µm.
-        edge: ``replicate`` repeats the outermost pixels, and ``zero`` assumes zeros outside; the size stays
-            the same. None keeps only the pixels whose whole support lies inside, (..., y - 2r, x - 2r).
-        radius_px: radius r of the kernel, or a pair (along y, along x); four sigma by default.
+        field: floating-point tensor of shape (..., ny, nx).
+        sigma_um: standard deviation, µm, or a pair of standard deviations (along y, along x). If it is a
+            tensor, gradients flow to it.
+        pitch_um: pixel pitch of the field, µm.
+        edge: how the field continues beyond its edge: ``replicate`` repeats the outermost pixels, and
+            ``zero`` assumes zeros. The result then has the shape of the field. With None, the result contains
+            only the pixels that are at least the radius r from the edge, and has shape (..., ny - 2r, nx -
+            2r).
+        radius_px: radius r of the kernel in pixels, or a pair of radii (along y, along x); by default four
+            standard deviations, rounded up.
 
     Raises:
-        InputError: a pitch that is not positive, or a field without pixels or narrower than the support.
+        InputError: the pitch is not positive, the kernel is too wide, or the field has no pixels or is
+            narrower than the kernel.
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
@@ -58,10 +67,10 @@ def gaussian_blur(
         raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
     widths = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
-    # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
+    # Heights need the precision of float32. At 1 µm, bfloat16 resolves only some nanometres.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
-        # Along x, then along y.
+        # Blur along x, then along y.
         for axis in (-1, -2):
             sigma_px = torch.as_tensor(widths[axis], dtype=field.dtype, device=field.device) / pitch_um
             radius = radii[axis]
@@ -73,7 +82,7 @@ def gaussian_blur(
             if field.shape[axis] <= 2 * radius:
                 wanted = f"more than {2 * radius} px (twice the radius of the kernel)"
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
-            # Along x, all lines of all samples form one image.
+            # For the blur along x, the lines of all samples are stacked to one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
             blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
@@ -81,11 +90,11 @@ def gaussian_blur(
 
 
 def kernel_radius_px(sigma_px: float) -> int:
-    """Return the radius, in whole pixels, of a kernel that extends to ``SUPPORT_SIGMAS`` standard deviations;
-    at least 1.
+    """Return the radius of a kernel that extends to ``SUPPORT_SIGMAS`` standard deviations, rounded up to
+    whole pixels. It is at least 1.
 
     Raises:
-        InputError: a Gaussian that is wider than any field, or whose width is not a number.
+        InputError: the Gaussian is wider than any field, or its width is not a number.
     """
     if not SUPPORT_SIGMAS * sigma_px <= _LARGEST_RADIUS_PX:
         raise InputError(
@@ -97,15 +106,17 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
-    """Return the radius of a kernel according to a model's rule ``support``, limited to ``cap_px`` if
-    given.
+    """Return the radius of a kernel in whole pixels according to the rule ``support``. If ``cap_px`` is
+    given, the radius is at most this.
     """
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
 
 
 def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replicate") -> Tensor:
-    """Add a border to a (batch, channel, y, x) or (..., y, x) tensor."""
+    """Add a border of ``rows_px`` pixels above and below and of ``columns_px`` pixels left and right of a
+    field of shape (..., ny, nx). The border repeats the outermost pixels or contains zeros.
+    """
     border = (columns_px, columns_px, rows_px, rows_px)
     flat = field.reshape(-1, 1, *field.shape[-2:])
     if edge == "replicate":
@@ -116,10 +127,11 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 
 
 class _Blur(torch.autograd.Function):
-    """Blur samples (s, y, x) along one axis (-1 or -2) with the band of a symmetric kernel. The result is
-    linear in samples and band.
+    """Blur samples of shape (samples, ny, nx) along one axis (-1 or -2) with the band matrix of a symmetric
+    kernel. The result is linear in the samples and in the band matrix.
 
-    PyTorch's own backward pass through overlapping windows takes three times as long.
+    The class defines its own derivatives, because PyTorch's backward pass through overlapping windows takes
+    three times as long.
     """
 
     generate_vmap_rule = True
@@ -129,7 +141,8 @@ class _Blur(torch.autograd.Function):
         size = samples.shape[axis] - band.shape[1] + band.shape[0]
         found = []
         for windows in _windows(samples, band, axis):
-            # (blocks, y, pixels of a block), or (blocks, pixels of a block, x).
+            # The shape is (blocks, ny, pixels of a block) along x, and (blocks, pixels of a block, nx) along
+            # y.
             blocks = (windows @ band.mT).movedim(0, 1) if axis == -1 else band @ windows.mT
             line = (samples.shape[-2], -1) if axis == -1 else (-1, samples.shape[-1])
             found.append(blocks.reshape(line).narrow(axis, 0, size))
@@ -139,7 +152,7 @@ class _Blur(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         samples, band, ctx.axis = inputs
         ctx.set_materialize_grads(False)
-        # The field is kept only if the width is learned.
+        # The field is kept for the backward pass only if the width of the kernel is learned.
         ctx.save_for_backward(band, samples if ctx.needs_input_grad[1] else None)
         ctx.save_for_forward(band, samples)
 
@@ -169,9 +182,12 @@ class _Blur(torch.autograd.Function):
 
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """Yield for each sample the overlapping windows of its blocks, as views: (blocks, other axis, window).
+    """Return the windows that the blocks of each sample need. A window is a block with the radius of the
+    kernel added on both sides, so neighbouring windows overlap. Each result is a view of shape (blocks,
+    length of the other axis, window).
 
-    Samples are treated one at a time, because one product over several samples would copy the windows.
+    There is one result per sample, because a single matrix product over several samples would copy the
+    windows.
     """
     block, window = band.shape
     count = -(-(samples.shape[axis] - window + block) // block)
@@ -185,12 +201,12 @@ def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
 
 
 def _band(radius: int, sigma_px: Tensor) -> Tensor:
-    """Return the matrix (block, block + 2 radius) whose row i holds the kernel centred on column i +
-    radius.
+    """Return the band matrix of a kernel. It has shape (block, block + 2 radius), and its row i contains the
+    kernel, centred on column i + radius.
     """
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
-    # Each row is a window on the zero-padded kernel, starting with the last row.
+    # Each row is a window on the zero-padded kernel. The windows come in reverse order, so they are flipped.
     block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
     kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
     return kernel.unfold(0, block + 2 * radius, 1).flip(0)

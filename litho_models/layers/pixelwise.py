@@ -1,4 +1,6 @@
-"""Evaluate pixelwise functions block by block, to limit the memory for hidden values."""
+"""Evaluate functions that act on each pixel separately. Pixels are evaluated in blocks, to limit the memory
+for the hidden values of networks.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
@@ -9,24 +11,28 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
-# A hundred hidden values for each of these pixels take 3 MB and fit into the last-level cache.
+# Number of pixels in a block. A hundred hidden values for each of these pixels take 3 MB and fit into the
+# last-level cache of a processor.
 _PIXELS_AT_ONCE = 2**13
 
 
 def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters: Iterable[Tensor]) -> Tensor:
-    """Return the values of ``function`` at all pixels, (n,). Gradients flow to the features.
+    """Evaluate a function of the features of a pixel at all n pixels. The result has shape (n,). Gradients
+    flow to the features.
 
     Args:
-        function: maps the features of m pixels, (m, ...) each, to m values, (m,), for any m.
-        features: tensors (n, ...), one row for each pixel.
-        parameters: parameters of the function; gradients flow to those that are trained.
+        function: receives the features of m pixels, as tensors of shape (m, ...), and returns their values,
+            of shape (m,). It must accept any m.
+        features: tensors of shape (n, ...), with one row for each pixel.
+        parameters: parameters of the function. Gradients flow to those that are trained.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
         values: Tensor = _WithSlopes.apply(function, *features)
         return values
     if torch.is_grad_enabled():
-        # The backward pass computes hidden values again, because those of a whole field would take gigabytes.
+        # The backward pass computes the hidden values again, because storing them for a whole field would
+        # take gigabytes.
         parts = [checkpoint(function, *block, use_reentrant=False) for block in _in_blocks(features)]
     else:
         parts = [function(*block) for block in _in_blocks(features)]
@@ -34,9 +40,11 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 
 
 class _WithSlopes(torch.autograd.Function):
-    """Compute values and slopes together, and keep only the slopes for the backward pass.
+    """Compute the values of a function and their derivatives with respect to the features (slopes) together.
+    Only the slopes are kept for the backward pass.
 
-    The slopes take as much memory as the features, but save a second pass over the pixels.
+    The slopes take as much memory as the features, but the backward pass need not evaluate the function
+    again.
     """
 
     @staticmethod
@@ -59,18 +67,18 @@ class _WithSlopes(torch.autograd.Function):
 
 
 def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-    """Yield the features of each block of pixels, (m, ...)."""
+    """Yield the features of each block of m pixels, as tensors of shape (m, ...)."""
     return zip(*(feature.split(_PIXELS_AT_ONCE) for feature in features), strict=True)
 
 
 def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: float) -> Tensor:
-    """Evaluate a piecewise-linear function at ``values`` of any shape. The result is differentiable in the
-    values and in the heights of the knots.
+    """Evaluate a piecewise-linear function. The result has the shape of ``values``, and is differentiable in
+    the values and in the heights of the knots.
 
     Args:
-        values: points at which the function is evaluated.
-        knot_heights: function values at ``len(knot_heights)`` equally spaced knots from ``lowest`` to
-            ``highest``; beyond the knots, the outermost segment is extrapolated.
+        values: points at which the function is evaluated, as a tensor of any shape.
+        knot_heights: values of the function at equally spaced knots, the first at ``lowest`` and the last at
+            ``highest``. Beyond the knots, the outermost segments are extended.
     """
     last = knot_heights.numel() - 1
     position = (values - lowest) * (last / (highest - lowest))
@@ -82,11 +90,11 @@ def interpolate(values: Tensor, knot_heights: Tensor, lowest: float, highest: fl
 
 
 class PointwiseNet(nn.Module):
-    """A network that maps one number to one number, 1 -> hidden layers -> 1, in the same way at all pixels (1
-    x 1 convolutions).
+    """A network with one input and one output, which is applied to each pixel separately (1 x 1
+    convolutions).
 
-    The network is a piecewise-linear function of one variable, so it is evaluated at ``knots`` points and
-    interpolated. This takes a thousand evaluations instead of one per pixel.
+    The network is a piecewise-linear function of one variable. It is therefore evaluated only at ``knots``
+    points, about a thousand, and interpolated between them, instead of being evaluated at every pixel.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):
@@ -99,11 +107,13 @@ class PointwiseNet(nn.Module):
         self.knots = knots
 
     def forward(self, values: Tensor, lowest: float, highest: float) -> Tensor:
-        """Evaluate by interpolation; the knots span the range from ``lowest`` to ``highest``."""
+        """Evaluate the network at ``values`` by interpolation between knots, which span the range from
+        ``lowest`` to ``highest``.
+        """
         return interpolate(values, self.at_knots(lowest, highest), lowest, highest)
 
     def at_knots(self, lowest: float, highest: float) -> Tensor:
-        """Return the network's values at the knots, shape (knots,)."""
+        """Return the values of the network at the knots, with shape (knots,)."""
         parameter = next(self.parameters())
         points = torch.linspace(lowest, highest, self.knots, device=parameter.device, dtype=parameter.dtype)
         return self.exact(points)
@@ -114,7 +124,9 @@ class PointwiseNet(nn.Module):
             return self.layers(values.reshape(-1, 1)).reshape(values.shape)
 
     def start_at_zero(self) -> None:
-        """Set the last layer to zero, so that the network returns zero. The hidden layers stay random."""
+        """Set the last layer to zero, so that the network returns zero before it is trained. The hidden
+        layers stay random.
+        """
         last = cast(nn.Linear, self.layers[-1])
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

@@ -1,4 +1,6 @@
-"""Set the precision of network products, and warn if a lower precision is slower on this processor."""
+"""Set the precision of the matrix products in networks, and warn if a lower precision is slower on this
+processor.
+"""
 
 import sys
 from collections.abc import Iterator
@@ -10,27 +12,29 @@ import torch
 
 Precision = Literal["float32", "bfloat16"]
 
-# PyTorch's names of the processor features that multiply in bfloat16: two of x86, two of ARM.
+# Names that PyTorch gives to the processor features that multiply in bfloat16: two of x86, two of ARM.
 _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
 
 @contextmanager
 def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
-    """Let networks multiply in ``precision`` inside the block; heights and blurs stay in float32."""
+    """Let networks multiply in the given precision inside the block. Heights and blurs stay in float32."""
     with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
         yield
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
-    """Warn once on stderr that float32 would be faster, if this processor has no unit for ``precision``."""
+    """If this processor only emulates the given precision, print a warning on stderr, once per process, that
+    float32 is faster.
+    """
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
         _say("networks run in bfloat16, but this processor has no bfloat16 unit: float32 is faster")
 
 
 def has_bfloat16_unit() -> bool:
-    """Return whether this processor multiplies in bfloat16; if not, bfloat16 is emulated in float32."""
+    """Return True if this processor multiplies in bfloat16. Other processors emulate it in float32."""
     known = getattr(torch.cpu, "get_capabilities", None)
-    # Older versions of PyTorch cannot list the features. A bfloat16 unit is then assumed.
+    # Older versions of PyTorch cannot list the features of a processor. A bfloat16 unit is then assumed.
     return known is None or any(known().get(unit) for unit in _UNITS)
 
 

@@ -1,9 +1,9 @@
-"""Define ranges of fitted values, and the rule for when a value is on its bound.
+"""Ranges of fitted values, and the rule for when a value counts as lying on a bound of its range.
 
-A fit changes a raw number, and the model uses the corresponding value inside its range. Near a bound, the
-value hardly changes with the raw number, so a fit that reached the bound could not leave it again. Fits
-therefore keep raw numbers within ``FLAT_FROM``. A value whose raw number is at that limit counts as on its
-bound.
+A fit changes an unlimited raw number, and the model uses the corresponding value inside the range. Near a
+bound, the value hardly changes with the raw number, so a fit that reached the bound could not leave it again.
+Fits therefore keep raw numbers between -``FLAT_FROM`` and ``FLAT_FROM``. A value whose raw number has reached
+such a limit counts as lying on the bound.
 """
 
 import math
@@ -15,19 +15,20 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# At this raw number, the slope of a sigmoid is 7 % of its maximum, and the value is 2 % of the range away
-# from the bound.
+# Largest magnitude of a raw number. There, the slope of a sigmoid is 7 % of its maximum, and the distance of
+# the value from the bound is 2 % of the range.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
 class Range:
-    """The range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
+    """The range of one fitted value. The value is lower + (upper - lower) · sigmoid(raw) or, if there is no
+    upper bound, lower + softplus(raw).
 
     Attributes:
         name: name of the value, with its unit.
-        lower, upper: bounds; with an infinite ``upper`` the softplus is used.
+        lower, upper: bounds of the value; an infinite ``upper`` means that there is no upper bound.
     """
 
     name: str
@@ -41,10 +42,10 @@ class Range:
         return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
 
     def raw(self, value: float) -> Tensor:
-        """Return the raw number that corresponds to a value.
+        """Return the raw number for which the model uses this value.
 
         Raises:
-            InputError: a value outside the range, or on a bound.
+            InputError: the value is outside the range or on a bound.
         """
         if not self.lower < value < self.upper:
             raise InputError(
@@ -61,7 +62,7 @@ class Range:
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """Return the bound on which a raw number lies; None inside the range."""
+        """Return the bound on which the value of this raw number lies, or None if it lies on neither."""
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
             return self.lower

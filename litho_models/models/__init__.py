@@ -1,4 +1,4 @@
-"""List, register and build models by name."""
+"""List the models of the printer by name, register further ones, and build them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -37,12 +37,12 @@ MODELS: dict[str, type[Simulator]] = {
 
 
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
-    """Register a model, so that every function and command of this process knows its name.
+    """Register a class of models, so that all functions and commands of this process know it by its name.
 
-    Call this function in a plug-in to register the model in every process of a command.
+    Call this function in a plug-in to register the class in every process that a command starts.
 
     Raises:
-        InputError: a model without a name, or with a name that is already taken.
+        InputError: the class has no name, or its name is already taken.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
@@ -55,17 +55,17 @@ def model_class(name: str) -> type[Simulator]:
     """Return the class of the model with this name.
 
     Raises:
-        InputError: unknown name.
+        InputError: the name is unknown.
     """
     require_known("model", name, MODELS)
     return MODELS[name]
 
 
 def require_models(names: Sequence[str]) -> None:
-    """Check a user's list of model names.
+    """Check a list of model names that a user gave.
 
     Raises:
-        InputError: no name, a repeated name, or an unknown name.
+        InputError: the list is empty or is a single string, or a name is repeated or unknown.
     """
     if isinstance(names, str):
         raise InputError("models", got=repr(names), wanted="a list of names", hint=f"use [{names!r}]")
@@ -78,10 +78,9 @@ def require_models(names: Sequence[str]) -> None:
 
 
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
-    """Return the parameters that no fit changes.
+    """Return the names of the parameters of a model that no fit changes.
 
-    These are the parameters that are fixed by default and the parameters in ``fix``, except the parameters in
-    ``free``.
+    These are the parameters that are fixed by default and those in ``fix``, without those in ``free``.
 
     Raises:
         InputError: the model is unknown, or ``free`` names a parameter that is not fixed by default.
@@ -93,10 +92,11 @@ def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) 
 
 
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
-    """Build an untrained model; ``fields`` are config fields (geometry, hyper-parameters).
+    """Build an untrained model. ``fields`` are values for fields of its configuration: geometry and
+    hyper-parameters.
 
     Raises:
-        InputError: an unknown model or field, or a value that the field does not allow.
+        InputError: the model, a field or a parameter to fix is unknown, or a value is not allowed.
     """
     kind = model_class(name)
     for field in fields:

@@ -1,5 +1,5 @@
-"""Load the weights of the paper's authors into our models of variant ``authors``. The names of the weights
-are translated.
+"""Load weights that the code of the paper's authors trained into the models of variant ``authors``. The names
+of the weights are translated.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -28,17 +28,17 @@ _PHYSICS = {
 
 
 def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
-    """Return our PBL, Physics or FNO of variant ``authors`` with the weights of the authors' corresponding
-    class.
+    """Return a PBL, Physics or FNO model of variant ``authors`` with the weights of the corresponding class
+    in the authors' code.
 
     Args:
-        weights: their ``state_dict``, a mapping from name to array or tensor. Complex numbers may also be
-            given as pairs of real numbers along the last axis.
-        fields: config fields of the model (geometry).
+        weights: ``state_dict`` of the authors' model, a mapping from name to array or tensor. Complex weights
+            may also be given as pairs of real numbers along the last axis.
+        fields: values for fields of the model's configuration, such as its geometry.
 
     Raises:
-        InputError: the weights belong to an unknown class, or some weights are missing, unknown or of the
-            wrong shape.
+        InputError: the weights belong to none of the three classes, or some weights are missing, unknown or
+            have the wrong size.
     """
     if not isinstance(weights, Mapping):
         hint = "read the authors' file with torch.load"
@@ -70,7 +70,7 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
             got=f"missing, unknown or of another size: {', '.join(wrong)}",
             wanted="the complete state_dict",
         )
-    # Our models store 1 x 1 convolutions as matrices, and tensors of shape (1,) as plain numbers.
+    # The models here store 1 x 1 convolutions as matrices and tensors of shape (1,) as scalars.
     model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})
     return model.eval()
 
@@ -81,7 +81,8 @@ def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Ten
         alpha = float(state["raw_alpha"])
         if not alpha > 0:
             raise InputError("alpha of the authors' physics", got=alpha, wanted="a number above 0")
-        # Their parameter is the steepness itself; ours is the raw number of a range.
+        # The parameter in the authors' code is the steepness itself. The parameter here is the raw number of
+        # a range.
         state["raw_alpha"] = steepness.raw(alpha)
     return state
 
@@ -105,7 +106,7 @@ def _fno_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         names |= {f"w{i}.{kind}": f"local.{i}.{kind}" for i in range(4)}
     state = {names.get(name, name): value for name, value in own.items()}
     for i in range(4):
-        # Our parameter contains the matrices for both signs of the frequency along y.
+        # The parameter here contains the matrices for both signs of the frequency along y.
         signs = [state.pop(f"conv{i}.weights{sign}", None) for sign in (1, 2)]
         pair = [matrix for matrix in signs if matrix is not None]
         if len(pair) == 2 and pair[0].shape == pair[1].shape:

@@ -1,4 +1,6 @@
-"""Baselines that every model must beat, from the layout itself to linear models fitted in closed form."""
+"""Simple models that every other model must beat. They range from the unchanged layout to models that are
+linear in features. In the formulas, M is the layout and H the printed height.
+"""
 
 import torch
 from pydantic import Field
@@ -13,7 +15,7 @@ _MOST_KNOTS = 33
 
 
 class Identity(Simulator):
-    """H = M, a model without parameters."""
+    """The unchanged layout: H = M. The model has no parameters."""
 
     name = "identity"
 
@@ -26,7 +28,7 @@ class Identity(Simulator):
 
 
 class Affine(Simulator):
-    """H = gain · M + offset."""
+    """A gain and an offset: H = gain · M + offset."""
 
     name = "affine"
     is_linear = True
@@ -52,8 +54,9 @@ class BlurTableConfig(SimulatorConfig):
 
 
 class BlurTable(Simulator):
-    """H = T(G_σ * M), where T interpolates linearly between fitted heights. The heights belong to evenly
-    spaced inputs; there is one input for each level, but there are at most 33.
+    """A blur followed by a fitted table: H = T(G_σ * M), where G_σ is a Gaussian and * a convolution. T
+    interpolates linearly between fitted heights at evenly spaced inputs. There are as many inputs as levels,
+    but at most 33.
     """
 
     name = "blur-table"
@@ -72,7 +75,7 @@ class BlurTable(Simulator):
 
     @property
     def sigma_um(self) -> Tensor:
-        """Return the standard deviation of the blur, between 0 and ``sigma_max_um``."""
+        """Return the standard deviation of the blur, µm, which is between 0 and ``sigma_max_um``."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -91,7 +94,9 @@ class AffineMtfConfig(SimulatorConfig):
 
 
 class AffineMtf(Simulator):
-    """H = offset + Σ_j w_j (G_j * M): the transfer function is Σ_j w_j exp(-2π²σ_j²f²), with gain Σ_j w_j."""
+    """A weighted sum of Gaussian blurs: H = offset + Σ_j w_j (G_j * M). Its transfer function is Σ_j w_j
+    exp(-2π²σ_j²f²), where f is the spatial frequency, and its gain is Σ_j w_j.
+    """
 
     name = "affine-mtf"
     is_linear = True
@@ -120,8 +125,8 @@ class AffineMtf(Simulator):
 def blurred_interior(
     layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Blur a layout and crop ``reach_px`` at each edge. ``sigma_um`` is the width of the blur, or a pair of
-    widths along y and x.
+    """Blur a layout and crop ``reach_px`` pixels at each edge. ``sigma_um`` is the standard deviation of the
+    blur, or a pair of them, along y and along x.
     """
     pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
@@ -141,10 +146,10 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """H = w · φ(M), where φ contains Gaussian blurs, the second to fourth powers of one blur, the squared
-    slopes of this blur, and 1.
+    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs, the second to fourth
+    powers of one blur, the squared slopes of this blur, and 1.
 
-    Slopes along y and x have separate weights, because the two axes of a print may differ.
+    The slopes along y and along x have separate weights, because the two axes of a print may differ.
     """
 
     name = "linear"
@@ -166,7 +171,7 @@ class Linear(Simulator):
         return (self.weights * self.features(layout_um)).sum(dim=-1)
 
     def features(self, layout_um: Tensor) -> Tensor:
-        """Return the features φ(M) of the interior, (b, 1, y, x, features)."""
+        """Return the features φ(M) of the interior, with shape (batch, 1, ny, nx, features)."""
         config, reach = self.config, self.reach_px
         blurs = [blurred_interior(layout_um, sigma, self.pitch_um, reach) for sigma in config.sigmas_um]
         wide = blurred_interior(layout_um, config.power_sigma_um, self.pitch_um, reach - 1)

@@ -1,7 +1,7 @@
-"""Networks whose inputs are fixed features of a field. The features describe either the surroundings of a
-layout pixel, or the height along x.
+"""Networks whose inputs are features with no parameters of their own. The features of a pixel describe either
+the layout around it, or the printed height along x.
 
-The features have no parameters, so these networks are fitted to single pixels
+Because the features never change, they are computed once, and the networks are fitted to single pixels
 (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
 """
 
@@ -18,26 +18,33 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
-# The magnitude of a slope is smoothed below this height change over σ, relative to the highest level (2 nm),
-# so that it has a derivative at 0.
+# Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is
+# the height change over the distance σ, relative to the height of the highest level; the value corresponds to
+# about 2 nm.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
 
 
 class FeatureNetworkConfig(BaseModel):
-    """The features, with all lengths in µm, and the number of hidden units."""
+    """Settings of a feature network: the lengths of its features, µm, and the numbers of its hidden units."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     LENGTHS: ClassVar[tuple[str, ...]] = ("blurs_um", "slope_blurs_um", "shifts_um", "steep_um")
 
-    hidden: tuple[int, ...] = Field((48, 32), min_length=1, max_length=8, description="hidden units")
+    hidden: tuple[int, ...] = Field(
+        (48, 32), min_length=1, max_length=8, description="number of units of each hidden layer"
+    )
     blurs_um: Widths = Field((0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5), description="σ")
     slope_blurs_um: Widths = Field(
-        (0.15, 0.3, 0.6), min_length=1, description="σ of the blurs whose slopes are used"
+        (0.15, 0.3, 0.6), min_length=1, description="σ of the blurs whose slopes are features"
     )
-    shifts_um: Widths = Field((0.2, 0.5, 1.0), min_length=1, description="displacements")
-    steep_um: Widths = Field((0.4, 1.0, 2.0), description="σ of the window for the mean steepness")
+    shifts_um: Widths = Field(
+        (0.2, 0.5, 1.0), min_length=1, description="displacements of the copies that are features"
+    )
+    steep_um: Widths = Field(
+        (0.4, 1.0, 2.0), description="σ of the windows over which the steepness is averaged"
+    )
 
 
 class ScanAxisConfig(FeatureNetworkConfig):
@@ -48,8 +55,9 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 
 class FeatureNetwork(OfField):
-    """A height, µm, computed from the features of each pixel. It is the sum of a linear part and a network.
-    Before training, both are zero.
+    """A network that computes a contribution to the height, µm, from the features of each pixel. The
+    contribution is the sum of a linear part and of a network with hidden layers. Before training, both are
+    zero.
     """
 
     # Whether the network may add a constant height.
@@ -71,7 +79,9 @@ class FeatureNetwork(OfField):
 
     @abstractmethod
     def features(self, field_um: Tensor) -> list[Tensor]:
-        """Compute features (b, 1, y - 2r, x - 2r) of a field (b, 1, y, x), where r is ``reach_px``."""
+        """Compute the features of a field of shape (batch, 1, ny, nx). Each feature is a map of the interior,
+        of shape (batch, 1, ny - 2r, nx - 2r), where r is ``reach_px``.
+        """
 
     @property
     def reach_px(self) -> int:
@@ -81,7 +91,9 @@ class FeatureNetwork(OfField):
         return max(self._radius(*config.blurs_um), slopes, self._steps_px()[-1], steep)
 
     def forward(self, field_um: Tensor) -> Tensor:
-        """Return the network's contribution to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
+        """Return the contribution of the network to the height of the interior, µm. It has shape (batch, 1,
+        ny - 2r, nx - 2r), where r is ``reach_px``.
+        """
         features = self.features(field_um)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
             pixels = (feature.flatten() for feature in features)
@@ -92,10 +104,12 @@ class FeatureNetwork(OfField):
         return self.at_pixels(torch.stack(features))
 
     def at_pixels(self, features: Tensor) -> Tensor:
-        """Compute the contribution to the height, (n,) µm, from features (features, n)."""
+        """Compute the contribution to the height, µm, at n pixels. ``features`` has shape (features, n), and
+        the result has shape (n,).
+        """
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # The standardisation is multiplied into the weights, which saves a pass over the pixels.
+        # The inputs are standardised by changing the weights instead, which saves a pass over the pixels.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
@@ -106,10 +120,12 @@ class FeatureNetwork(OfField):
 
     @abstractmethod
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the slope times σ and the curvature times σ² of a height with a margin of 1 px."""
+        """Return the slope times σ and the curvature times σ². ``height`` must have a margin of 1 px, which
+        the results lack.
+        """
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
-        """Return the local means of the slope's magnitude and of its square around each pixel."""
+        """Return local means, around each pixel, of the magnitude of the slope and of its square."""
         sigma, widths = self.config.slope_blurs_um[0], self.config.steep_um
         margin = self._radius(*widths)
         slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
@@ -118,8 +134,8 @@ class FeatureNetwork(OfField):
 
 
 class Surroundings(FeatureNetwork):
-    """A network on features of the layout near a pixel: blurs, slopes, displaced copies, and mean steepness.
-    The features treat x and y alike.
+    """A network whose inputs are features of the layout near a pixel: blurs, slopes, displaced copies, and
+    the mean steepness. The features treat x and y alike.
     """
 
     def features(self, field_um: Tensor) -> list[Tensor]:
@@ -139,7 +155,7 @@ class Surroundings(FeatureNetwork):
         return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the magnitude of the slope, and the curvature."""
+        """Return the magnitude of the slope times σ, and the curvature times σ²."""
         up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
@@ -148,8 +164,8 @@ class Surroundings(FeatureNetwork):
 
 
 class ScanAxis(FeatureNetwork):
-    """A network on features of a printed height along x, the direction of the microscope's lines: slopes,
-    steps, and mean steepness.
+    """A network whose inputs are features of the printed height along x, the direction of the microscope's
+    lines: slopes, steps, and the mean steepness.
 
     All features are 0 where the print does not change along x, so the network adds nothing there.
     """
@@ -175,14 +191,16 @@ class ScanAxis(FeatureNetwork):
         return found + self._steepness(field)
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
-        """Return the slope and the curvature along x."""
+        """Return the slope along x times σ, and the curvature along x times σ²."""
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
-    """Apply the layer to values (inputs, n), with the pixels last; return (outputs, n)."""
+    """Apply a linear layer to values whose last axis is the pixels. ``values`` has shape (inputs, n), and the
+    result has shape (outputs, n).
+    """
     if layer.bias is None:
         return layer.weight @ values
     return torch.addmm(layer.bias[:, None], layer.weight, values)

@@ -1,4 +1,6 @@
-"""Models that are linear in many features of the layout, such as blurs, slopes and products."""
+"""Models whose height is a weighted sum of many features of the layout, such as blurs, slopes and products of
+these.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,7 +16,8 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
-# The magnitude of a slope is smoothed below this relative height per µm, so that it has a derivative at 0.
+# Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is a
+# height change per µm, relative to the height of the highest level.
 _LEAST_SLOPE = 1e-4
 
 
@@ -27,19 +30,24 @@ class FeaturesConfig(SimulatorConfig):
     sigmas_um: tuple[float, ...] = Field(
         (0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5, 4.0),
         min_length=1,
-        description="blurs, µm; 0 is the layout itself",
+        description="σ of the blurs, µm; 0 stands for the layout itself",
     )
-    slope_sigmas_um: tuple[float, ...] = Field((0.15, 0.3, 0.6), min_length=1, description="µm")
-    shifts_um: tuple[float, ...] = Field((0.2, 0.5, 1.0), min_length=1, description="displacements, µm")
-    shift_sigma_um: float = Field(0.1, gt=0, description="blur of the displaced copies, µm")
-    streak_sigmas_um: tuple[float, ...] = Field((), description="blurs along one axis only, µm")
-    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs whose slopes are averaged, µm")
-    steep_widths_um: tuple[float, ...] = Field((), description="widths of these averages, µm")
+    slope_sigmas_um: tuple[float, ...] = Field(
+        (0.15, 0.3, 0.6), min_length=1, description="σ of the blurs whose slopes are features, µm"
+    )
+    shifts_um: tuple[float, ...] = Field(
+        (0.2, 0.5, 1.0), min_length=1, description="displacements of the copies that are features, µm"
+    )
+    shift_sigma_um: float = Field(0.1, gt=0, description="σ of the blur of the displaced copies, µm")
+    streak_sigmas_um: tuple[float, ...] = Field((), description="σ of the blurs along one axis only, µm")
+    steep_sigmas_um: tuple[float, ...] = Field((), description="σ of the blurs whose slopes are averaged, µm")
+    steep_widths_um: tuple[float, ...] = Field((), description="σ of the windows of these averages, µm")
 
 
 class OfField(nn.Module, ABC):
-    """Methods that all models with features share: blurs, displacements, the reach of these operations, and
-    the scaling of the inputs of a network.
+    """Base class of all models and networks that compute features of a field. It provides blurs and
+    displacements, the receptive radius of these operations, and the standardisation of the inputs of a
+    network.
     """
 
     config: Any
@@ -50,10 +58,10 @@ class OfField(nn.Module, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int:
-        """Return the receptive radius of the features."""
+        """Return the receptive radius of the features, in pixels."""
 
     def _point(self) -> Tensor:
-        """Return a field of the smallest possible size. Its interior is a single pixel."""
+        """Return a field of zeros of the smallest possible size, whose interior is a single pixel."""
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -74,8 +82,9 @@ class OfField(nn.Module, ABC):
         self.register_buffer("scale", torch.ones(count))
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
-        """Set the centre and the scale of the inputs from the inputs ``seen`` in each scan, (inputs, n). The
-        centre is the mean over scans, and the scale is the standard deviation within scans.
+        """Set the centre and the scale with which the inputs are standardised. ``seen`` contains the inputs
+        in each scan, as a tensor of shape (inputs, n). The centre is the mean over all scans, and the scale
+        is the standard deviation within a scan.
         """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
@@ -84,19 +93,20 @@ class OfField(nn.Module, ABC):
 
 
 class Features(OfField, Simulator):
-    """H = w · φ(M), with all heights relative to the highest level.
+    """A weighted sum of features of the layout: H = w · φ(M). For the features, the layout M is divided by
+    the height of the highest level.
 
-    φ contains:
+    The features φ are:
 
-    - blurs, their cubes, and the product of each pair of blurs;
+    - blurs, their cubes, and the products of any two blurs;
     - slopes along y and x at several blurs, with their magnitudes, products and second derivatives;
     - copies of the layout that are displaced to one side, and the magnitudes of the height differences
       between the layout and these copies;
     - blurs along one axis;
     - the steepness of the surroundings along each axis.
 
-    The magnitudes |∂x| and |∂y| are separate features, because the microscope's lines make the two axes
-    differ. ``litho_models.fitting.ridge`` finds the weights in closed form.
+    The magnitudes of the slopes along x and along y are separate features, because the microscope scans in
+    lines along one axis. ``litho_models.fitting.ridge`` finds the weights in closed form.
     """
 
     name = "features"
@@ -127,13 +137,15 @@ class Features(OfField, Simulator):
         return self.weights @ self.completed(torch.stack(features))
 
     def completed(self, features: Tensor) -> Tensor:
-        """Return all features that have a weight, (weights, n), from φ(M) of n pixels."""
+        """Add the features that are computed from φ(M), if the model has such features. ``features`` are φ(M)
+        at n pixels, and the result, of shape (weights, n), has one row for each weight.
+        """
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Return the features φ(M) of the interior in two lists of maps (b, 1, y, x). The first list contains
-        the simple features, such as blurs, slopes and displaced copies. The second list contains products of
-        these features, and 1.
+        """Return the features φ(M) of the interior in two lists. The first list contains the simple features,
+        such as blurs, slopes and displaced copies. The second list contains products of these features, and
+        1. Each feature is a map of shape (batch, 1, ny, nx).
         """
         config = self.config
         layout = layout_um / config.full_height_um
@@ -149,15 +161,15 @@ class Features(OfField, Simulator):
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
-        """Return all features that have a weight, (weights, n), at flat indices of the interior of a layout
-        (1, 1, y, x).
+        """Evaluate every weighted feature at n pixels. ``at`` contains their flat indices in the interior of
+        a layout of shape (1, 1, ny, nx). The result has shape (weights, n).
         """
         simple, products = self.features(layout_um)
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
 
     def _slopes(self, height: Tensor) -> list[Tensor]:
-        """Return the height, its slopes, their magnitudes and the second derivatives, per µm, from a height
-        with a margin of 1 px.
+        """Return the height, its slopes per µm, their magnitudes, and its second derivatives per µm².
+        ``height`` must have a margin of 1 px, which the results lack.
         """
         pitch, inner = self.pitch_um, crop_border(height, 1)
         up, down, left, right = neighbours(height, 1)
@@ -167,8 +179,8 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Return copies displaced to each side, and the magnitudes of the height differences between the
-        field and each copy and between opposite copies.
+        """Return copies of the layout that are displaced to each of the four sides. Also return the
+        magnitudes of the height differences between the layout and each copy, and between opposite copies.
         """
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
@@ -181,13 +193,15 @@ class Features(OfField, Simulator):
         return found
 
     def _streaks(self, layout: Tensor) -> list[Tensor]:
-        """Return blurs that are wide along one axis (y, then x) and one pixel wide along the other."""
+        """Return blurs that are wide along one axis (y, then x) and one pixel wide along the other axis."""
         wide, narrow = self.config.streak_sigmas_um, self.pitch_um
         pairs = [pair for sigma in wide for pair in ((sigma, narrow), (narrow, sigma))]
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
 
     def _steepness(self, layout: Tensor) -> list[Tensor]:
-        """Return local means of |slope| and slope² along y and x; a slope is a height change over σ."""
+        """Return local means of the magnitude and of the square of the slope along y and along x. A slope
+        here is the height change over the distance σ.
+        """
         widths, found = self.config.steep_widths_um, []
         margin = self._radius(*widths)
         for sigma in self.config.steep_sigmas_um:
@@ -210,11 +224,11 @@ class RandomFeaturesConfig(FeaturesConfig):
 
 
 class RandomFeatures(Features):
-    """``Features`` plus tanh(V z + c), where z are the standardised simple features; V and c are random and
-    fixed.
+    """The model ``Features`` with additional features tanh(V z + c), where z are the standardised simple
+    features. V and c are random and not fitted.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
-    learn more than products of two features and is still fitted in closed form.
+    represent more than products of two features, and its weights are still found in closed form.
     """
 
     name = "random-features"
@@ -240,8 +254,8 @@ class RandomFeatures(Features):
 
 
 def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the neighbours at distance ``step`` above, below, left and right of all pixels that are at least
-    ``step`` from the edge.
+    """Return four fields: the values ``step`` pixels above, below, left and right of each pixel that is at
+    least ``step`` pixels from the edge.
     """
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]

@@ -1,10 +1,10 @@
-"""FNO: the Fourier neural operator, the paper's learned simulator that contains no physics.
+"""FNO: the Fourier neural operator, which is the learned simulator of the paper that contains no physics.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
 24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of a local
-convolution and a product in Fourier space, which acts on the whole image. The operator treats the image as
-periodic. A mode is defined by its number of periods per image, so the result depends on the image size. The
-variant ``default`` therefore runs the operator on tiles of one size.
+convolution and of a product in Fourier space, which acts on the whole layout. The operator treats the layout
+as periodic. A mode is defined by its number of periods per layout, so the result depends on the size of the
+layout. The variant ``default`` therefore applies the operator to tiles of one size.
 """
 
 import math
@@ -19,29 +19,35 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Largest number of weights that a card may request: ninety times the number in the paper, 0.5 GB.
+# Limit of the number of Fourier weights, so that a card cannot request too much memory. It is ninety times
+# the number in the paper.
 _MOST_MATRIX_ENTRIES = 30_000_000
 
 
 class FnoConfig(SimulatorConfig):
     layers: int = Field(4, ge=1, le=64)
-    # Frequencies kept along y (both signs) and x.
+    # Number of frequencies that are kept along y (for each sign) and along x.
     modes: tuple[PositiveInt, PositiveInt] = (12, 12)
-    width: int = Field(24, ge=1, le=1024, description="channels of the layers")
-    projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
-    # The paper uses 1 x 1. Detail finer than the kept modes is then mapped only pixel by pixel.
-    local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
-    coordinates: bool = Field(False, description="use y and x, scaled to 0 ... 1, as further inputs")
+    width: int = Field(24, ge=1, le=1024, description="number of channels of each layer")
+    projection_channels: int = Field(
+        128, ge=1, le=4096, description="number of hidden channels between the last two layers"
+    )
+    # The paper uses 1 x 1. Then detail finer than the kept modes is mapped only pixel by pixel.
+    local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, px; must be odd")
+    coordinates: bool = Field(False, description="whether y and x, scaled to 0 ... 1, are further inputs")
     padding_fraction: float = Field(
-        0.0, ge=0, le=1, description="width of the zeros added at the bottom and right, relative to the size"
+        0.0,
+        ge=0,
+        le=1,
+        description="width of the zeros added at the bottom and right, relative to the size of the layout",
     )
     padding_px: int = Field(
-        0, ge=0, le=4096, description="width of the zeros added at the bottom and right of every image"
+        0, ge=0, le=4096, description="width of the zeros added at the bottom and right of the layout, px"
     )
-    tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
-    overlap_px: int = Field(32, ge=0, description="overlap of blended tiles, at most half a tile")
-    # Before training, the network returns the layout; it learns the difference. The paper's network starts
-    # with random weights.
+    tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile, px; None: no tiles")
+    overlap_px: int = Field(32, ge=0, description="overlap of neighbouring tiles, px; at most half a tile")
+    # If True, the network returns the layout before training and learns the difference. The network in the
+    # paper starts with random weights.
     starts_as_layout: bool = True
 
     _PUBLISHED: ClassVar[dict[str, Any]] = {
@@ -66,13 +72,13 @@ class FnoConfig(SimulatorConfig):
 
 
 class Fno(Simulator):
-    """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), but without gelu in the last
-    layer.
+    """The Fourier neural operator: H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))), where M is the layout and H the printed
+    height. A layer is L(v) = gelu(local(v) + spectral(v)), but the last layer has no gelu.
 
-    P lifts each pixel to ``width`` channels, and Q maps them to a height through one hidden layer. With
-    ``starts_as_layout``, this height is added to M, and it is zero before training. If the config has a tile,
-    ``interior`` returns the height of one tile, which is treated as periodic. The height of the whole field
-    is then blended from tiles.
+    P maps each pixel to ``width`` channels, and Q maps the channels to a height through one hidden layer.
+    With ``starts_as_layout``, this height is added to M and is zero before training. If the configuration has
+    a tile size, ``interior`` returns the height of one tile, which is treated as periodic. The heights of the
+    tiles are then blended to the height of the whole layout.
     """
 
     name = "fno"
@@ -102,11 +108,13 @@ class Fno(Simulator):
         return None if size is None else Tile(size, self.config.overlap_px)
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Return the height of a whole image, (batch, 1, y, x) µm, with the size of the image."""
+        """Return the height of a whole layout or of one tile, µm. Layout and height have shape (batch, 1, ny,
+        nx).
+        """
         config = self.config
         ny, nx = layout_um.shape[-2:]
-        # Heights need full precision at the input and the output, even under autocast. Channels are the last
-        # axis, so that products over channels are matrix products.
+        # The input and the output are heights and need the precision of float32, even under autocast.
+        # Channels are the last axis, so that sums over channels are matrix products.
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
             features = _pointwise(self.lift, inputs.permute(0, 2, 3, 1))
@@ -123,13 +131,13 @@ class Fno(Simulator):
         return layout_um + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
-        """Apply the last layers, which map features (n, width) to a height (n,)."""
+        """Apply the last two layers. They map features of shape (n, width) to a height of shape (n,)."""
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole layout, µm. Layout and height have shape (batch, 1, ny, nx)."""
         return self.inside(layout_um, 0)
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
@@ -139,7 +147,7 @@ class Fno(Simulator):
 
 
 class PeriodicConvolution(nn.Conv2d):
-    """A convolution of a periodic image (b, y, x, channels) that keeps its shape."""
+    """A convolution of a periodic field that keeps its size. Fields have shape (batch, ny, nx, channels)."""
 
     def forward(self, features: Tensor) -> Tensor:
         if margin := self.kernel_size[0] // 2:
@@ -149,11 +157,12 @@ class PeriodicConvolution(nn.Conv2d):
 
 
 class SpectralConvolution(nn.Module):
-    """A product v̂'(k) = W(k) v̂(k) with a matrix over channels at each of the lowest frequencies; other
-    frequencies are set to zero.
+    """A convolution that is computed in Fourier space. At each of the lowest frequencies k, the vector of
+    channels v̂(k) is multiplied by a matrix W(k). All other frequencies are set to zero.
 
-    The weights are real, with shape (sign of k_y, in, out, modes y, modes x, real and imaginary part), so
-    that they can be stored and cast like any other parameter.
+    The weights are stored as real numbers, so that they can be saved and converted like any other parameter.
+    Their shape is (2, channels in, channels out, modes along y, modes along x, 2). The first axis is the sign
+    of k_y, and the last axis is the real and imaginary part.
     """
 
     def __init__(self, channels: int, modes: tuple[int, int]):
@@ -161,10 +170,10 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field (b, y, x, channels). A small image, which has fewer frequencies than there are
-        modes, uses only some modes.
+        """Convolve a field of shape (batch, ny, nx, channels). A small field, which has fewer frequencies
+        than there are modes, uses only some of the modes.
 
-        Only a few frequencies are kept, so products with their waves are cheaper than fast Fourier
+        Only a few frequencies are kept. Products with their waves are therefore cheaper than fast Fourier
         transforms.
         """
         ny, nx = field.shape[1:3]
@@ -180,27 +189,32 @@ class SpectralConvolution(nn.Module):
             along_x = torch.complex(*(parts_x @ field).chunk(2, dim=2))
             spectra = (waves_y.conj() @ along_x.flatten(2)).unflatten(2, (kept_x, -1))
             mixed = torch.einsum("byxi,ioyx->byxo", spectra, matrices)
-            # Each frequency along x also stands for its negative, unless the two are equal.
+            # Each frequency along x also represents its negative, unless the two are equal.
             shares = (1 + (2 * k_x % nx).sign()).to(field)[:, None] / (ny * nx)
             lines = (waves_y.T @ (shares * mixed).flatten(2)).unflatten(2, (kept_x, -1))
             return parts_x.T @ torch.cat([lines.real, lines.imag], dim=2)
 
 
 def _waves(frequencies: Tensor, size: int, like: Tensor) -> Tensor:
-    """Return exp(2πi k n / N), (frequencies, N), with the precision and on the device of ``like``."""
-    # Whole numbers are reduced to one period first, so the angles stay exact at any size.
+    """Return the waves exp(2πi k n / N) for the given frequencies k and the pixels n = 0 … N - 1, where N is
+    ``size``. The result has shape (frequencies, N) and the precision and device of ``like``.
+    """
+    # The products k n are whole numbers. They are reduced to one period first, so the angles stay exact at
+    # any size.
     turns = torch.outer(frequencies, torch.arange(size)) % size
     angle = (2 * math.pi / size) * turns.double()
     return torch.complex(angle.cos().to(like), angle.sin().to(like))
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
-    """Apply a 1 x 1 convolution to features whose channels are the last axis."""
+    """Apply a 1 x 1 convolution to features. Their last axis is the channels."""
     return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
 
 
 def _coordinates(layout: Tensor) -> Tensor:
-    """Return the coordinates y and x of each pixel on 0 ... 1, (batch, 2, y, x)."""
+    """Return the coordinates y and x of each pixel, scaled to 0 ... 1. The result has shape (batch, 2, ny,
+    nx).
+    """
     y, x = (
         torch.linspace(0, 1, size, device=layout.device, dtype=layout.dtype) for size in layout.shape[-2:]
     )

@@ -1,9 +1,10 @@
-"""Compute partially coherent images as a sum of coherent systems (SOCS).
+"""Compute the partially coherent image of a mask as a sum of coherent systems (SOCS).
 
-Hopkins' image is I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi (f₁ - f₂) x), with the transmission cross
-coefficients C(f₁, f₂) = Σ_s P(f₁ + s) P*(f₂ + s) over the points s of the source (Proc. R. Soc. A 217, 408
-(1953)). C is A⁺A with A(s, f) = P(s + f), so the singular vectors of A are the kernels, and I = Σ_k |h_k *
-t|² (Cobb, PhD thesis, Berkeley 1998).
+In Hopkins' theory (Proc. R. Soc. A 217, 408 (1953)), the intensity is I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi
+(f₁ - f₂) x), where T is the spectrum of the mask t. The transmission cross coefficients are C(f₁, f₂) = Σ_s
+P(f₁ + s) P*(f₂ + s), a sum over the points s of the source, where P is the pupil. C is the matrix A⁺A with
+A(s, f) = P(s + f). The right singular vectors of A, times the singular values, are therefore kernels h_k with
+I = Σ_k |h_k * t|² (Cobb, PhD thesis, Berkeley 1998).
 """
 
 from __future__ import annotations
@@ -21,22 +22,22 @@ from torch.nn import functional
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 
-# Radius in units of λ / NA at which a kernel is cut off.
+# Radius at which a kernel is cut off, in units of λ / NA.
 _REACH = 4.0
-# Number of sample points along each side of a frequency cell, for estimating the share of the cell that the
-# source fills. The number is odd, so one point is at the centre.
+# Number of sample points along each side of a frequency cell. They are used to estimate the share of the cell
+# that the source fills. The number is odd, so one point is at the centre.
 _COUNTED = 9
 
 
 class Optics(NamedTuple):
-    """A projection lens and its light.
+    """A projection lens and its illumination.
 
     Attributes:
-        wavelength_um, na: wavelength, and numerical aperture on the image side.
-        outer, inner: radii of a round or ring-shaped source, relative to the pupil; with both 0, the source
-            is a point.
-        defocus_um: distance of the resist from the focus.
-        kernels: number of kernels that are used, the strongest first.
+        wavelength_um, na: wavelength, µm, and numerical aperture on the image side.
+        outer, inner: outer and inner radius of a round or ring-shaped source, relative to the radius of the
+            pupil. If both are 0, the source is a point.
+        defocus_um: distance of the resist from the focus, µm.
+        kernels: number of kernels that are used. They are the strongest ones.
     """
 
     wavelength_um: float
@@ -48,13 +49,13 @@ class Optics(NamedTuple):
 
 
 def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
-    """Return the number of pixels that a kernel reaches to each side."""
+    """Return the radius of a kernel in pixels."""
     return max(1, math.ceil(_REACH * optics.wavelength_um / optics.na / pitch_um))
 
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
-    """Return the intensity of the image of a mask (b, 1, y, x), relative to an open mask. A border as wide as
-    the kernels' reach is cropped.
+    """Return the intensity of the image of a mask, relative to that of an open mask. The mask has shape
+    (batch, 1, ny, nx). The result lacks a border as wide as the radius of the kernels.
     """
     reach = kernel_reach_px(optics, pitch_um)
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
@@ -62,31 +63,34 @@ def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
 
 
 def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tensor:
-    """Image a mask that is not periodic; return the intensity without the outermost ``reach_px``."""
-    # Fourier transforms spread rounding errors over the field. In double precision, tiles give the same
-    # result as the whole field.
+    """Return the intensity of the image of a mask that is not periodic, without the outermost ``reach_px``
+    pixels.
+    """
+    # Fourier transforms spread rounding errors over the whole field. In double precision these are so small
+    # that tiles give the same result as the whole field.
     image = imaged(transmission.double(), spectra.to(transmission.device))
     return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
 
 def imaged(transmission: Tensor, spectra: Tensor) -> Tensor:
-    """Return Σ_k |h_k * t|² of a periodic mask (b, 1, y, x), with transfer functions (k, y, x) of the
-    kernels.
+    """Return the intensity Σ_k |h_k * t|² of the image of a periodic mask t. The mask has shape (batch, 1,
+    ny, nx). ``spectra`` contains the transfer functions of the kernels h_k, with shape (kernels, ny, nx).
 
-    The mask is transformed once; the inverse transforms run in one batch over all kernels.
+    The mask is transformed once, and the inverse transforms for all kernels are computed in one batch.
     """
     amplitudes = torch.fft.ifft2(torch.fft.fft2(transmission) * spectra)
     return (amplitudes.real**2 + amplitudes.imag**2).sum(dim=1, keepdim=True)
 
 
 def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) -> Array:
-    """Return the kernels of a periodic field (ny, nx) as transfer functions (k, ny, nx), complex.
+    """Return the complex transfer functions of the kernels of a lens, for a periodic field of shape (ny, nx).
+    The result has shape (kernels, ny, nx).
 
-    Source points lie on the grid of the field's frequencies, and each is weighted by the filled share of its
-    cell.
+    The points of the source lie on the grid of the field's frequencies. The weight of a point is the share of
+    its grid cell that the source fills.
 
     Raises:
-        InputError: a ring too thin to fill any cell.
+        InputError: the source is a ring too thin to fill any cell.
     """
     fy, fx = (np.fft.fftfreq(n, pitch_um) for n in shape)
     y, x = (one.ravel() for one in np.meshgrid(fy, fx, indexing="ij"))
@@ -97,7 +101,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
         raise InputError(
             "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
         )
-    # All kernels are 0 at frequencies that no source point brings into the pupil.
+    # All kernels are 0 at frequencies that no point of the source shifts into the pupil.
     reach = 1 + np.hypot(y[source], x[source]).max() / cutoff
     bright = np.flatnonzero(np.hypot(y, x) / cutoff <= reach + 1e-9)
     shifted = y[source, None] + y[bright], x[source, None] + x[bright]
@@ -111,8 +115,8 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
 
 
 def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
-    """Return the share of each cell (y, x) that the source fills; each cell is centred on a frequency,
-    relative to the pupil.
+    """Return the share of each frequency cell that the source fills. ``y`` and ``x`` are the centres of the
+    cells and ``cell`` is their size, all relative to the radius of the pupil.
     """
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
@@ -124,7 +128,9 @@ def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
 
 
 def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
-    """Return the amplitude that passes through the pupil, with the phase of the defocus."""
+    """Return the complex amplitude that passes through the pupil at each frequency. Its phase is that of the
+    defocus.
+    """
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)
     along = np.sqrt(np.where(inside, 1 - squared, 1.0)) - 1
@@ -133,19 +139,23 @@ def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
 
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
-    """Return the spectra (``spectra_of``) of a lens's kernels, cropped to ``size_px``."""
+    """Crop the kernels of a lens to ``size_px`` pixels, and return their transfer functions on a field of
+    shape (ny, nx), as ``spectra_of`` does.
+    """
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
     return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)
 
 
 def spectra_of(kernels: np.ndarray, ny: int, nx: int) -> Tensor:
-    """Return the transfer functions (k, ny, nx) of kernels (k, size, size) around their middle pixel."""
+    """Return the transfer functions of kernels on a field of shape (ny, nx). The kernels have shape (kernels,
+    size, size), and their middle pixel is the origin. The result has shape (kernels, ny, nx).
+    """
     size_px = kernels.shape[-1]
     reach = size_px // 2
     placed = np.zeros((len(kernels), ny, nx), np.complex128)
     placed[:, :size_px, :size_px] = kernels
     placed = np.roll(placed, (-reach, -reach), axis=(-2, -1))
-    # An open mask has intensity 1 for any number of kernels.
+    # The kernels are scaled so that an open mask has intensity 1, whatever their number.
     spectra = np.fft.fft2(placed)
     spectra /= np.sqrt(np.sum(np.abs(spectra[:, 0, 0]) ** 2))
     return torch.from_numpy(spectra)

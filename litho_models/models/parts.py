@@ -1,7 +1,8 @@
-"""Define the parts of a printer: functions that turn one field into the next, each with parameters and the
-source of its formula.
+"""Parts from which modular models of printers are assembled. A part is a function that turns one field, such
+as a dose, into the next, with its parameters and the source of its formula.
 
-Fields are (batch, 1, y, x), relative to a full dose or height. A part may crop the field by its reach.
+Fields have shape (batch, 1, ny, nx) and are relative to the full dose or the full height. A part may crop the
+field by its receptive radius.
 """
 
 import math
@@ -23,13 +24,13 @@ from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
-# There is no edge where the resist changes by less than this between neighbouring pixels.
+# Where the resist changes by less than this between neighbouring pixels, there is no edge.
 FLATTEST = 5e-3
-# The upper limit of a length is this multiple of its starting value.
+# By default, the upper limit of a length is this multiple of its starting value.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
-# Fitted values are tensors; other values are plain numbers.
+# The values of a part's parameters by name. Fitted values are tensors; other values are Python numbers.
 Values = Mapping[str, Any]
 Apply = Callable[[Tensor, Values, float], Tensor]
 
@@ -39,9 +40,10 @@ class Number:
     """One parameter of a part.
 
     Attributes:
-        start: starting value; ``unit``: its unit, ``1`` if it has none.
-        lower, upper: its range; by default the upper limit of a length is five times its start.
-        fitted: whether a fit changes the parameter.
+        start: starting value; ``unit``: unit of the parameter, or ``1`` if it has none.
+        lower, upper: range of the parameter. If ``upper`` is None, the upper limit of a length is five times
+            its starting value, and other parameters have none.
+        fitted: whether the parameter is fitted; otherwise it keeps its value.
     """
 
     start: float
@@ -51,18 +53,19 @@ class Number:
     fitted: bool = True
 
     def range_at(self, name: str, start: float) -> Range:
-        """Return the range of a fit that begins at ``start``."""
+        """Return the range of the parameter in a fit that begins at ``start``."""
         upper = self.upper if self.upper is not None else _WIDEST * start if self.unit == "µm" else math.inf
         return Range(name, self.lower, upper)
 
 
 @dataclass(frozen=True)
 class Part:
-    """A stage of a printer.
+    """A part of a printer, which is one stage of its process.
 
     Attributes:
-        numbers: the parameters by name (see ``Number``); ``source``: reference for the formula.
-        apply: maps field, values and pitch (µm) to the next field, cropped by ``reach_px(values, pitch)``.
+        numbers: parameters of the part by name; ``source``: reference for the formula.
+        apply: function with the arguments (field, values of the parameters, pitch in µm). It returns the next
+            field.
     """
 
     name: str
@@ -73,24 +76,25 @@ class Part:
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
-    """Return the number of pixels that a Gaussian spot reaches to each side."""
-    # Float32 rounds a width, and this rounding must not change the size of the kernel.
+    """Return the radius of a Gaussian spot in pixels."""
+    # The width is rounded, because the rounding errors of float32 must not change the size of the kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
 
 def illuminate(
     pattern: Tensor, spots: Sequence[tuple[Tensor | float, Tensor]], pitch_um: float, reach_px: int
 ) -> Tensor:
-    """Expose a pattern with a spot that is a sum of Gaussians, Σ share · G_sigma; the result is cropped by
-    ``reach_px``.
+    """Expose a pattern with a spot that is a sum of Gaussians: Σ share · G_sigma. Return the dose, cropped by
+    ``reach_px`` pixels on each side.
 
     One Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered electrons
-    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third has a width between those two.
+    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third Gaussian may be added, with a width between these
+    two.
 
     Args:
-        pattern: written pattern, at ``pitch_um``; ``spots``: share and standard deviation (µm) of each
-            Gaussian.
-        reach_px: at least the widest reach of the spots.
+        pattern: pattern to write, with the pixel pitch ``pitch_um``, µm; ``spots``: share and standard
+            deviation (µm) of each Gaussian.
+        reach_px: width of the cropped border; at least the radius of the widest Gaussian.
     """
     total = torch.zeros(())
     for share, sigma_um in spots:
@@ -101,8 +105,8 @@ def illuminate(
 
 
 def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
-    """Apply a smoothed threshold of the resist, which maps 0 to 0 and 1 to 1 (Wang et al. 2011,
-    doi:10.1007/s00158-010-0602-y).
+    """Apply the response of a resist with a smooth threshold to the exposure. The response maps 0 to 0 and 1
+    to 1 (Wang et al. 2011, doi:10.1007/s00158-010-0602-y).
     """
     low = torch.tanh(steepness * threshold)
     return (low + torch.tanh(steepness * (exposure - threshold))) / (
@@ -111,28 +115,28 @@ def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
 
 
 def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
-    """Return the share of resist that a dose converts, E^γ / (E^γ + η^γ), with contrast γ; it is one half at
-    the threshold η.
+    """Return the share of the resist that a dose E converts: E^γ / (E^γ + η^γ), where γ is the contrast and η
+    the threshold. At the threshold, one half is converted.
     """
     turned = exposure.clamp(min=1e-6) ** contrast
     return turned / (turned + threshold**contrast)
 
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
-    """Return the developed share of the depth, 1 + γ log₁₀(E / E₀), limited to 0 ... 1 with rounded
-    corners.
+    """Return the share of the depth to which a dose E is developed: 1 + γ log₁₀(E / E₀), where γ is the
+    contrast and E₀ the clearing dose. The share is limited to 0 ... 1, with rounded corners.
     """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
     return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Return the coverage of a film that remains where the resist exceeds the threshold; the result is
-    cropped by one pixel.
+    """Return the coverage of each pixel by an etched film, which remains where the resist exceeds the
+    threshold. The result is cropped by one pixel on each side.
 
-    The edge lies where the resist crosses the threshold, moved outward by the bias. A pixel that the edge
-    crosses is partly covered. The coverage is a sigmoid, one pixel wide, of the distance (resist - threshold)
-    / |∇ resist| + bias.
+    The edge of the film lies where the resist crosses the threshold, moved outward by the bias. A pixel that
+    the edge crosses is partly covered. The coverage is a sigmoid, about one pixel wide, of the distance from
+    the edge, which is (resist - threshold) / |∇ resist| + bias.
     """
     slope_y = (resist[..., 2:, 1:-1] - resist[..., :-2, 1:-1]) / 2
     slope_x = (resist[..., 1:-1, 2:] - resist[..., 1:-1, :-2]) / 2
@@ -141,7 +145,7 @@ def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pit
 
 
 def _spots(values: Values) -> list[tuple[Tensor | float, Tensor]]:
-    """Return the share and width of each Gaussian of a spot with one to three Gaussians."""
+    """Return the share and the standard deviation, µm, of each of the one to three Gaussians of a spot."""
     back, between = values.get("back_share", 0.0), values.get("between_share", 0.0)
     shares = {"sigma_um": (1 - back) * (1 - between), "back_um": back, "between_um": (1 - back) * between}
     return [(share, values[name]) for name, share in shares.items() if name in values]
@@ -171,13 +175,13 @@ def _shrink(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
 
 
 def kernels_part(name: str, file: str | Path) -> Part:
-    """Make a part for illumination by the coherent kernels in an NPY file: Σ_k |h_k * M|², which is 1 for an
-    open mask.
+    """Make a part that images a mask M with coherent kernels h_k from an NPY file. The intensity Σ_k |h_k *
+    M|² is scaled to 1 for an open mask.
 
     Args:
         name: name of the part.
-        file: real or complex array (k, size, size) at the layout's pitch; the size is odd and the middle
-            pixel is the origin.
+        file: NPY file with a real or complex array of shape (kernels, size, size), sampled at the pitch of
+            the layout. The size is odd, and the middle pixel is the origin.
 
     Raises:
         InputError: the file does not exist, or its array has another shape or type.
@@ -188,7 +192,11 @@ def kernels_part(name: str, file: str | Path) -> Part:
         odd = kernels.ndim == 3 and kernels.shape[1] == size_px and size_px % 2
         if not odd or not np.isfinite(kernels).all():
             got = f"{kernels.dtype} {kernels.shape}"
-            raise InputError(f"kernels {file}", got=got, wanted="finite numbers (k, size, size), size odd")
+            raise InputError(
+                f"kernels {file}",
+                got=got,
+                wanted="finite numbers of shape (kernels, size, size), with an odd size",
+            )
     spectra = lru_cache(maxsize=2)(partial(spectra_of, kernels))
 
     def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
@@ -240,13 +248,14 @@ PARTS = {
             "hill",
             _CONTRAST,
             lambda dose, values, pitch: hill(dose, values["contrast"], values["threshold"]),
-            "share that a dose converts: one half at the threshold",
+            "Hill curve: the share of resist that a dose converts, one half at the threshold",
         ),
         Part(
             "contrast-curve",
             {"contrast": Number(1.5), "clearing": Number(0.9, upper=3.0)},
             lambda dose, values, pitch: contrast_curve(dose, values["contrast"], values["clearing"]),
-            "depth by the logarithm of the dose: Mack, Fundamental Principles of Optical Lithography, 2007",
+            "depth proportional to the logarithm of the dose: Mack, Fundamental Principles of Optical "
+            "Lithography, 2007",
         ),
         Part(
             "inverted",
@@ -265,31 +274,32 @@ PARTS = {
             "shrinkage",
             {"sigma_um": Number(1.5, "µm"), "kappa_min": Number(0.5, upper=1.0)},
             _shrink,
-            "the height is lower where less is exposed nearby: arXiv:2309.17343, parameterized physics model",
+            "the resist shrinks more where less is exposed nearby: arXiv:2309.17343, parameterized physics "
+            "model",
             lambda values, pitch: spot_radius_px(values["sigma_um"], pitch),
         ),
         Part(
             "etch",
             {**_THRESHOLD, "bias_px": Number(0.0, "px", -_BIAS_PX, _BIAS_PX)},
             lambda resist, values, pitch: etch(resist, values["threshold"], values["bias_px"], 1.0),
-            "a film remains under the resist, with its edge moved by a bias",
+            "the film remains under the resist, and its edge is moved by a bias",
             lambda values, pitch: 1,
         ),
         Part(
             "transfer",
             {"selectivity": Number(1.0)},
             lambda resist, values, pitch: values["selectivity"] * resist,
-            "directional etching: the relief is proportional to that of the resist",
+            "directional etching: the etched relief is proportional to the relief of the resist",
         ),
     )
 }
 
 
 def register_part(part: Part) -> Part:
-    """Register a part, so that printers in this process can name it in their ``parts``.
+    """Register a part, so that models in this process can use its name in their ``parts``.
 
     Raises:
-        InputError: a name that is taken.
+        InputError: the name of the part is already taken.
     """
     if part.name in PARTS:
         raise InputError("part to register", got=part.name, wanted="a name that is not taken")

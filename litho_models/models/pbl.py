@@ -1,12 +1,13 @@
-"""PBL: physics-based learning, the paper's simulator, with networks for the unknown steps of the process.
+"""PBL: physics-based learning. This is the main simulator of the paper, which has networks for the unknown
+steps of the process.
 
 PBL is a chain of five steps:
 
 - an optical blur of fixed width;
-- a pointwise network for the exposure threshold;
+- a pointwise network for the threshold of the exposure;
 - a diffusion blur of learned width;
 - a pointwise network for the shrinkage;
-- an areawise network for everything else.
+- an areawise network (a stack of small convolutions) for everything else.
 
 See arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL model".
 """
@@ -49,31 +50,46 @@ class PblConfig(SimulatorConfig):
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     illumination: str | None = Field(
-        None, description="part of a printer that replaces this spot, such as lens"
+        None, description="name of a part of a printer that replaces this spot, such as lens"
     )
-    numbers: dict[str, float] = Field({}, description="values that replace those of the illumination")
-    sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
-    # The blur starts wider than the reach of the areawise network (0.5 µm), because no other part can learn
-    # influences at such distances.
-    sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
+    numbers: dict[str, float] = Field(
+        {}, description="values of parameters of this part that replace its defaults"
+    )
+    sigma_diffusion_max_um: float = Field(
+        2.5, gt=0, description="upper bound η of the diffusion, standard deviation, µm"
+    )
+    # The diffusion blur starts wider than the radius of the areawise network (0.5 µm), because no other step
+    # of the chain can learn influences at larger distances.
+    sigma_diffusion_init_um: float = Field(
+        1.5, gt=0, description="diffusion before training, standard deviation, µm"
+    )
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
-    # Before training, the model returns the optically blurred layout; it learns the difference. The paper's
-    # networks start with random weights.
+    # If True, the model returns the optically blurred layout before training and learns the difference. The
+    # networks in the paper start with random weights.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
-    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
-    blur_modulus: bool = Field(False, description="absolute value after the diffusion blur")
+    kernel_cap_px: int | None = Field(
+        None, ge=1, description="limit of the kernel radius, px; None: no limit"
+    )
+    blur_modulus: bool = Field(
+        False, description="whether the absolute value is taken after the diffusion blur"
+    )
     edge: Edge = "replicate"
     knots: int = Field(
-        1025, ge=0, le=1_000_000, description="interpolation points of a pointwise network; 0: none"
+        1025,
+        ge=0,
+        le=1_000_000,
+        description="number of points between which a pointwise network is interpolated; 0: no interpolation",
     )
 
     # The next three fields are not in the paper.
-    transposable: bool = Field(False, description="network on areas (areawise) that treats x and y alike")
+    transposable: bool = Field(False, description="whether the areawise network treats x and y alike")
     surroundings: FeatureNetworkConfig | None = None
-    scan_axis: ScanAxisConfig | None = Field(None, description="network for effects along scan lines")
+    scan_axis: ScanAxisConfig | None = Field(
+        None, description="settings of a network for effects along the lines of a scan"
+    )
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
         "default": {
@@ -96,8 +112,8 @@ class PblConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the config of a variant as for other models; the lengths of the feature networks are scaled
-        too.
+        """Make the configuration of a variant, as for other models. The lengths of the feature networks are
+        also scaled to the pitch.
         """
         config = super().of_variant(variant, **fields)
         parts = {"surroundings": config.surroundings, "scan_axis": config.scan_axis}
@@ -110,12 +126,12 @@ class PblConfig(SimulatorConfig):
 
     @property
     def exposing(self) -> Part:
-        """Return the illumination: the spot, or the part that replaces it."""
+        """Return the part for the illumination: the Gaussian spot, or the part that replaces it."""
         return part_of(self.illumination or "spot")
 
     @property
     def exposing_values(self) -> dict[str, float]:
-        """Return the values of the illumination by name."""
+        """Return the values of this part's parameters by name."""
         return {name: self.numbers.get(name, own.start) for name, own in self.exposing.numbers.items()}
 
     @model_validator(mode="after")
@@ -132,15 +148,17 @@ class PblConfig(SimulatorConfig):
 
 
 class Pbl(Simulator):
-    """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
+    """The PBL model: H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical). M is the
+    layout, H the printed height, and all heights are in µm.
 
-    With ``starts_as_blur``, the three networks learn a difference: g_thresh(I) = I + net(I), g_shrink = 1 +
-    net, g_mismatch(H) = H + net(H). The last layers of these networks are zero before training.
+    With ``starts_as_blur``, each of the three networks learns a difference: g_thresh(I) = I + net(I),
+    g_shrink = 1 + net, g_mismatch(H) = H + net(H). The last layers of these networks are zero before
+    training.
 
-    The default adds two networks on fixed features to this chain. ``surroundings`` describes the influence of
-    the layout within some micrometres, equally along x and y. ``scan_axis`` describes the influence of the
-    height along x on the measured map. It is fitted together with the chain, so that the chain does not learn
-    this influence, and ``printer()`` leaves it out.
+    The variant ``default`` adds two feature networks to this chain. ``surroundings`` describes the influence
+    of the layout within some micrometres, which is the same along x and y. ``scan_axis`` describes how the
+    height along x influences the measured height. It is part of the fit so that the other networks do not
+    learn this influence; ``printer()`` leaves it out.
     """
 
     name = "pbl"
@@ -164,18 +182,20 @@ class Pbl(Simulator):
 
     @property
     def feature_networks(self) -> list[FeatureNetwork]:
-        """Return the model's feature networks, in the order of ``feature_fields``."""
+        """Return the feature networks of the model. They have the order of the fields that ``feature_fields``
+        returns.
+        """
         return [network for network in (self.surroundings, self.scan_axis) if network is not None]
 
     def printer(self) -> Pbl:
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """Return the model without its feature networks: the paper's chain alone."""
+        """Return the model without its feature networks. What remains is the chain of the paper."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
-        """Replace the weights of the chain by those of another chain."""
+        """Replace the weights of this model's chain by those of the given chain."""
         self.load_state_dict(self.state_dict() | chain.state_dict())
 
     def _without(self, *parts: str) -> Pbl:
@@ -190,7 +210,7 @@ class Pbl(Simulator):
 
     @property
     def sigma_diffusion_um(self) -> Tensor:
-        """Return the diffusion length η / (1 + exp(-τ)), µm."""
+        """Return the standard deviation of the diffusion blur, η / (1 + exp(-τ)), µm."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -209,8 +229,8 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the height of the interior after the chain, and the input field of each feature network,
-        µm.
+        """Return the height of the interior that the chain predicts, and the field that is the input of each
+        feature network. All are in µm.
         """
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
         printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
@@ -219,12 +239,12 @@ class Pbl(Simulator):
         return crop_border(printed, along), layouts if self.scan_axis is None else [*layouts, printed]
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole layout, µm. Layout and height have shape (batch, 1, ny, nx)."""
         return self._chain(layout_um, "zero") if self.config.edge == "zero" else super().forward(layout_um)
 
     def _chain(self, layout_um: Tensor, edge: Edge | None = None) -> Tensor:
-        """Apply the paper's chain to a field padded by ``edge``, or only to the field's interior if ``edge``
-        is None.
+        """Apply the chain of the paper. If ``edge`` is None, return the height of the interior only.
+        Otherwise pad the layout by the rule ``edge`` and return the height of the whole layout.
         """
         optical, diffusion = self._radii_px()
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
@@ -267,8 +287,8 @@ class Pbl(Simulator):
         return height + (product if padding else crop_border(product, self.mismatch.reach_px))
 
     def _shrink_by_table(self, dose: Tensor) -> Tensor:
-        # A blur averages, so the dose stays in the range of its input. The range of the threshold network is
-        # that of its values at the knots, whatever the image.
+        # A blur averages, so the dose stays in the range of the blur's input, which is the output of the
+        # threshold network. The range of this output is that of its values at the knots, whatever the layout.
         full = self.config.full_height_um
         knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
         reachable = self.thresh.at_knots(0.0, full).detach()
@@ -284,8 +304,8 @@ class Pbl(Simulator):
 
 
 class AreawiseNet(nn.Module):
-    """A stack of 3 x 3 convolutions, 1 -> channels -> 1, with a leaky ReLU after every convolution except the
-    last.
+    """A stack of 3 x 3 convolutions that maps one field to one field. ``channels`` are the numbers of
+    channels between the convolutions. Every convolution except the last is followed by a leaky ReLU.
 
     With ``transposable``, each kernel is averaged with its transpose, which treats x and y alike.
     """
@@ -307,14 +327,15 @@ class AreawiseNet(nn.Module):
         return len(self.hidden) + 1
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
-        """Return the height (b, 1, y, x) of the interior, or of the whole field if each layer has a zero
-        padding of 1.
+        """Apply the network to a height of shape (batch, 1, ny, nx). Return the height of the interior or, if
+        ``padding`` is 1, of the whole field, which every layer then pads with zeros.
         """
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
             features = functional.leaky_relu(features, self.leaky_slope, inplace=True)
-        # The sum over channels is the height, so it needs full precision even if the layers run in bfloat16.
+        # The sum over the channels is a height. It needs the precision of float32, even if the other layers
+        # run in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding
@@ -325,6 +346,8 @@ class AreawiseNet(nn.Module):
         return (kernel + kernel.transpose(-1, -2)) / 2 if self.transposable else kernel
 
     def start_at_zero(self) -> None:
-        """Set the last layer to zero, so that the network returns zero. The hidden layers stay random."""
+        """Set the last layer to zero, so that the network returns zero before it is trained. The hidden
+        layers stay random.
+        """
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(cast(Tensor, self.last.bias))

@@ -1,7 +1,9 @@
-"""Physics: the paper's parameterised simulator, with five or six physical values.
+"""Physics: the parameterised simulator of the paper. It has few physical values: six by default, five in the
+variants ``paper`` and ``authors``, and more if the spot is fitted.
 
-It chains optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
-shrinkage and height bias; see arXiv:2309.17343, appendix "Parameterized physics model".
+It is a chain of an optical blur, a threshold with a normalised tanh (projection; Zhou et al. 2014), a
+diffusion blur, a shrinkage that depends on the dose, and a height bias. See arXiv:2309.17343, appendix
+"Parameterized physics model".
 """
 
 import math
@@ -23,7 +25,7 @@ Spot = Literal["given", "round", "elliptical"]
 
 
 class PhysicsConfig(SimulatorConfig):
-    """Config of Physics; variants replace some defaults."""
+    """Configuration of the Physics model. The variants replace some of the defaults."""
 
     LENGTHS = (
         *("sigma_optical_um", "sigma_optical_max_um"),
@@ -31,26 +33,42 @@ class PhysicsConfig(SimulatorConfig):
     )
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
-    spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one per axis")
+    spot: Spot = Field(
+        "given",
+        description=(
+            "whether the width of the spot is given, or fitted as one width (round) or one per axis "
+            "(elliptical)"
+        ),
+    )
     sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
-    sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
-    # The starting values matter: fits that start from a steep threshold in mid-range end with a linear
-    # projection.
-    sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
-    alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
-    eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
+    sigma_diffusion_max_um: float = Field(
+        2.5, gt=0, description="upper bound of the diffusion, standard deviation, µm"
+    )
+    # The starting values matter. Fits that start from a steep threshold in the middle of the range end with a
+    # nearly linear projection.
+    sigma_diffusion_init_um: float = Field(
+        1.5, gt=0, description="diffusion before fitting, standard deviation, µm"
+    )
+    alpha_init: float = Field(1.0, gt=0, description="steepness of the threshold before fitting")
+    eta_init: float = Field(0.1, lt=1, description="threshold before fitting")
     eta_min: float = Field(0.0, le=0, description="lower bound of the threshold")
-    kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
-    gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: fixed at 1")
-    bias_init_um: float = Field(0.0, description="height bias, µm")
-    # With 1, the equations are in µm, and with None, in units of the full height. The paper states no such
-    # height.
+    kappa_min_init: float = Field(
+        0.5, gt=0, lt=1, description="share of the height that remains at the lowest dose, before fitting"
+    )
+    gain_init: float | None = Field(
+        None, gt=0, description="gain before fitting; None: the gain is fixed at 1"
+    )
+    bias_init_um: float = Field(0.0, description="height bias before fitting, µm")
+    # With the value 1, the equations are in µm. With None, they are in units of the full height. The paper
+    # does not state this reference height.
     reference_height_um: float | None = Field(
-        None, gt=0, description="height that counts as 1; None: the highest level"
+        None, gt=0, description="height, µm, that counts as 1; None: the height of the highest level"
     )
     shrinkage: Shrinkage = "fixed-reference"
     kernel_support: Support = "four-sigma"
-    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
+    kernel_cap_px: int | None = Field(
+        None, ge=1, description="limit of the kernel radius, px; None: no limit"
+    )
     edge: Edge = "replicate"
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
@@ -72,15 +90,17 @@ class PhysicsConfig(SimulatorConfig):
 
 
 class Physics(Simulator):
-    """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
+    """The Physics model: H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀). The shrinkage factor
+    S depends on G_diffusion * Ĥ. M is the layout, H the printed height, g a gain and b a height bias.
 
-    In ``default``, H₀ is the nominal full height and g is a gain, without which a full level would always
-    print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. A threshold below 0 lies before the
-    first level, so that the projection uses only the concave part of the tanh.
+    In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. Without
+    it, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. A
+    threshold below 0 lies below the lowest level. The projection then uses only the concave part of the tanh.
 
-    The shrinkage is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
-    ``default`` scales by a fixed range, ``paper`` scales by the range of the image, and ``authors`` scales by
-    the maximum of the image. In ``paper`` and ``authors``, the result therefore depends on the crop.
+    The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
+    ``default`` scales it by a fixed range, ``paper`` by the range of the dose in the layout, and ``authors``
+    by the maximum of the dose in the layout. In ``paper`` and ``authors``, the height of a pixel therefore
+    depends on where the layout is cropped.
     """
 
     name = "physics"
@@ -120,8 +140,8 @@ class Physics(Simulator):
         return keys[self.config.spot]
 
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
-        """Return the standard deviation of the spot along y and along x, µm; an unfitted value is a plain
-        number.
+        """Return the standard deviation of the spot along y and along x, µm. A value that is not fitted is a
+        Python number.
         """
         keys = self._spot_keys or ("",)
         given = self.config.sigma_optical_um
@@ -130,8 +150,8 @@ class Physics(Simulator):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """Return the physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um, fitted widths and
-        gain.
+        """Return the physical values by name: alpha, eta, kappa_min, sigma_diffusion_um and bias_um and, if
+        they are fitted, the gain and the widths of the spot.
         """
         ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
         return {**ranged, "bias_um": self.bias_um}
@@ -150,17 +170,17 @@ class Physics(Simulator):
         return self._printed(layout_um, None)
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole field, (batch, 1, y, x) µm."""
+        """Return the height of the whole layout, µm. Layout and height have shape (batch, 1, ny, nx)."""
         return self._printed(layout_um, self.config.edge)
 
     def _printed(self, layout_um: Tensor, edge: Edge | None) -> Tensor:
-        """Return the height of the whole field, padded by ``edge``, or only of its interior if ``edge`` is
-        None.
+        """Apply the model. If ``edge`` is None, return the height of the interior only. Otherwise pad the
+        layout by the rule ``edge`` and return the height of the whole layout.
         """
         values = self.values
         optical, diffusion = self._radii_px(values)
-        # The layout is continued by its outermost pixels, so its optical blur is constant farther outside
-        # than the radius of the blur.
+        # Beyond its edge, the layout is continued by repeating its outermost pixels. A margin as wide as the
+        # radius of the optical blur is enough, because farther outside the blurred layout no longer changes.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
@@ -170,12 +190,13 @@ class Physics(Simulator):
         initial = crop_border(initial, margin if edge else diffusion)
         return self._develop(initial, crop_border(dose, margin), values)
 
-    # The methods below take the values as arguments. The values are computed once per pass, because every
-    # operation is slow in forward-mode differentiation.
+    # The methods below receive the physical values as an argument. The values are computed only once per
+    # pass, because every operation is slow in forward-mode differentiation.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        # Float32 rounds a width, and this rounding must not move the edge of the kernel.
+        # The widths are rounded, because the rounding errors of float32 must not change the size of the
+        # kernel.
         widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
         spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (

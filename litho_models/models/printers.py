@@ -1,4 +1,6 @@
-"""Printers built from parts: one model with settings for several machines."""
+"""Modular models of printers, assembled from parts. There is one class of model, with default settings for
+several machines.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +15,26 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 
 class PrinterConfig(SimulatorConfig):
-    """The parts in their order, and the fixed or initial values of their parameters, which are named
-    ``part.parameter``.
+    """Configuration of a printer: its parts, in the order in which they act, and the values of their
+    parameters. A value is the starting value of a fitted parameter, or the fixed value of any other. A
+    parameter has the name ``part.parameter``.
 
-    Each parameter can also be set like a field, for example as ``spot.sigma_um``.
+    Each parameter can also be set like a field of the configuration, under this name, such as
+    ``spot.sigma_um``.
     """
 
     parts: tuple[str, ...] = Field(
         ("spot", "tanh"), min_length=1, description="names of the parts, in the order in which they act"
     )
-    numbers: dict[str, float] = Field({}, description="values that replace those of the parts")
+    numbers: dict[str, float] = Field(
+        {}, description="values of parameters that replace the defaults of the parts"
+    )
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the config of a variant as for other models; the fields may include parameters of parts."""
+        """Make the configuration of a variant, as for other models. The fields may include parameters of
+        parts.
+        """
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
         parts = fields.get("parts", cls.model_fields["parts"].default)
@@ -54,7 +62,9 @@ class PrinterConfig(SimulatorConfig):
 
 
 class Printer(Simulator):
-    """A printer that applies its ``parts`` in order: H = H₀ · (…part₂(part₁(M / H₀)))."""
+    """A printer that applies its parts one after the other: H = H₀ · (…part₂(part₁(M / H₀))). M is the
+    layout, H the printed height, and H₀ the nominal height of the highest level.
+    """
 
     name = "printer"
     Config = PrinterConfig
@@ -78,7 +88,7 @@ class Printer(Simulator):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """Return the fitted values by name, ``part.number``."""
+        """Return the fitted values. Their names have the form ``part.parameter``."""
         return {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
 
     @property
@@ -92,7 +102,9 @@ class Printer(Simulator):
         return self.config.full_height_um * field
 
     def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
-        """Return the parts, each with its values by name; unfitted values are plain numbers."""
+        """Return the parts, each with the values of its parameters by name. Values that are not fitted are
+        Python numbers.
+        """
         known = {**self.config.numbers, **self.values}
         found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}
         for part, name, number in self.config.all_numbers():
@@ -101,7 +113,9 @@ class Printer(Simulator):
 
 
 def _key(name: str) -> str:
-    """Return the name of a torch parameter, which must not contain a full stop."""
+    """Convert the name of a parameter of a part to a name for a torch parameter, which must not contain a
+    full stop.
+    """
     return f"raw_{name.replace('.', '__').replace('-', '_')}"
 
 
@@ -118,7 +132,7 @@ class ElectronBeamConfig(PrinterConfig):
 
 
 class ElectronBeam(Printer):
-    """An electron-beam writer, with backscattering, for films that are etched."""
+    """An electron-beam writer with backscattering. Its resist is the mask for etching a film."""
 
     name = "e-beam"
     Config = ElectronBeamConfig
@@ -130,7 +144,7 @@ class ProjectionConfig(PrinterConfig):
 
 
 class Projection(Printer):
-    """A projection lens with a partially coherent source, for films that are etched."""
+    """A projection lens with a partially coherent source. The resist is the mask for etching a film."""
 
     name = "projection"
     Config = ProjectionConfig
@@ -142,7 +156,7 @@ class LaserWriterConfig(PrinterConfig):
 
 
 class LaserWriter(Printer):
-    """A laser writer for multi-level reliefs in a resist with a contrast curve."""
+    """A laser writer that makes multi-level reliefs in a resist with a contrast curve."""
 
     name = "laser-writer"
     Config = LaserWriterConfig
@@ -154,7 +168,9 @@ class DmdGrayscaleConfig(PrinterConfig):
 
 
 class DmdGrayscale(Printer):
-    """A micromirror printer for multi-level reliefs in a resist in which the dose diffuses."""
+    """A printer with a micromirror device that makes multi-level reliefs in a resist in which the dose
+    diffuses.
+    """
 
     name = "dmd-grayscale"
     Config = DmdGrayscaleConfig

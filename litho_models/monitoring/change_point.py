@@ -1,15 +1,15 @@
-"""Test whether the mean of a monitored quantity has changed since the reference, at a stated rate of false
-alarms.
+"""Test whether the mean of a monitored quantity has changed since the reference prints, at a given rate of
+false alarms.
 
-The test assumes in turn that each new print is the first print after a step, and that the step lasts until
-the last print. Student's t with a pooled spread compares the values before the step, including the reference,
-with the values after it. The t distribution is valid for any number of reference prints, although their mean
-and spread are unknown. The test is the likelihood ratio for a step in the mean with unknown parameters
-(Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of false alarms is divided among the
-comparisons, so it holds for the whole set, whatever the correlation between comparisons (Bonferroni). A step
-should be noticed within ``SOON`` prints, so comparisons with at least that many prints after the step get
-most of the rate. With three new prints, the rule is nearly the t test of their mean, which is the best
-possible test if the spread is unknown.
+The test makes one comparison for each new print. It assumes that the mean steps at this print and stays
+changed until the last print. A t test with a pooled spread compares the values before the step, which include
+those of the reference prints, with the values after it. Student's t distribution holds for any number of
+reference prints, although their mean and spread are unknown. This is the likelihood-ratio test for a step in
+the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of
+false alarms is divided among the comparisons, so it holds for all of them together, even if they are
+correlated (Bonferroni). A step should be noticed within ``SOON`` prints. Comparisons with at least that many
+prints after the step therefore get most of the rate. With three new prints, the test is nearly the t test of
+their mean, which is the best possible test if the spread is unknown.
 """
 
 from typing import NamedTuple
@@ -23,20 +23,21 @@ from litho_data.foundation.kinds import Array
 
 # Number of prints within which a step should be noticed.
 SOON = 3
-# Share of the rate of false alarms for each comparison with fewer than ``SOON`` prints after the step.
+# Share of the rate of false alarms that each comparison with fewer than ``SOON`` prints after the step gets.
 _YOUNG = 0.1
-# Steps larger than this, in standard errors, are not searched for.
+# Largest step that is considered, in standard errors.
 _LARGEST = 1e4
 
 
 class Series(NamedTuple):
-    """The value of each print in printing order, and the variance of each value up to a common factor.
+    """The value of a monitored quantity for each print, in printing order, and the variance of each value up
+    to a common factor. There are n reference prints and m new prints.
 
     Attributes:
-        reference: values of the reference prints, (..., n).
-        new: values of the new prints, (..., m).
-        reference_variance: relative variances of the reference prints, (n,).
-        new_variance: relative variances of the new prints, (m,).
+        reference: values of the reference prints, with shape (..., n).
+        new: values of the new prints, with shape (..., m).
+        reference_variance: relative variances of the values of the reference prints, with shape (n,).
+        new_variance: relative variances of the values of the new prints, with shape (m,).
     """
 
     reference: Array
@@ -50,8 +51,8 @@ class Step(NamedTuple):
 
     Attributes:
         since: index of the first new print after the step, counted from 0.
-        size: new mean minus old mean.
-        ci95: confidence interval of ``size``.
+        size: mean after the step minus mean before it.
+        ci95: 95 % confidence interval of ``size``.
     """
 
     since: int
@@ -60,8 +61,8 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Return the share of the rate of false alarms that each comparison gets, (m,). The comparisons are in
-    the order of their first changed print. The shares add up to 1.
+    """Return the share of the rate of false alarms that each comparison gets, with shape (m,). The
+    comparisons have the order of their first changed print. The shares add up to 1.
     """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
@@ -69,14 +70,14 @@ def shares(new_prints: int) -> Array:
 
 
 def step_statistics(series: Series) -> tuple[Array, Array]:
-    """Return the step and its standard error for every possible first changed print. Both arrays have the
-    shape (m, ...).
+    """Return the size of the step and its standard error for every possible first changed print. Both arrays
+    have shape (m, ...).
 
     If nothing has changed, the ratio of step to standard error follows Student's t with n + m - 2 degrees of
     freedom.
     """
     weight = 1 / np.concatenate([series.reference_variance, series.new_variance])
-    # A value within the data is subtracted first, because sums of squares of large values would lose digits.
+    # The reference mean is subtracted first, because sums of squares of large values would lose digits.
     centre = np.mean(series.reference, axis=-1, keepdims=True)
     values = np.concatenate([series.reference - centre, series.new - centre], axis=-1)
     n, m = series.reference.shape[-1], series.new.shape[-1]
@@ -92,10 +93,10 @@ def step_statistics(series: Series) -> tuple[Array, Array]:
 
 
 def likeliest_step(series: Series) -> tuple[Step, float]:
-    """Find the most significant step, and an upper bound on its p value.
+    """Return the most significant step, and an upper bound on its p value.
 
     Args:
-        series: values of shape (n,) and (m,), n at least 2, m at least 1.
+        series: values of shape (n,) and (m,), with n at least 2 and m at least 1.
     """
     sizes, errors = step_statistics(series)
     freedom = len(series.reference) + len(series.new) - 2
@@ -106,25 +107,26 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
 
 
 def chance_to_notice(step: float, reference_variance: Array, new_variance: Array, rate: float) -> float:
-    """Return the probability that a rise causes an alarm within ``SOON`` prints, or within all new prints if
-    there are fewer.
+    """Return the probability that a rise of the mean raises an alarm within ``SOON`` prints, or within all
+    new prints if there are fewer.
 
-    The result is a lower bound. It is computed from the noncentral t distribution of a single comparison, the
-    one in which the step starts with the rise.
+    The result is a lower bound. It is computed from the noncentral t distribution of a single comparison, in
+    which the assumed step is at the first print after the rise. All values are assumed to be Gaussian.
 
     Args:
-        step: the rise, in units of the unknown spread. A print with this spread has a relative variance of 1.
-        reference_variance: relative variances of the reference prints, (n,). All values are Gaussian.
-        new_variance: relative variances of the new prints, (m,).
-        rate: chance of a false alarm in the whole set.
+        step: size of the rise, in units of the unknown spread of a print whose relative variance is 1.
+        reference_variance: relative variances of the values of the reference prints, with shape (n,).
+        new_variance: relative variances of the values of the new prints, with shape (m,).
+        rate: probability of a false alarm in all comparisons together.
     """
     limit, freedom, error = _comparison(reference_variance, new_variance, rate)
     return float(nct.sf(limit, freedom, step / error))
 
 
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
-    """Return the step that is noticed with probability ``power``; infinite if it exceeds ten thousand
-    standard errors.
+    """Return the size of a step that raises an alarm with probability ``power``, in units of the spread of a
+    print whose relative variance is 1. The result is infinite if the step exceeds ten thousand standard
+    errors. The arguments are those of ``chance_to_notice``.
     """
     error = _comparison(reference_variance, new_variance, rate)[2]
 
@@ -135,8 +137,8 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
-    """Return the limit of t, the degrees of freedom and the standard error for a comparison of the last
-    ``SOON`` prints with all prints before them.
+    """Consider the comparison of the last ``SOON`` prints with all prints before them. Return the value of t
+    above which it raises an alarm, its degrees of freedom, and its standard error.
     """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

@@ -1,4 +1,6 @@
-"""The function of ``litho-models check``: test whether a printer still behaves as its model predicts."""
+"""The function behind ``litho-models check``, which tests whether a printer still behaves as its model
+predicts.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,22 +28,26 @@ def check(
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
 ) -> Check:
-    """Compare new prints with a model's reference prints; write ``check.json``, a report and tables.
+    """Compare new prints with reference prints, both relative to the predictions of a model. Write
+    ``check.json``, a report and tables.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
-        store: dataset store of the new prints. Locked scans are left out if the model was made from the
-            prints of this store.
+        store: dataset store of the new prints. If the model was trained on prints of this store, its locked
+            scans are left out.
         out: result folder.
-        reference: store of unchanged prints; by default, the prints in the model's card are the reference.
+        reference: store of prints made before any change of the printer. By default, the reference is the
+            values of the training prints that the model's card contains.
         new: names of the new prints, if ``store`` also contains the reference prints. All other prints of the
-            store are then the reference.
-        false_alarms: chance that prints of an unchanged printer raise an alarm in any monitored quantity.
+            store are then reference prints.
+        false_alarms: probability that prints of an unchanged printer raise an alarm in any monitored
+            quantity.
         tolerance: largest allowed relative drift of a monitored quantity (0.05 is 5 %); by default three
             times the spread of the quantity.
 
     Raises:
-        InputError: a model or store that cannot be read or does not fit, or too few prints.
+        InputError: the model or a store cannot be read, their pitch or level height differs, there are too
+            few prints, or a rate or tolerance is out of range.
     """
     if not 0 < false_alarms < 0.5:
         raise InputError("rate of false alarms", got=false_alarms, wanted="a number between 0 and 0.5")
@@ -54,8 +60,8 @@ def check(
         say(f"checking {len(dataset)} scans of {dataset.name}")
         found = gather(frozen, dataset, reference, new)
         parameters = frozen.card["parameters"]
-        # The model's error on its training prints may be too small to be compared with its error on new
-        # prints.
+        # The error of the model on its training prints may be smaller than on unseen prints. The two cannot
+        # be compared then, so the error is not monitored.
         optimistic = wording.too_optimistic(found.reference, parameters)
         judged = judge(
             found.reference,

@@ -1,4 +1,6 @@
-"""Collect the scans to check and the reference scans, which come from a store, other prints or a card."""
+"""Collect the monitored values of the new scans and of the reference scans. The reference is another store,
+other prints of the same store, or the values in the model's card.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -16,15 +18,16 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
-# Heights below half or above twice the predicted heights show that the model describes another printer.
+# If the reference prints are lower than half or higher than twice the predicted heights, the model describes
+# another printer.
 _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
-    """The monitored values of reference and new scans, the excluded scans, and a description of the
-    reference.
+    """The monitored values of the reference scans and of the new scans. ``dropped`` lists the excluded scans
+    with the reason, and ``words`` describes the reference.
 
-    ``between`` says whether the new prints were made between reference prints.
+    ``between`` says whether new prints may have been made between reference prints.
     """
 
     reference: list[ScanFigures]
@@ -37,14 +40,15 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Compute the monitored values of the new prints and of the reference, keeping only scans of one dose.
+    """Compute the monitored values of the scans of the new prints and of the reference prints. Only scans at
+    one dose are kept.
 
     Raises:
-        InputError: no reference or more than one, unknown prints, stores of another geometry, stores with
-            scans in common, or too few prints.
+        InputError: there is no reference, or more than one; a print is unknown; a store has another pitch or
+            level height than the model; the two stores share scans; or there are too few prints.
     """
     if reference is not None and new:
-        raise InputError("reference", got="both a store and --new", wanted="only one of the two")
+        raise InputError("reference", got="both a store and --new", wanted="only one of these")
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     dropped: list[str] = []
     if reference is not None:
@@ -79,8 +83,8 @@ def _require_prints(names: Sequence[str], rows: Sequence[ScanFigures], dataset: 
 
 
 def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
-    """Return the monitored values of the prints from which the model was made, unless they are in the
-    store.
+    """Return the monitored values of the prints on which the model was trained. They are in the card of the
+    model. Raise an InputError if the store contains these prints.
     """
     hint = "use --reference STORE, or --new PRINT to compare it with the other prints of this store"
     if not frozen.card["baseline"]:
@@ -101,8 +105,8 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
 
 
 def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[ScanFigures]:
-    """Compute the monitored values of the scans of a store. Locked scans are left out if the model was made
-    from these prints.
+    """Compute the monitored values of the scans of a store, and add the excluded scans to ``dropped``. If the
+    model was trained on prints of this store, locked scans are excluded.
     """
     seen, locked = trained_ids(frozen, store), set()
     if made_of_these_prints(frozen, store):
@@ -119,7 +123,9 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """Keep scans at the dose of most reference scans, because other doses change the gain on purpose."""
+    """Keep only the scans whose dose is that of most reference scans. Other doses change the gain on purpose.
+    Scans that state no dose are kept.
+    """
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:
         return found
@@ -147,7 +153,7 @@ def _check_reference(rows: Sequence[ScanFigures], frozen: FrozenSimulator) -> No
         raise InputError(
             "prints in the reference",
             got=prints,
-            wanted=f"at least {FEWEST_REFERENCE_PRINTS}, to show how much unchanged prints differ",
+            wanted=f"at least {FEWEST_REFERENCE_PRINTS}, which show how much unchanged prints differ",
         )
     gain = float(np.median([row.gain for row in rows]))
     if not _OWN_GAIN[0] < gain < _OWN_GAIN[1] or min(row.gain for row in rows) <= 0:

@@ -1,4 +1,6 @@
-"""Judge each monitored quantity of the scans. This module needs neither files nor models."""
+"""Judge each monitored quantity: whether it has changed, and when to measure again. This module needs neither
+files nor models, only the values of the scans.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,14 +26,13 @@ from litho_models.scoring.printer_state import ScanFigures
 
 
 class Trend(NamedTuple):
-    """A straight line through the values of prints.
+    """A straight line through the values of prints in printing order.
 
     Attributes:
-        per_print: change from print to print.
+        per_print: slope of the line, which is the change from print to print.
         ci95: 95 % confidence interval of ``per_print``.
-        p: two-sided p value of the slope.
-        prints_left: number of further prints for which the 95 % bound on the drift stays within the
-            tolerance.
+        p: two-sided p value of the hypothesis that the slope is zero.
+        prints_left: number of further prints until the 95 % bound on the drift reaches the tolerance.
     """
 
     per_print: float
@@ -41,18 +42,19 @@ class Trend(NamedTuple):
 
 
 def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, tolerance: float) -> Trend:
-    """Fit the trend over all prints, and estimate the number of prints until it reaches the tolerance.
+    """Fit a straight trend to the values of all prints, and estimate the number of prints until the drift may
+    reach the tolerance.
 
-    The drift is the change since the model was made, which is taken to be at the middle of the reference. It
-    is the slope of the trend multiplied by the number of prints since then. Its 95 % bound is computed from
-    the steeper end of the slope's confidence interval. The forecast assumes a steady drift. Steps are
-    detected by the alarm.
+    The drift is the change since the model was made: the slope of the trend times the number of prints since
+    then. The model is taken to have been made at the middle of the reference prints. The 95 % bound on the
+    drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift. Sudden
+    steps are not forecast; they raise an alarm.
 
     Args:
-        values: one value per print in printing order, (n,). At least three values are needed.
-        variance: relative variances of the values, (n,).
-        reference: bool (n,), True for prints of the reference.
-        tolerance: largest drift, in the unit of ``values``.
+        values: one value per print in printing order, with shape (n,); at least three.
+        variance: relative variances of the values, with shape (n,).
+        reference: boolean array of shape (n,), True for reference prints.
+        tolerance: largest allowed drift, in the unit of ``values``.
     """
     n = len(values)
     place = np.arange(n)
@@ -68,7 +70,7 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
 
 
 DEFAULT_RATE = 0.005
-# The default tolerance, as a multiple of the spread between prints.
+# Default tolerance, as a multiple of the spread between reference prints.
 TOLERANCE_SPREADS = 3.0
 
 
@@ -81,15 +83,16 @@ def judge(
     figures: Sequence[Figure] = FIGURES,
     between: bool = False,
 ) -> list[FigureCheck]:
-    """Compare every monitored quantity of the new prints with the reference.
+    """Compare the new prints with the reference prints in every monitored quantity.
 
     Args:
-        reference, new: scans of the prints, in any order; there must be at least three reference prints.
-        rate: chance of a false alarm if nothing has changed. This rate is divided among the quantities by
-            their weights.
-        tolerance: largest allowed relative drift; three times the spread by default.
-        between: whether new prints were made between reference prints. If so, the trend follows the common
-            printing order; otherwise all new prints come after the reference.
+        reference, new: values of the scans of these prints, in any order; there must be at least three
+            reference prints.
+        rate: probability of a false alarm if nothing has changed. It is divided among the quantities in
+            proportion to their weights.
+        tolerance: largest allowed relative drift; by default three times the spread between reference prints.
+        between: whether new prints may have been made between reference prints. If so, the trend is fitted in
+            the common printing order; otherwise all new prints come after the reference prints.
     """
     return [
         _judged(figure, reference, new, own, tolerance, between=between)
@@ -98,7 +101,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """Return each quantity's share of the rate of false alarms."""
+    """Return the part of the rate of false alarms that each quantity gets."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

@@ -1,5 +1,5 @@
-"""Define the record ``check.json`` and the monitored quantities, each with one value per print and the spread
-of these values.
+"""The record ``check.json`` and the monitored quantities. A quantity has one value per print; the spread of
+these values between prints is computed here.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,8 +19,9 @@ _LEAST_GAIN = 0.01
 class Figure(NamedTuple):
     """A monitored quantity.
 
-    ``of`` returns the logarithm of the quantity for one scan, so that differences are relative: a step of
-    0.03 is 3 %. ``weight`` is the quantity's share of the rate of false alarms.
+    ``words`` is the name of the quantity in sentences, and ``causes`` lists what may change it. ``of``
+    returns the logarithm of the quantity for one scan, so that differences are relative: a step of 0.03 is 3
+    %. ``weight`` is the share of the rate of false alarms that the quantity gets.
     """
 
     name: str
@@ -34,7 +35,7 @@ FIGURES = (
     Figure(
         "gain",
         "height gain",
-        # A failed print may have a gain near or below 0.
+        # The gain of a failed print may be near or below 0, so a lower limit is needed.
         lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
         "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
         "height tells them apart",
@@ -53,7 +54,7 @@ WATCHED = {figure.name: figure for figure in FIGURES}
 
 
 class PrintValues(NamedTuple):
-    """The name, the value and the number of scans of each print, in printing order. The value of a print is
+    """The names, the values and the numbers of scans of prints, in printing order. The value of a print is
     the mean over its scans.
     """
 
@@ -63,14 +64,14 @@ class PrintValues(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """The variation of unchanged prints.
+    """The mean and the variation of a quantity over unchanged prints.
 
     Attributes:
-        mean: mean over the prints.
-        sd: standard deviation between prints.
+        mean: mean of the values of the prints.
+        sd: standard deviation of the values of the prints.
         sd_ci95: 95 % confidence interval of ``sd``.
-        between: variance between prints.
-        within: variance between the scans of a print; None if no print has two scans.
+        between: variance that comes from differences between prints.
+        within: variance between the scans of one print; None if no print has two scans.
     """
 
     mean: float
@@ -80,8 +81,8 @@ class Spread(NamedTuple):
     within: float | None
 
     def relative_variance(self, counts: np.ndarray) -> np.ndarray:
-        """Return the relative variance of the value of each print, (n,). The variance depends on the number
-        of scans of the print. It is 1 for a typical print.
+        """Return the relative variance of the value of each print, which depends on the number of its scans.
+        ``counts`` and the result have shape (n,). The relative variance of a typical print is 1.
         """
         if self.within is None:
             return np.ones(len(counts))
@@ -90,12 +91,12 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """Return the prints in printing order, by the first scan of each."""
+    """Return the names of the prints in printing order. The place of a print is that of its first scan."""
     return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
-    """Return the value of each print, in printing order."""
+    """Return the value of a monitored quantity for each print, in printing order."""
     names = in_order(rows)
     of_print = [[figure.of(row) for row in rows if row.print == name] for name in names]
     return PrintValues(
@@ -104,11 +105,12 @@ def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
 
 
 def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
-    """Compute the mean and spread over at least two prints, with variance components from a one-way analysis
-    of variance.
+    """Compute the mean and the spread of a quantity over at least two prints. A one-way analysis of variance
+    divides the spread into its variance between prints and within prints.
 
-    A value from one scan varies more than a mean over four scans. Prints with several scans show how much of
-    the variation comes from the scans. A negative variance between prints counts as 0.
+    The division is needed because the value of a print with one scan varies more than a mean over four scans.
+    Prints with several scans show how much of the variation comes from the scans. If the estimate of the
+    variance between prints is negative, it is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -119,14 +121,14 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     for name, value in zip(prints.names, prints.values, strict=True):
         rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
     within = rest / (scans - n) if scans > n else None
-    # The variance of the prints' means is the variance between prints plus the mean contribution of the
+    # The variance of the means of the prints is the variance between prints plus the mean contribution of the
     # scans.
     between = max(sd**2 - (within or 0.0) * float(np.mean(1 / prints.counts)), 0.0)
     return Spread(mean, sd, (ends[0], ends[1]), between, within)
 
 
 class CheckedModel(Record):
-    """Name and hash of the model, and the dataset from which it was made."""
+    """Name and hash of the model that is checked, and the dataset on which it was trained."""
 
     name: str
     sha256: str
@@ -134,10 +136,10 @@ class CheckedModel(Record):
 
 
 class Alarm(Record):
-    """A relative step in the mean of a monitored quantity; ``since`` is the first changed print.
+    """A relative step in the mean of a monitored quantity. ``since`` is the name of the first changed print.
 
-    ``step`` is the mean from ``since`` on minus the mean before. Its confidence interval does not account for
-    the choice of ``since``.
+    ``step`` is the mean from ``since`` on minus the mean before, relative to the mean before. Its confidence
+    interval does not account for the choice of ``since``.
     """
 
     since: str
@@ -146,16 +148,16 @@ class Alarm(Record):
 
 
 class FigureCheck(Record):
-    """One monitored quantity of the new prints, compared with the reference. All values except ``mean`` are
-    relative: 0.01 is 1 %.
+    """The comparison of new prints with reference prints in one monitored quantity. All values of the
+    quantity except ``mean`` are relative: 0.01 is 1 %.
 
     ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound on the p value of a
-    change. An alarm is raised if ``p`` is at most ``alarm_at``, the quantity's share of the rate.
-    ``noticeable_step`` is a rise r that is noticed in 9 of 10 cases within three new prints, or within all
-    new prints if there are fewer than three. A fall by r/(1 + r) is noticed equally often.
-    ``noticeable_step`` is None if the rise exceeds a factor of e. ``trend`` is the change per print over all
-    prints. ``measure_again_in`` is the number of prints until the 95 % bound on the drift reaches
-    ``tolerance``.
+    change. An alarm is raised if ``p`` is at most ``alarm_at``, which is this quantity's part of the rate of
+    false alarms. ``noticeable_step`` is the rise r that raises an alarm in 9 of 10 cases within three new
+    prints, or within all new prints if there are fewer than three. A fall by r/(1 + r) raises an alarm
+    equally often. ``noticeable_step`` is None if the rise would exceed a factor of e. ``trend`` is the change
+    from print to print, fitted to all prints. ``measure_again_in`` is the number of prints until the 95 %
+    bound on the drift reaches ``tolerance``.
     """
 
     name: str
@@ -176,9 +178,11 @@ class FigureCheck(Record):
 
 
 class Check(Result):
-    """The record ``check.json``. ``verdict`` is meant for people, and ``alarm`` is meant for programs.
+    """The record ``check.json``. ``verdict`` states the result in sentences for people, and ``alarm`` states
+    it for programs.
 
-    ``false_alarm_rate`` is the chance that a data set like this from an unchanged printer raises an alarm.
+    ``false_alarm_rate`` is the probability that a dataset of this size from an unchanged printer raises an
+    alarm.
     """
 
     SCHEMA = "litho-models/check/2"

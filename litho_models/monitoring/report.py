@@ -1,5 +1,5 @@
-"""Write ``report.html`` of a check: the verdict, a control chart for each monitored quantity, and a table of
-scans.
+"""Write the ``report.html`` of a check. It contains the verdict, a control chart for each monitored quantity,
+and a table of scans.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _COLUMNS = (
 
 
 def write_check_report(result: Check, out: str | Path) -> Path:
-    """Write the report of a check into ``out``; return its path."""
+    """Write the report of a check into the folder ``out``, and return the path of the report."""
     page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
     page.verdict(result.verdict[0])
     for one in result.figures:
@@ -34,7 +34,7 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.heading("In numbers", folded=True)
     page.table(
         result.figures,
-        "All values except the mean are relative: 0.01 is 1 %. p is the chance that the prints of an "
+        "All values except the mean are relative: 0.01 is 1 %. p is the probability that the prints of an "
         "unchanged printer seem to change as clearly as these, no matter at which print. An alarm is raised "
         "if p is at most the value in “alarm at”. This value is the quantity's share of the rate of false "
         f"alarms, {result.false_alarm_rate:g}.",
@@ -52,8 +52,9 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
-    """Draw one monitored quantity of all prints, relative to the reference: large dots for prints, small dots
-    for scans, bands for the spread of the reference and for a step.
+    """Draw one monitored quantity of all prints, relative to the mean of the reference prints. Large dots are
+    prints and small dots are scans. One band shows the spread of the reference prints; another, if there is
+    an alarm, marks the changed prints.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -89,7 +90,9 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
 
 
 def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
-    """Convert the logarithm of a quantity to its difference from the reference mean, %."""
+    """Convert the logarithm of a quantity to the difference of the quantity from the mean of the reference
+    prints, in %.
+    """
     return 100 * np.expm1(np.asarray(value) - np.log(one.mean))
 
 

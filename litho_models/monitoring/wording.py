@@ -1,4 +1,4 @@
-"""Write the text of a check from templates: the verdict and the notes."""
+"""Write the verdict and the notes of a check in sentences, which are filled into templates."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,15 +11,16 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# A layout that is flatter, higher or steeper than every reference layout by this factor is of another kind.
+# If all new prints are higher, flatter or steeper than every reference print by this factor, their layouts
+# are of another kind.
 _OTHER_KIND = 1.1
-# Largest amount, in units of the spread, by which a fit may understate its error without raising the rate of
-# false alarms.
+# Largest amount, in units of the spread, by which the error on training scans may be too small without
+# raising the rate of false alarms noticeably.
 _BEARABLE_OPTIMISM = 0.25
 
 
 def verdict(checks: Sequence[FigureCheck], rate: float) -> list[str]:
-    """Return the verdict in sentences, the most important first."""
+    """Return the verdict as sentences, the most important one first."""
     return _sentences("verdict", checks=checks, rate=rate, soon=SOON)
 
 
@@ -29,7 +30,9 @@ def notes(
     checks: Sequence[FigureCheck],
     parameters: int = 0,
 ) -> list[str]:
-    """Return notes on the limits of the verdict; ``parameters`` is the number of parameters of the model."""
+    """Return sentences about the limits of the verdict. ``parameters`` is the number of parameters of the
+    model.
+    """
     return _sentences(
         "notes",
         checks=checks,
@@ -46,11 +49,12 @@ def _sentences(template: str, **values: object) -> list[str]:
 
 
 def too_optimistic(reference: Sequence[ScanFigures], parameters: int) -> bool:
-    """Return whether the errors of the reference are too small to be compared with errors on unseen prints.
+    """Return True if the errors on the reference scans are too small to be compared with errors on unseen
+    prints, because the model was trained on these scans.
 
-    On scans that were used in the fit, the error is too small. The relative difference is the number of
-    parameters divided by the number of independent pixels. Pixels within one correlation length of the
-    residual count as one.
+    On scans that were used in the fit, a model has a smaller error than on unseen scans. The relative
+    difference is about the number of parameters divided by the number of independent pixels, where all pixels
+    within one correlation length of the residual count as one.
     """
     independent = sum(row.pixels for row in reference if not row.held_out) / Blocks().buffer_px ** 2
     spread = float(np.std([WATCHED["error"].of(row) for row in reference], ddof=1))

@@ -1,4 +1,6 @@
-"""Estimate noise, the error that no model can predict, and test the calibration of stated uncertainties."""
+"""Estimate the noise, which is the part of the error that no model can predict, and test whether stated
+uncertainties are calibrated.
+"""
 
 from litho_models.noise.analyse import analyse_noise, analyse_noise_of_files
 from litho_models.noise.result import NoiseAnalysis

@@ -1,4 +1,6 @@
-"""The function of ``litho-models noise``: estimate the noise of prints from the available measurements."""
+"""The functions behind ``litho-models noise``, which estimate the noise of prints from the available
+measurements.
+"""
 
 from pathlib import Path
 
@@ -30,20 +32,21 @@ def analyse_noise(
     model: str | None = None,
     seed: int = 0,
 ) -> NoiseAnalysis:
-    """Analyse the noise of a store; write ``noise.json``, a report and CSV tables.
+    """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. If the store contains scans whose use is substrate, flat or steps, or scans that
-            state a dose, these scans are analysed as well.
+        store: dataset store. Scans whose use is stated as substrate, flat or steps, and scans that state a
+            dose, are also analysed.
         out: result folder.
-        residuals: result folder of ``litho-models benchmark``, whose residuals are out of fold, or a frozen
-            model (a folder or ``zoo:NAME``). The analysis then contains σ(x) and its calibration. If the
-            residuals are out of fold, it also contains the budget.
+        residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
+            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. If none of
+            the scans was used to train the model, which always holds for a benchmark, it also contains the
+            noise budget.
         model: name of a model in the benchmark; by default the best model.
         seed: seed of the random choice of pixels.
 
     Raises:
-        InputError: a store or residuals that cannot be read or do not match.
+        InputError: the store or the residuals cannot be read, or do not belong together.
     """
     if model is not None and residuals is None:
         raise InputError(
@@ -58,8 +61,8 @@ def analyse_noise(
         spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # The dose matrix also uses locked scans, because it does not judge a model, and a dose often has only
-        # one print.
+        # The dose matrix also uses locked scans, because it does not judge any model, and there is often only
+        # one print at a dose.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
@@ -101,16 +104,17 @@ def analyse_noise_of_files(
     size_um: tuple[float, float] | None = None,
     level_height_um: float = 0.1,
 ) -> NoiseAnalysis:
-    """Analyse the noise from single scans, without a store.
+    """Analyse the noise from the files of single scans, without a store.
 
     Args:
         out: result folder.
-        flat, substrate, steps: scans of a flat print, the bare substrate and a staircase.
-        unit, size_um: unit of the heights and size (y, x) of the field, if the files do not state them.
-        level_height_um: nominal step of the staircase.
+        flat, substrate, steps: scan files of a flat print, of the bare substrate and of a print of steps.
+        unit, size_um: unit of the heights and size of the scan along y and x, µm, if the files do not state
+            them.
+        level_height_um: nominal height of one step, µm.
 
     Raises:
-        InputError: a file that cannot be read, or whose pitch is not known.
+        InputError: a file cannot be read, its pitch is not known, or no step is found in the print of steps.
     """
     with growing_folder(out, NoiseAnalysis.FILE_NAME):
         references = []

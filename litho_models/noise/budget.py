@@ -1,8 +1,8 @@
-"""Estimate the noise of ordinary prints from the out-of-fold residuals of a model.
+"""Estimate the noise of ordinary prints from the residuals of a model on held-out scans.
 
-There are two upper estimates. The first is based on the differences between residuals in similar surroundings
-(``estimated_floor``). The second is the roughness in areas where the layout is flat and model errors are
-small.
+There are two upper estimates. The first compares residuals at pixels whose surroundings in the layout are
+similar (``estimated_floor``). The second is the roughness in areas where the layout is flat, because the
+errors of a model are small there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,10 +24,11 @@ _FEWEST_PIXELS = 1000
 
 
 class FlatLevel(Record):
-    """The residual of pixels of one level where the layout is flat: rms and mean absolute value, nm.
+    """The residual at the pixels of one level where the layout is flat: its rms (``sigma_nm``) and its mean
+    absolute value (``mae_nm``).
 
-    The terms of policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the confidence interval of σ
-    over prints.
+    The terms of the policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the 95 % confidence
+    interval of ``sigma_nm`` over prints.
     """
 
     level: int
@@ -37,13 +38,14 @@ class FlatLevel(Record):
     mae_nm: float
 
 
-# Older results also contain a correlation length.
+# Older results also contain a correlation length, which is ignored.
 class NoiseBudget(Record, extra="ignore"):
     """Two upper estimates of the noise of prints.
 
-    ``flat_levels`` covers the quarter of the pixels at which the layout is flattest. The slope of the layout
-    is at most ``flat_slope`` at these pixels. ``flat_texture`` is the texture of the same pixels after the
-    terms of policy ``full`` are removed, so it contains line offsets.
+    ``floor`` is the first estimate. ``flat_levels`` is the second; it covers the quarter of the pixels where
+    the layout is flattest. At these pixels, the slope of the layout is at most ``flat_slope``.
+    ``flat_texture`` is the texture of the residual at the same pixels. For the texture, only the terms of the
+    policy ``full`` are removed, so line offsets are part of it.
     """
 
     model: str
@@ -54,7 +56,7 @@ class NoiseBudget(Record, extra="ignore"):
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Compute both estimates from the residuals of one model on held-out scans."""
+    """Compute both estimates of the noise from the residuals of one model on held-out scans."""
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
@@ -74,7 +76,7 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 
 def _by_level(scans: Sequence[PrintedScan], flat_um: Sequence[np.ndarray]) -> Iterator[FlatLevel]:
-    """Yield the residual in the flat pixels of each level that has enough of them."""
+    """Yield the residual of each level that has enough pixels in flat areas."""
     pool = Pool(scans, [np.isfinite(own) for own in flat_um])
     level, residual = pool.of([scan.mask_level for scan in scans]), NM_PER_UM * pool.of(flat_um)
     for value in np.unique(level).tolist():

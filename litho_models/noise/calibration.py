@@ -1,4 +1,6 @@
-"""Test the calibration of a stated spread on prints that the fit of the spread has not used."""
+"""Test whether a stated spread of the residuals is calibrated, on prints that were not used to fit the
+spread.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -33,19 +35,21 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import Interval, rms
 
 _FOLDS = 5
-# Roughness is correlated over ten pixels and more, so more pixels would add no information.
+# Number of pixels of each scan that are used in the fit. Roughness is correlated over ten pixels and more, so
+# more pixels would add no information.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
-# Older results contain further values: those of ensembles, and stated bounds for whole scans.
+# Older results also contain values of ensembles and bounds for whole scans, which are ignored.
 class ScanCalibration(Record, extra="ignore"):
-    """The calibration on one scan: negative log-likelihood and CRPS (lower is better), the coverage at the
-    stated levels, and the rms of r/σ.
+    """The calibration on one scan: the negative log-likelihood and the continuous ranked probability score
+    (for both, lower is better), the coverage at the levels of ``Calibration.levels``, and the rms of the
+    residual divided by its stated standard deviation.
 
-    ``ence`` and ``ause`` are fractions, where 0 is best (see ``spread_scores``).
+    ``ence`` and ``ause`` are fractions, for which 0 is best (see ``spread_scores``).
     """
 
     scan: str
@@ -58,14 +62,15 @@ class ScanCalibration(Record, extra="ignore"):
 
 
 class Calibration(Record, extra="ignore"):
-    """A model of the spread, and its calibration on prints that the fit of the spread has not used.
+    """The calibration of one model of the spread, on prints that were not used to fit it.
 
     Args:
         name: whether the spread is constant or depends on covariates.
-        levels: the coverages that a calibrated spread would have.
-        nll, crps_nm, coverage, ence, ause: means over scans.
-        pit: histogram, in 20 bins that sum to one, of the probability that the stated distribution gives to
-            values below r/s. The histogram is flat if the shape of the distribution is right.
+        levels: coverages that the intervals of a calibrated spread would have.
+        nll, crps_nm, coverage, ence, ause: means of the values of ``ScanCalibration`` over scans.
+        pit: histogram of the probability integral transform. The transform of a pixel is the probability that
+            the stated distribution gives to residuals below the observed one. The 20 bins add up to one. If
+            the stated distribution is right, the histogram is flat.
     """
 
     name: str
@@ -81,10 +86,11 @@ class Calibration(Record, extra="ignore"):
 
 
 class SigmaBin(Record, extra="ignore"):
-    """The measured and predicted spread, and its coverage, for pixels within one range of one covariate.
+    """The measured and the predicted spread of the residual, and the coverage of its intervals, for the
+    pixels within one range of one covariate.
 
-    The record contains the coverage of the 68 and 95 % intervals with 95 % confidence intervals over prints,
-    and ENCE and AUSE within the bin.
+    The coverages are those of the 68 % and 95 % intervals, each with its 95 % confidence interval over
+    prints. ``ence`` and ``ause`` are computed from the pixels in this range.
     """
 
     covariate: str
@@ -102,11 +108,12 @@ class SigmaBin(Record, extra="ignore"):
 
 
 class SpreadAnalysis(Record, extra="ignore"):
-    """The spread σ(x) of one model's residuals, and its calibration. ``bins`` are out of fold, while the
-    recorded variance model is fitted to all scans.
+    """The spread σ(x) of the residuals of one model, and its calibration. The values in ``bins`` are computed
+    on scans that were not used to fit the spread, while ``variance`` is a model of the spread that is fitted
+    to all scans.
 
-    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` states whether each fit
-    leaves out prints or scans. The fit is then judged on the prints or scans that it left out.
+    ``nuisance`` names the terms that were removed from the residuals. ``left_out`` says whether prints or
+    scans are left out of each fit of the spread. The fit is then judged on what it left out.
     """
 
     model: str
@@ -121,7 +128,7 @@ class SpreadAnalysis(Record, extra="ignore"):
 
 
 class Stated(NamedTuple):
-    """The stated distribution of the residual of one scan. ``scale_nm`` is the scale of the distribution at
+    """The stated distribution of the residuals of one scan. ``scale_nm`` is the scale of the distribution at
     each pixel, and ``tails`` is its shape.
     """
 
@@ -130,13 +137,14 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """For each print, fit a constant and a covariate-dependent spread to the other prints, and judge both on
-    this print.
+    """Fit two models of the spread of the residuals, and judge both: a constant spread, and one that depends
+    on covariates. For each print, they are fitted to the other prints and judged on this print.
 
-    With fewer than three prints, scans are left out instead. Tails and scale are fitted together.
+    If there are fewer than three prints, groups of scans are left out instead. The shape and the scale of the
+    distribution are fitted together.
 
     Raises:
-        InputError: fewer than three scans.
+        InputError: there are fewer than three scans.
     """
     scans, residuals = found.scans, found.residuals_nm
     if len(scans) < 3:
@@ -184,7 +192,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 def calibrate(
     name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
-    """Judge a stated spread on every scan, and average over scans."""
+    """Judge a stated spread on every scan, and average the results over the scans."""
     rows, histograms = [], []
     for scan, residual, (scale, tails) in zip(scans, residuals_nm, stated, strict=True):
         scored = np.isfinite(residual)
@@ -220,8 +228,8 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Yield the bins: all pixels, each level, and, for every other covariate, ranges with equal numbers of
-    pixels.
+    """Yield the bins: one with all pixels, one for each level, and, for every other covariate, bins with
+    equal numbers of pixels.
     """
     pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
     residual = pool.of(residuals_nm)
@@ -256,7 +264,9 @@ def _bins(
 
 
 def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[str, float, float, Array]]:
-    """Yield each group of pixels: the covariate, the limits of its values in the group, and the pixels."""
+    """Yield each group of pixels as a tuple: the name of the covariate, the lowest and highest value of the
+    covariate in the group, and a mask of its pixels.
+    """
     level = pool.of([scan.mask_level for scan in pool.scans])
     yield "all", 0, 0, np.ones(level.size, bool)
     for one in np.unique(level).tolist():
@@ -268,7 +278,7 @@ def _groups(pool: Pool, places: Sequence[dict[str, Array]]) -> Iterator[tuple[st
 
 
 def _sample(residual: Array, seed: int) -> tuple[Array, ...]:
-    """Return row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
+    """Return the row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels, drawn at random."""
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:
         scored = np.random.default_rng(seed).choice(scored, _PIXELS_PER_SCAN, replace=False)

@@ -1,8 +1,9 @@
-"""Evaluate the dose matrix: height, roughness and lost steps as functions of dose, and the recommended dose.
+"""Evaluate a dose matrix, which is a set of prints at different doses: height, roughness and lost steps at
+each dose, and the recommended dose.
 
-This is the paper's search for a laser power (appendix "Mask and optical elements fabrication"). It uses scans
-that state a dose. They show step ladders, or any layout with areas of one level that are wider than the
-printer's blur.
+The paper searches for a laser power in this way (appendix "Mask and optical elements fabrication"). The
+evaluation uses all scans that state a dose. Their layouts are step ladders, or any layouts with areas of one
+level that are wider than the blur of the printer.
 """
 
 from collections.abc import Sequence
@@ -16,18 +17,20 @@ from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Distance kept from every change of level: four σ of the optical spot, or two σ of a diffusion of 0.5 µm.
+# Pixels closer than this to a change of level are not used. The distance is about four standard deviations of
+# the optical spot, or two standard deviations of a diffusion of 0.5 µm.
 _GUARD_UM = 1.0
-# A step is lost if its height is less than half the usual height of the steps at this dose.
+# A step is lost if its height per level is less than this fraction of the median at the same dose.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Surroundings matter even beyond the guard distance, because diffusion reaches up to 2.5 µm.
+# Distances over which the surroundings of a pixel are averaged. They exceed the distance above, because
+# diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
 class LevelHeight(Record):
-    """The printed height of one level above the lowest printed level, pooled over the scans of a dose."""
+    """The printed height of one level above the lowest printed level, from all scans at one dose together."""
 
     level: int
     height_nm: float
@@ -36,21 +39,22 @@ class LevelHeight(Record):
 
 
 class DoseRow(Record, extra="ignore"):
-    """One dose.
+    """The results at one dose.
 
     Args:
         dose: dose relative to the nominal dose.
-        height_gain: ratio of printed height to nominal height, from the slope of a straight line through the
-            levels.
+        height_gain: slope of a straight line fitted to the printed heights of the levels against their
+            nominal heights.
         full_height_nm: printed height of the highest level above the lowest.
-        roughness_nm: rms deviation within areas of one level.
-        lost_low: number of steps that are lost at the low end because of under-exposure (nothing remains). A
-            step is lost if its height per level is less than half the median at this dose. Steps are compared
-            with others of the same dose, so that shrinkage does not count as a wrong exposure.
-        lost_high: number of steps that are lost at the high end because of over-exposure (nothing more
-            reacts).
-        worst_readability: smallest ratio of a step to the σ of its two levels; if it is at least 3.92, single
-            pixels of the two levels can be told apart.
+        roughness_nm: rms deviation of the height within areas of one level.
+        lost_low: number of steps that are lost at the lowest levels, because under-exposed resist does not
+            remain. A step is lost if its height per level is less than half the median at this dose. It is
+            compared with the other steps at the same dose, so that shrinkage does not count as wrong
+            exposure.
+        lost_high: number of steps that are lost at the highest levels, because over-exposed resist cannot
+            react any further.
+        worst_readability: smallest ratio of the height of a step to the standard deviation σ of its two
+            levels. If it is at least 3.92, single pixels of the two levels can be told apart.
     """
 
     dose: float
@@ -65,7 +69,9 @@ class DoseRow(Record, extra="ignore"):
 
 
 class DoseMatrix(Record):
-    """All doses in ascending order, with the recommended dose and the reason for it."""
+    """The results at all doses, in ascending order of the dose, and the recommended dose with the reason for
+    it.
+    """
 
     rows: list[DoseRow]
     recommended_dose: float
@@ -74,19 +80,23 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge the doses of all scans that state a dose. Notes say which doses are not judged, and why.
+    """Judge all doses that scans state. Return the dose matrix, or None if there is none, and notes that say
+    which doses are not judged, and why.
 
-    A dose needs three levels with areas wide enough to measure, and a matrix needs two doses. Among the doses
-    that lose the fewest steps, the one with the height nearest to nominal is recommended.
+    A dose is judged only if three levels have areas that are wide enough to measure. A matrix needs two such
+    doses. Among the doses that lose the fewest steps, the dose whose heights are nearest to the nominal
+    heights is recommended.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
         if scan.dose is not None:
             by_dose.setdefault(round(scan.dose, 6), []).append(scan)
     if not by_dose:
-        return None, ["No doses in the store: a dose matrix needs a column 'dose' in the card's table."]
+        return None, [
+            "No dose matrix, because no scan in the store states a dose (column 'dose' in the card's table)."
+        ]
     if len(by_dose) == 1:
-        return None, [f"No dose matrix: every dose in the store is {min(by_dose):g}."]
+        return None, [f"No dose matrix, because all scans in the store have the same dose, {min(by_dose):g}."]
     heights = {dose: _level_heights(by_dose[dose]) for dose in sorted(by_dose)}
     narrow = [dose for dose in heights if len(heights[dose]) < _FEWEST_LEVELS]
     rows = [_row(dose, by_dose[dose], heights[dose]) for dose in heights if dose not in narrow]
@@ -136,8 +146,9 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
-    """Return the mean and the standard deviation of the height of each level, computed inside areas of one
-    level. Before this, the datum, the tilt and the effect of the surroundings are removed from each scan.
+    """Return the mean and the standard deviation of the height of each level, computed from pixels far from
+    every change of level. The datum, the tilt and the effect of the surroundings are removed from each scan
+    first.
     """
     found: dict[int, list[Array]] = {}
     for scan in scans:
@@ -148,8 +159,9 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
         y, x = np.nonzero(inside)
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
-        # The fit has a height per level, one tilt, and an effect of the surroundings. Height differences
-        # within the treads distinguish the tilt and the surroundings from the levels.
+        # The fit has one height per level, one tilt, and an effect of the surroundings. Height differences
+        # within areas of one level distinguish the tilt and the effect of the surroundings from the heights
+        # of the levels.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
         others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
@@ -170,14 +182,14 @@ def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Return the mean layout around each pixel, over 1 and 2 µm, minus the layout at the pixel, (2, ny, nx)
-    µm.
+    """Return the mean of the layout around each pixel minus the layout at the pixel, µm, for averages over 1
+    µm and over 2 µm. The result has shape (2, ny, nx).
     """
     return np.stack([blurred_layout_um(scan, reach_um) for reach_um in _REACHES_UM]) - scan.layout_um
 
 
 def _plateaus(scan: PrintedScan) -> Array:
-    """Return a mask (ny, nx) of the measured pixels that are not near any change of level."""
+    """Return a mask, of shape (ny, nx), of the measured pixels that are not near any change of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * round(_GUARD_UM / scan.pitch_um) + 1
@@ -191,6 +203,8 @@ def _run_length(flags: Array) -> int:
 
 
 def _pooled_sd(parts: Sequence[Array]) -> float:
-    """Return the standard deviation within parts, each relative to its mean; 0 if no part has two values."""
+    """Return the pooled standard deviation of values around the mean of their part. Return 0 if no part has
+    two values.
+    """
     squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
     return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

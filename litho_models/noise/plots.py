@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
-    """Draw a map of each reference scan after subtracting its mean. All scans except those of steps share a
-    colour scale.
+    """Draw the height map of each reference scan, with its mean subtracted. All maps except those of steps
+    share one colour scale.
     """
     figure = new_figure(3.1 * len(references) + 0.6, 3.2)
     grid = figure.subplots(1, len(references), squeeze=False)[0]
@@ -42,8 +42,8 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def dose(found: DoseMatrix) -> Figure:
-    """Draw the heights of the levels and the readability against dose. Doses at which steps are lost are
-    shaded.
+    """Draw the height of each level at each dose, and the readability as a function of the dose. Doses at
+    which steps are lost are shaded.
     """
     figure = new_figure(8.5, 3.2)
     left, right = figure.subplots(1, 2)
@@ -72,7 +72,9 @@ def dose(found: DoseMatrix) -> Figure:
 
 
 def spread(found: SpreadAnalysis) -> Figure:
-    """Draw the observed (points) and the predicted (line) rms of the residual in ranges of each covariate."""
+    """Draw the rms of the residual in ranges of each covariate: the measured values as points and the
+    predicted values as a line.
+    """
     names = list(dict.fromkeys(row.covariate for row in found.bins if row.covariate != "all"))
     figure = new_figure(2.8 * len(names), 2.9)
     grid = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
@@ -90,7 +92,9 @@ def spread(found: SpreadAnalysis) -> Figure:
 
 
 def calibration(found: SpreadAnalysis) -> Figure:
-    """Draw the coverage of the 90 % interval scan by scan, and the PIT histogram."""
+    """Draw the coverage of the 90 % interval for each scan, and the histogram of the probability integral
+    transform (``Calibration.pit``).
+    """
     figure = new_figure(9.5, 3.2)
     left, right = figure.subplots(1, 2)
     for number, described in enumerate(found.calibrations):

@@ -1,4 +1,6 @@
-"""Read scans for measuring the noise (bare substrate, flat print, steps), and compute the noise from them."""
+"""Measure the noise from reference scans (of the bare substrate, of flat prints and of steps) and from
+repeated prints.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,13 +26,15 @@ from litho_models.noise.texture import Texture, texture
 from litho_models.scoring.statistics import Interval, interval, rms
 
 _SQUARE_WITHIN = 0.01
-# Number of pixels that two prints of one layout must have in common.
+# Smallest number of pixels that must be measured in both of two prints of one layout.
 _FEWEST_PIXELS = 64
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A scan for measuring the noise. ``use`` is ``substrate``, ``flat`` or ``steps``."""
+    """A scan from which the noise is measured. ``use`` says what it shows: ``substrate``, ``flat`` or
+    ``steps``.
+    """
 
     id: str
     use: str
@@ -39,11 +43,11 @@ class Reference:
 
 
 class ReferencePrints(Record):
-    """Results of the reference scans: the roughness of each surface, the roughness of the print alone, and
-    the steps.
+    """The results from the reference scans: the roughness of each substrate and flat print, the roughness
+    that the print alone adds, and the evaluation of steps.
 
-    ``textures`` describes substrates and flat prints with square pixels, after a quadratic background is
-    removed.
+    ``textures`` describes those substrates and flat prints whose scans have square pixels, after a quadratic
+    background is removed.
     """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
@@ -54,7 +58,9 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """Return the levelled scans of substrates, flat prints and steps in a store, each on its own grid."""
+    """Return the levelled scans of substrates, flat prints and steps in a store. Each scan is on its own
+    grid, not on that of a layout.
+    """
     pitches = store.recorded_pitches_um()
     return [
         Reference(
@@ -69,8 +75,8 @@ def store_references(store: Store) -> list[Reference]:
 
 
 def reference_prints(references: Sequence[Reference], level_height_um: float) -> ReferencePrints:
-    """Compute the results of the reference scans. The roughness of substrates and flat prints is computed
-    twice, once for each background that is removed.
+    """Compute the results from the reference scans. The roughness of substrates and flat prints is computed
+    twice: once after an offset is removed, and once after a quadratic background is removed.
     """
 
     def surfaces(use: str) -> list[SurfaceNoise]:
@@ -103,16 +109,18 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
 
 
 def _has_texture(one: Reference) -> bool:
-    """Return whether a scan has enough lines and square pixels."""
+    """Return True if a scan has square pixels and enough lines for an analysis of its texture."""
     pitch_y_um, pitch_x_um = one.pitch_um
     return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
 
 
 class RepeatedPrints(Record):
-    """The noise of one print, nm. It comes from the print, the microscope and, at edges, the registration.
+    """The noise of a single print, nm, from the differences between repeated prints of one layout. It
+    contains the noise of the print, of the microscope and, at edges, of the registration.
 
-    A polynomial of second degree is removed from each pair, so datum, tilt and bow are not included. Errors
-    that repeat from print to print are not included either. ``ci95_nm`` comes from resampling pairs.
+    A polynomial of second degree is removed from the difference between two prints, so datum, tilt and bow
+    are not included. Errors that repeat from print to print are not included either. ``ci95_nm`` is the 95 %
+    confidence interval of ``sigma_nm``, from resampling the pairs of prints.
     """
 
     sigma_nm: float
@@ -122,11 +130,12 @@ class RepeatedPrints(Record):
 
 
 def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
-    """Estimate the noise variance as half the variance of the difference between prints of one layout at one
-    dose. Return None without repeated prints.
+    """Estimate the noise from repeated prints, which are prints of the same layout at the same dose. The
+    variance of the noise is half the variance of the difference between two such prints. Return None if there
+    are no repeated prints.
 
-    The mean absolute error is the mean absolute difference divided by √2. This is exact for Gaussian noise,
-    and within a few percent for other noise (``estimated_floor``).
+    The mean absolute value of the noise is the mean absolute difference divided by √2. This is exact for
+    Gaussian noise, and correct within a few percent for other noise (see ``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:

@@ -1,4 +1,4 @@
-"""Write ``report.html`` of a noise analysis."""
+"""Write the ``report.html`` of a noise analysis."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
-# A description of the terms that each policy fits to a scan before the noise is measured.
+# Texts that say which terms each policy fits to a scan before the noise is computed.
 _FREE = {
     "none": "nothing fitted",
     "offset": "the zero height of each scan fitted",
@@ -31,7 +31,7 @@ _FREE = {
 
 
 def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], out: str | Path) -> Path:
-    """Write the report of a noise analysis into ``out``; return its path."""
+    """Write the report of a noise analysis into the folder ``out``, and return the path of the report."""
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
@@ -44,7 +44,8 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
         _dose(page, result.dose)
     if result.repeats is not None:
         page.paragraph(
-            f"Noise from {result.repeats.scans} repeated prints: σ = {result.repeats.sigma_nm:.2f} nm (95 %: "
+            f"Noise from {result.repeats.scans} repeated prints: σ = {result.repeats.sigma_nm:.2f} nm (95 % "
+            "interval: "
             f"{interval_text(result.repeats.ci95_nm)}). σ² is half the variance of the difference between "
             "two prints."
         )
@@ -56,7 +57,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
 
 
 def noise_verdict(floor: NoiseFloor) -> str:
-    """State in one sentence how much of a model's error is noise."""
+    """Return one sentence that states how much of the error of a model is noise."""
     return filled(Path(__file__).with_name("verdict.jinja"), floor=floor).strip()
 
 
@@ -65,7 +66,8 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     page.heading("Reference prints")
     page.figure(
         plots.surfaces(references),
-        "Heights relative to their mean. The maps of substrate and flat print have the same scale.",
+        "Heights relative to the mean of each scan. The maps of substrates and flat prints have the same "
+        "colour scale.",
     )
     page.heading("Reference prints in numbers", folded=True)
     rows = [
@@ -76,13 +78,14 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     if rows:
         page.table(
             rows,
-            "Roughness. MAE is the mean absolute deviation from the median.",
+            "Roughness of substrates and flat prints. MAE is the mean absolute deviation from the median.",
             "surfaces.csv",
         )
     if found.print_noise:
         page.table(
             found.print_noise,
-            "Roughness that the print adds in quadrature to the roughness of substrate and microscope.",
+            "Roughness of the print alone. It adds in quadrature to the roughness of the substrate and the "
+            "noise of the microscope.",
             "print_noise.csv",
         )
     for one in found.textures:
@@ -96,8 +99,9 @@ def _texture(page: Page, found: Texture) -> None:
     page.table(
         found.lines,
         f"The directional strength is {found.strength:.2f}. It is 0 if all directions are alike, and 1 if "
-        "all lines have one direction. An isotropic surface is at least as directional with probability "
-        f"{found.isotropic_p:.1g}. The share of the lines is the fraction of the variance that is in the "
+        "all lines have one direction. If the surface were isotropic, the strength would be at least this "
+        f"large with probability {found.isotropic_p:.1g}. The share of the lines is the fraction of the "
+        "variance that is in the "
         "means of the lines along this axis. The share of the period is the fraction of the sum of squares "
         "of these means that has the strongest period. p is the probability of such a peak in a smooth "
         "spectrum. The coherence is 1 if the lines have the same phase on all surfaces.",
@@ -110,7 +114,8 @@ def _steps(page: Page, found: StepPrint) -> None:
     page.heading(f"Steps of {found.id}", folded=True)
     page.table(
         [{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)],
-        f"Steps along {found.axis}. The σ of the treads is {found.tread_sigma_nm:.2f} nm. The readability is "
+        f"Steps along {found.axis}. The standard deviation σ within the treads is {found.tread_sigma_nm:.2f} "
+        "nm. The readability is "
         "the height of a step divided by σ. The height of a misread pixel is nearer to that of the other "
         f"tread. Single pixels resolve steps of at least {found.resolvable_step_nm:.1f} nm.",
         f"steps_{found.id}.csv",
@@ -123,8 +128,10 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
         plots.dose(found),
-        "The green line marks the recommended dose. Steps are lost at the shaded doses. Single pixels "
-        "resolve the levels if the value is above the dashed line.",
+        "The green line marks the recommended dose. Steps are lost at the shaded doses. At doses whose "
+        "point in the right plot is above the dashed line, single pixels of all neighbouring levels can be "
+        "told "
+        "apart.",
     )
     page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
@@ -153,12 +160,16 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     )
     page.figure(
         plots.calibration(found),
-        "These scans were left out of the fit. The first plot shows the percentage of pixels inside their "
+        "Calibration of σ on scans that were left out of its fit. The first plot shows the percentage of "
+        "pixels inside their "
         "predicted 90 % intervals. The second plot is a histogram of the predicted probability of a height "
         "below the measured one; it is flat if σ is right.",
     )
     page.heading(f"Dependence of the uncertainty of {found.model} on its covariates", folded=True)
-    page.figure(plots.spread(found), "Spread by level, slope, distance to the nearest edge, and radius.")
+    page.figure(
+        plots.spread(found),
+        "Spread of the residuals by level, slope, distance to the nearest edge, and radius.",
+    )
     page.table(
         [row for one in found.calibrations for row in _covered(one, [one], {"levels", "pit", "scans"})],
         "Means over scans. NLL is in nats for heights in nm; ENCE and AUSE are fractions (0 is best).",
@@ -169,7 +180,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.table(scans, "By scan.", "calibration_scans.csv", digits=3)
     page.table(
         {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients},
-        "The coefficients of ln s², fitted to all scans.",
+        "Coefficients of ln s², where s is the scale of the residuals in nm, fitted to all scans.",
         "variance.csv",
         digits=4,
     )
@@ -185,7 +196,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
 def _budget(page: Page, found: NoiseBudget) -> None:
     page.heading("Noise budget", folded=True)
     page.paragraph(
-        f"These estimates come from residuals of {found.model} on scans that it had not seen. Both are upper "
+        f"The two estimates below come from residuals of {found.model} on scans that it had not seen. Both "
+        "are upper "
         "limits, because an effect that the model lacks counts as noise unless it is the same in similar "
         "surroundings. Levelling removed a few percent of the variance from the scans. This part is not "
         "included."
@@ -215,7 +227,7 @@ def _shape(freedom: float | None) -> str:
 def _covered(
     one: Calibration, rows: Sequence[Calibration | ScanCalibration], without: Collection[str] = ()
 ) -> Iterator[dict[str, object]]:
-    """Yield the rows of a calibration, or of its scans, with a column for each level of coverage."""
+    """Yield a table row for each calibration or scan in ``rows``, with one column per level of coverage."""
     for row in rows:
         shares = zip(one.levels, row.coverage, strict=True)
         known = row.model_dump(exclude={"name", "coverage", *without})

@@ -1,5 +1,5 @@
-"""Read a model's residuals on the scans of a store, from a benchmark's cache (out of fold) or a frozen
-model.
+"""Compute the residuals of a model on the scans of a store. The predictions come from the cache of a
+benchmark, which predicts held-out scans, or from a frozen model.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ from litho_models.scoring.statistics import Interval, pixel_interval
 
 
 class Residuals(NamedTuple):
-    """The residuals of a model on each scan. A residual is the measured minus the predicted height, nm; it is
-    NaN at pixels that are not scored.
+    """The residuals of a model on each scan. A residual is the measured minus the predicted height.
 
     Attributes:
-        maps_um: the map that the model expects for each scan, (ny, nx).
-        residuals_nm: residuals without the terms of ``protocol``.
-        held_out: whether none of the scans was used to train the model.
+        maps_um: height map that the model predicts for each scan, µm, with shape (ny, nx).
+        residuals_nm: residuals of each scan, nm, after the terms of ``protocol`` are removed, with shape (ny,
+            nx). They are NaN at pixels that are not scored.
+        held_out: True if none of the scans was used to train the model that predicts it.
     """
 
     model: str
@@ -43,44 +43,45 @@ class Residuals(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Concatenated pixels of several scans. ``used`` contains a bool map (ny, nx) for each scan, which marks
-    these pixels.
+    """Some pixels of several scans, treated as one list of n pixels. ``used`` contains a mask for each scan,
+    of shape (ny, nx), which marks these pixels.
     """
 
     scans: Sequence[PrintedScan]
     used: Sequence[Array]
 
     def of(self, maps: Sequence[Array]) -> Array:
-        """Return the values (n,) at these pixels; ``maps`` contains one map for each scan."""
+        """Return the values of ``maps``, which contains one map for each scan, at these pixels. The result
+        has shape (n,).
+        """
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
 
     def interval(self, values: Array, mine: Array) -> Interval:
-        """Return the confidence interval, over prints, of the mean of ``values`` (n,) at the chosen
-        pixels.
+        """Return the confidence interval, over prints, of the mean of ``values`` at the pixels chosen by
+        ``mine``. Both arrays have shape (n,).
         """
         owner = np.repeat(np.arange(len(self.scans)), [int(use.sum()) for use in self.used])
         return pixel_interval(values[mine], owner[mine], [scan.print_id for scan in self.scans])
 
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
-    """Return the residuals of each scan (measured minus predicted) after its scan terms are removed. The
-    terms are fitted on other pixels.
+    """Return the residuals (measured minus predicted height) of each scan, after the per-scan terms are
+    removed. The terms removed from a pixel are fitted to other pixels.
 
-    The pixels, the policy and the shared background are those of the benchmark or, for a frozen model, those
-    of ``evaluate``. The mean absolute value of these residuals is therefore the error that the benchmark or
+    The scored pixels, the policy and the background are those of the benchmark or, for a frozen model, those
+    of ``evaluate``. The mean absolute value of the residuals is therefore the error that the benchmark or
     ``evaluate`` reports.
 
     Args:
-        store: the store from which the source was made.
-        source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``.
-            The cache of the benchmark contains predictions of scans that the fit has not seen. Locked scans
-            are left out.
+        store: dataset store on which the benchmark was run, or to whose scans the frozen model is applied.
+        source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``,
+            whose cache contains predictions of held-out scans. Locked scans are left out.
         model: name of a model in the benchmark; by default the best model.
 
     Raises:
-        InputError: the folder contains neither a frozen model nor a benchmark; the benchmark is of another
-            dataset or lacks its cache; ``model`` is given together with a frozen model; or no scan was
-            predicted.
+        InputError: the folder contains neither a frozen model nor a benchmark; the benchmark belongs to
+            another dataset or its cache is missing; ``model`` is unknown, or is given together with a frozen
+            model; or there are no predictions for scans of the store.
     """
     folder = zoo.model_folder(source, other=["the result of a benchmark"])
     if not (folder / CARD_FILE).exists():
@@ -119,7 +120,9 @@ def _of_benchmark(
         cache = fit_folder(folder / "cache", fit.model, fit.key)
         if not cache.exists():
             raise InputError(
-                f"cache of {folder}", got=f"no {cache.name}", wanted="the benchmark's own cache folder"
+                f"cache of {folder}",
+                got=f"no {cache.name}",
+                wanted="the cache folder that the benchmark wrote",
             )
         record, heights = kept_fit(cache)
         for scan_id, height_um in zip(record.held_out_ids, heights, strict=True):

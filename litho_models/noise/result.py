@@ -1,5 +1,5 @@
-"""The record ``noise.json``: all results about the noise of a dataset, and the noise floor that follows from
-them.
+"""The record ``noise.json``. It contains all results about the noise of a dataset, and the noise floor that
+follows from them.
 """
 
 import numpy as np
@@ -35,8 +35,8 @@ class NoiseAnalysis(Result, extra="ignore"):
 def floor_of(
     found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
 ) -> NoiseFloor:
-    """Choose the source of the noise floor: repeated prints if there are any, otherwise a flat print, and if
-    there is no flat print either, the residuals of a model.
+    """Return the noise floor. It comes from repeated prints, if there are any; otherwise from flat prints;
+    and if there are no flat prints either, from the residuals of a model.
     """
     if repeats is not None:
         return NoiseFloor(

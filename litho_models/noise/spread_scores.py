@@ -1,8 +1,8 @@
-"""Score a stated spread with closed-form scores for a Gaussian or Student's t, and with two scores that
-assume no distribution.
+"""Score a stated spread of residuals. Some scores have a closed form for a Gaussian or Student's t
+distribution; two others (ENCE and AUSE) assume no distribution.
 
-The CRPS of a Gaussian follows Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with the
-opposite sign.
+The continuous ranked probability score (CRPS) of a Gaussian is equation 21 of Gneiting and Raftery 2007,
+doi:10.1198/016214506000001437, with the opposite sign.
 """
 
 from dataclasses import dataclass
@@ -19,53 +19,61 @@ _BINS = 10
 
 @dataclass(frozen=True)
 class Tails:
-    """The shape of a residual over its scale: Student's t, or a Gaussian for ``freedom`` = ∞."""
+    """The distribution of a residual divided by its scale: Student's t with ``freedom`` degrees of freedom,
+    or a Gaussian if ``freedom`` is infinite.
+    """
 
     freedom: float = float("inf")
 
     def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
-        """Return the log density per pixel, up to a constant that depends on the common unit of residual and
-        scale.
+        """Return the logarithm of the probability density of each residual. The unit in which residual and
+        scale are given adds a constant.
         """
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
     def weight(self, z2: Array) -> Array | float:
-        """Return −2 d log density / d z², the weight of a squared residual, which is 1 for a Gaussian."""
+        """Return the weight of a squared residual in a fit: −2 times the derivative of the log density with
+        respect to z², where z is the residual divided by its scale. For a Gaussian, the weight is 1.
+        """
         return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
 
     @property
     def information(self) -> float:
-        """Return the Fisher information of a pixel about the logarithm of the squared scale."""
+        """Return the Fisher information that one pixel carries about the logarithm of the squared scale."""
         return 0.5 if np.isinf(self.freedom) else 0.5 * self.freedom / (self.freedom + 3)
 
     @property
     def sd(self) -> float:
-        """Return the ratio of standard deviation to scale; this requires more than two degrees of freedom."""
+        """Return the ratio of the standard deviation to the scale. It is finite only for more than two
+        degrees of freedom.
+        """
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Return the probability below z (PIT). For residuals divided by their scale, this probability is
-        uniformly distributed if scale and shape are right.
+        """Return the probability of values below z, the probability integral transform. If z is the residual
+        divided by its scale, and if scale and distribution are right, this probability is uniformly
+        distributed.
         """
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return the half width, in units of the scale, of the central interval with the probability
+        """Return half the width, in units of the scale, of the central interval that has the probability
         ``level``.
         """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
-        """Return for each pixel whether it lies within the central interval. The share of pixels in this
-        interval should be ``level``.
+        """Return, for each pixel, whether its residual lies within the central interval that has the
+        probability ``level``. If the spread is calibrated, this holds for the share ``level`` of the pixels.
         """
         return np.abs(residual) <= self.half_width(level) * scale
 
     def crps(self, residual: Array, scale: Array | float) -> Array:
         """Return the continuous ranked probability score in the unit of the residual.
 
-        The score generalises the absolute error to a prediction with a stated spread; for scale → 0, it is
-        |r|. For Student's t, it follows Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        The score generalises the absolute error to predictions with a stated spread. As the scale approaches
+        0, the score approaches the absolute value of the residual. For Student's t, the formula is that of
+        Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom
         density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
@@ -79,11 +87,12 @@ GAUSSIAN = Tails()
 
 
 def normalised_calibration_error(residual: Array, sigma: Array) -> float:
-    """Return ENCE, the mean over bins of σ of ``|rms σ − rms r| / rms σ``.
+    """Return the expected normalised calibration error (ENCE). It is the mean of ``|rms σ − rms r| / rms σ``
+    over bins of σ, where r is the residual.
 
-    Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins contain equal counts. Pixels with the
-    same σ are in the same bin, so a constant σ has only one bin. If each bin contains n independent pixels,
-    the result is about ``1/√(π n)`` by chance, even for a perfect σ.
+    See Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. The bins contain equal numbers of pixels.
+    Pixels with the same σ are in the same bin, so for a constant σ there is only one bin. If each bin
+    contains n independent pixels, the result is about ``1/√(π n)`` by chance, even for a perfect σ.
 
     Args:
         residual, sigma: (pixels,), both in the same unit.
@@ -96,19 +105,22 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
-    """Return the limits of bins of equal counts (fewer bins if values repeat) and the bin of each value."""
+    """Divide values into bins with equal numbers of values. Return the limits of the bins and the number of
+    the bin of each value. If values repeat, there may be fewer bins.
+    """
     limits = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
     return limits, np.searchsorted(limits[1:-1], values, side="right")
 
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
-    """Return AUSE, which states how well σ ranks the pixels by error; 0 is perfect.
+    """Return the area under the sparsification error (AUSE). It states how well σ ranks the pixels by their
+    error; 0 is perfect.
 
-    Pixels are removed in two orders, largest σ first and largest ``|r|`` first. For each order, the mean
-    ``|r|`` of the remaining pixels is a function of the removed share, 0 to 1. AUSE is the area between the
-    graphs of the two functions, in units of the mean ``|r|`` of all pixels. Ilg et al. 2018,
-    arXiv:1802.07095. Each pixel in a group with the same σ counts with the mean of the group, so that the
-    order within the group does not matter.
+    Pixels are removed in two orders: those with the largest σ first, and those with the largest absolute
+    residual ``|r|`` first. For each order, the mean ``|r|`` of the remaining pixels is a function of the
+    share that is removed, from 0 to 1. AUSE is the area between the graphs of these two functions, divided by
+    the mean ``|r|`` of all pixels (Ilg et al. 2018, arXiv:1802.07095). All pixels with the same σ count with
+    their mean ``|r|``, so that their order does not matter.
 
     Args:
         residual, sigma: (pixels,), both in the same unit. At least one residual must not be zero.

@@ -1,4 +1,6 @@
-"""Evaluate step prints: treads, heights of steps, and readability of neighbouring levels."""
+"""Evaluate prints of steps (staircases): the areas between the steps (treads), the heights of the steps, and
+whether neighbouring levels can be told apart (readability).
+"""
 
 from itertools import pairwise
 
@@ -14,21 +16,24 @@ from litho_models.noise.spread_scores import GAUSSIAN
 from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
-# Two heights can be told apart if at most 2.5 % of the pixels of each lie beyond the middle between them.
+# Smallest readability of a step that can be told from the next. At most 2.5 % of the pixels of each of its
+# treads then lie beyond the middle between the two heights.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
-# Distance kept from each edge: at least three σ of the printer's blur.
+# Pixels closer than this to an edge are not used. The distance is at least three standard deviations of the
+# printer's blur.
 _GUARD_UM = 0.75
-# Width of the narrowest tread, as a fraction of the field.
+# Width of the narrowest tread that is searched for, as a fraction of the width of the field.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
 
 
 class Step(Record, extra="ignore"):
-    """One step of a staircase, nm.
+    """One step of a staircase. Heights are in nm.
 
     Args:
-        readability: height divided by the σ of single pixels on its two treads.
-        misread: share of pixels, over both treads, that are nearer to the height of the other tread.
+        readability: height of the step divided by ``sigma_nm``, the standard deviation of single pixels on
+            its two treads.
+        misread: share of the pixels of both treads whose height is nearer to that of the other tread.
     """
 
     height_nm: float
@@ -39,12 +44,14 @@ class Step(Record, extra="ignore"):
 
 
 class StepPrint(Record, extra="ignore"):
-    """A print of steps.
+    """The results from a print of steps.
 
     Args:
-        tread_sigma_nm: rms deviation within the treads after one common plane is removed.
-        tread_mae_nm: mean absolute deviation from the median of each tread.
-        resolvable_step_nm: smallest step at which single pixels can be told apart, 3.92 σ.
+        tread_sigma_nm: rms deviation of the height within the treads, after one tilt common to all treads is
+            removed.
+        tread_mae_nm: mean absolute deviation of the height from the median of its tread.
+        resolvable_step_nm: smallest height of a step at which single pixels of its treads can be told apart:
+            3.92 times ``tread_sigma_nm``.
     """
 
     id: str
@@ -63,17 +70,17 @@ def step_print(
     pitch_um: tuple[float, float],
     level_height_um: float,
 ) -> StepPrint:
-    """Find the treads of a staircase along x or y and judge its steps.
+    """Find the treads of a staircase, which rises along x or y, and judge its steps.
 
     Args:
-        scan_id: name in the result.
-        height_um: (ny, nx), µm; NaN where not measured.
-        pitch_um: (y, x) sampling, µm.
-        level_height_um: nominal height of a step. An edge counts if the heights of its two treads differ by
-            at least half a nominal step.
+        scan_id: name of the scan in the result.
+        height_um: measured height, µm, with shape (ny, nx); NaN where it was not measured.
+        pitch_um: pixel pitch along y and x, µm.
+        level_height_um: nominal height of a step, µm. An edge counts only if the heights on its two sides
+            differ by at least about half of this.
 
     Raises:
-        InputError: no step found.
+        InputError: no step was found.
     """
     axis, edges_px = find_edges(height_um, level_height_um)
     along, pitch_along = (height_um, pitch_um[1]) if axis == "x" else (height_um.T, pitch_um[0])
@@ -91,7 +98,8 @@ def step_print(
                 height_nm=step.height_nm,
                 uncertainty_nm=step.uncertainty_nm,
                 sigma_nm=sigma,
-                # float32 heights of 1 µm have an error of 6e-5 nm.
+                # Rounding to float32 changes a height of 1 µm by up to 6e-5 nm, so a smaller σ is
+                # meaningless.
                 readability=abs(step.height_nm) / max(sigma, 1e-4),
                 misread=_misread(first, second),
             )
@@ -110,21 +118,24 @@ def step_print(
 
 
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
-    """Find the axis of a staircase and the pixels at which a new tread starts, ascending.
+    """Find the axis along which a staircase rises, and the pixels at which a new tread starts, in ascending
+    order.
 
-    A piecewise-constant function is fitted to the profile of medians, minimising the squared error plus a
-    price per edge. The price is based on two treads of the narrowest width whose heights differ by half a
-    level. It is the amount by which an edge between these treads reduces the squared error.
+    A piecewise-constant function is fitted to the profile of the staircase, whose values are medians across
+    it. The fit minimises the squared error plus a price for each edge. The price is the amount by which an
+    edge between two treads reduces the squared error if the treads have the narrowest width and their heights
+    differ by half a level.
 
     Raises:
-        InputError: no edge along either axis.
+        InputError: there is no edge along either axis.
     """
     found: dict[Axis, tuple[float, list[int]]] = {}
     for axis in ("x", "y"):
         profile = np.nanmedian(height_um, axis=0 if axis == "x" else 1)
         profile = profile[np.isfinite(profile)]
         narrowest = max(3, int(len(profile) * _NARROWEST_TREAD))
-        # If two pieces of w pixels that differ by d are joined, the error grows by w d²/2.
+        # If two pieces of w pixels each, whose heights differ by d, are joined to one, the squared error
+        # grows by w d²/2.
         price = narrowest * (level_height_um / 2) ** 2 / 2
         edges = _piecewise_constant(profile, price, narrowest)
         means = [piece.mean() for piece in np.split(profile, edges)]
@@ -140,7 +151,9 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
 
 def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[int]:
-    """Minimise the squared error plus ``price`` per edge, by dynamic programming over the last edge."""
+    """Return the edges of the piecewise-constant function that minimises the squared error plus ``price`` for
+    each edge. It is found by dynamic programming.
+    """
     size = len(profile)
     sums = np.concatenate([[0.0], np.cumsum(profile)])
     squares = np.concatenate([[0.0], np.cumsum(profile**2)])
@@ -163,8 +176,8 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the columns of each tread without a guard zone at both edges. The zone is at most a third as
-    wide as the tread.
+    """Return the columns of each tread, without a zone of ``guard_px`` pixels at both edges. The zone is at
+    most a third as wide as the tread.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]
@@ -172,7 +185,9 @@ def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[
 
 
 def _without_plane(height_um: Array, treads: list[slice]) -> Array:
-    """Remove the common tilt of all treads from the heights; NaN outside the treads."""
+    """Return the heights without the tilt that all treads have in common. The result is NaN outside the
+    treads.
+    """
     ny, nx = height_um.shape
     x, y = smooth_shapes((ny, nx))[:2]
     terms = [np.zeros((ny, nx)) for _ in treads]

@@ -1,4 +1,4 @@
-"""Measure the roughness of one surface: bare substrate, flat print, or the treads of a staircase."""
+"""Measure the roughness of a surface, such as the bare substrate or a flat print."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -21,17 +21,17 @@ BACKGROUNDS: dict[Background, Terms] = {
 
 
 class SurfaceNoise(Record, extra="ignore"):
-    """Deviation of a surface from its background.
+    """The roughness of a surface: how far its heights deviate from its smooth background.
 
     Args:
-        background: the background that was removed, which is the mean (``offset``) or a polynomial of second
-            degree.
-        sigma_nm: root mean square (Sq).
-        sigma_uncertainty_nm: standard uncertainty of ``sigma_nm``, from the number of independent heights in
-            the field.
-        mae_nm: mean absolute deviation from the median, computed from the pixels without assuming a
-            distribution.
-        independent_heights: number of pixels divided by the sum of the squared autocorrelation.
+        background: background that was removed: the mean height (``offset``) or a polynomial of second degree
+            (``quadratic``).
+        sigma_nm: root-mean-square deviation (Sq).
+        sigma_uncertainty_nm: standard uncertainty of ``sigma_nm``, which follows from
+            ``independent_heights``.
+        mae_nm: mean absolute deviation from the median. No distribution is assumed.
+        independent_heights: number of independent heights in the field: the number of pixels divided by the
+            sum of the squared autocorrelation.
     """
 
     id: str
@@ -44,7 +44,8 @@ class SurfaceNoise(Record, extra="ignore"):
 
 
 class PrintNoise(Record, extra="ignore"):
-    """The roughness of the print alone: ``print² = flat² − substrate²``, nm.
+    """The roughness that a print adds to the substrate, nm. Its square is that of the flat print minus that
+    of the substrate: ``print² = flat² − substrate²``.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
@@ -58,19 +59,19 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
     """Measure the roughness of one surface relative to its background.
 
     Args:
-        scan_id: name in the result.
-        height_um: (ny, nx), µm; NaN where not measured.
-        background: ``offset`` or ``quadratic``.
+        scan_id: name of the scan in the result.
+        height_um: measured height, µm, with shape (ny, nx); NaN where it was not measured.
+        background: background to remove: ``offset`` or ``quadratic``.
 
     Raises:
-        InputError: fewer than 64 measured pixels.
+        InputError: fewer than 64 pixels were measured.
     """
     deviation = without_background(height_um, background)
     finite = np.isfinite(deviation)
     if finite.sum() < 64:
         raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
     sigma = NM_PER_UM * rms(deviation[finite])
-    # Unmeasured pixels carry no information, so the mean replaces them in the correlation.
+    # For the autocorrelation, unmeasured pixels are replaced by the mean, because they carry no information.
     filled = np.where(finite, deviation, deviation[finite].mean())
     independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
     centred = deviation[finite] - np.median(deviation[finite])
@@ -86,20 +87,22 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
 
 
 def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
-    """Return the height minus its background, float64 (ny, nx) µm. The background is fitted to the measured
-    pixels by least squares.
+    """Return the height minus its background, µm, which is fitted to the measured pixels by least squares.
+    The result is float64 and has the shape of ``height_um``.
     """
     level = np.zeros(height_um.shape)
     return height_um - fitted_terms(height_um, level, np.isfinite(height_um), BACKGROUNDS[background])[1]
 
 
 def print_noise(flat: SurfaceNoise, substrates: Sequence[SurfaceNoise]) -> PrintNoise:
-    """Compute the roughness of the print alone by subtraction in quadrature, assuming that the roughness of
-    microscope and substrate is independent of the print.
+    """Compute the roughness that a print adds, by subtracting the squared roughness of the substrate from
+    that of the flat print. This assumes that the roughness of the substrate and the noise of the microscope
+    are independent of the roughness of the print.
 
     Args:
-        flat: noise of the flat print.
-        substrates: noise of one or more substrates, after the same kind of background is removed.
+        flat: roughness of the flat print.
+        substrates: roughness of one or more substrates, computed after the same kind of background is
+            removed.
     """
     square = flat.sigma_nm**2 - np.mean([one.sigma_nm**2 for one in substrates])
     if square <= 0:

@@ -1,6 +1,7 @@
-"""Describe the texture of flat surfaces: whether it has lines, in which direction, and with which period.
+"""Describe the texture of flat surfaces: whether it consists of lines, in which direction, and with which
+period.
 
-The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
+The paper says that the roughness of its flat print is line-shaped and not periodic (arXiv:2309.17343).
 """
 
 from collections.abc import Sequence
@@ -16,14 +17,15 @@ RARE = 1e-3
 
 
 class Period(Record, extra="ignore"):
-    """A period of lines.
+    """The strongest period with which lines repeat.
 
     Args:
-        period_um: distance at which lines repeat.
-        share: fraction of the sum of the squared line means that has this period.
-        p: chance that a smooth spectrum contains a peak of at least this height at any frequency.
-        amplitude_nm: root mean square of the amplitude over the surfaces.
-        coherence: 1 if the lines have the same phase in all surfaces, in the coordinates of the given arrays.
+        period_um: distance at which the lines repeat, µm.
+        share: fraction of the sum of squares of the line means that belongs to this period.
+        p: probability that a smooth spectrum has a peak at least this high at any frequency.
+        amplitude_nm: amplitude of this period, as root mean square over the surfaces.
+        coherence: 1 if the lines have the same phase on all surfaces, relative to the first pixel of each
+            array.
     """
 
     period_um: float
@@ -34,13 +36,13 @@ class Period(Record, extra="ignore"):
 
 
 class Lines(Record):
-    """Lines along one axis.
+    """The lines of a texture along one axis.
 
     Args:
-        along: ``x`` (rows) or ``y`` (columns).
-        share: fraction of the surface's variance that is in the means of the lines. It is above zero even for
-            a surface without lines, so compare the two axes.
-        period: the strongest period of these means; None with fewer than 64 lines.
+        along: axis along which the lines run: ``x`` (rows) or ``y`` (columns).
+        share: variance of the means of the lines, as a fraction of the variance of the surface. It is above
+            zero even for a surface without lines, so compare the values of the two axes.
+        period: strongest period of the means of the lines; None if there are fewer than 64 lines.
     """
 
     along: str
@@ -49,13 +51,13 @@ class Lines(Record):
 
 
 class Texture(Record):
-    """Texture of surfaces of one kind.
+    """The texture that one or more surfaces of one kind have in common.
 
     Args:
-        angle_deg: direction of the lines, 0 along x, positive from x to y.
+        angle_deg: direction of the lines in degrees; 0 is along x, and positive angles turn from x to y.
         strength: directional strength; 0 if all directions are alike, 1 if all lines have one direction.
-        isotropic_p: the chance of at least this strength on an isotropic surface.
-        lines: the lines along x and the lines along y.
+        isotropic_p: probability that an isotropic surface has at least this strength.
+        lines: results for the lines along x, then for the lines along y.
     """
 
     id: str
@@ -67,7 +69,9 @@ class Texture(Record):
 
     @property
     def verdict(self) -> str:
-        """State whether the texture is directional and periodic, at a significance level of 1 in 1,000."""
+        """Return a phrase that states whether the texture has a direction and a period. The significance
+        level is 1 in 1,000.
+        """
         directed = (
             f"line-shaped, along {self.angle_deg:.0f}° from x" if self.isotropic_p < RARE else "no direction"
         )
@@ -82,12 +86,12 @@ class Texture(Record):
 
 
 def texture(name: str, heights_um: Sequence[np.ndarray], pitch_um: float) -> Texture:
-    """Measure the texture of levelled surfaces with square pixels.
+    """Measure the texture of levelled surfaces whose scans have square pixels.
 
-    Each surface is an array (ny, nx) of heights in µm. Pixels that are NaN are left out.
+    Each surface is an array of heights, µm, of shape (ny, nx). Pixels that are NaN are left out.
 
     Raises:
-        InputError: a surface of fewer than 64 rows or columns.
+        InputError: a surface has fewer than 64 rows or columns.
     """
     direction = line_direction(heights_um)
     return Texture(
@@ -112,6 +116,8 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Return the mean of each line; lines without a measured pixel get the mean of all lines."""
+    """Return the mean of each line. The heights have a mean of zero, so a line without measured pixels gets
+    the mean of the surface.
+    """
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

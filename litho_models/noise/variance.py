@@ -1,9 +1,10 @@
-"""Fit σ(x), a log-linear model of a residual's spread by layout and position.
+"""Fit σ(x), the spread of a residual at each pixel. Its logarithm is a linear function of covariates, which
+describe the layout at the pixel and the position of the pixel.
 
-The mean is fitted first and then kept fixed. Then ln s² = X β is fitted to the out-of-fold residuals by
-maximum likelihood, with the tails of Student's t. With these two stages, a wide spread cannot hide errors of
-the mean (compare Seitzer et al. 2022, arXiv:2203.09168). Tens of scans determine the coefficients of only a
-few covariates.
+The model of the height is fitted first and then kept fixed. Then the scale s of its residuals on held-out
+scans is fitted as ln s² = X β by maximum likelihood, where the residuals follow Student's t distribution.
+With these two stages, a wide spread cannot hide errors of the predicted height (compare Seitzer et al. 2022,
+arXiv:2203.09168). There are only a few covariates, because tens of scans determine no more coefficients.
 """
 
 import numpy as np
@@ -15,10 +16,11 @@ from litho_data.store import PrintedScan
 from litho_models.noise.spread_scores import GAUSSIAN, Tails
 from litho_models.scoring.like_layouts import blurred_layout_um
 
-# Maps on which σ may depend; the square of the slope and the fourth power of the radius are used too.
+# Names of the maps on which σ depends. The square of the slope and the fourth power of the radius are also
+# covariates.
 PLACES = ("level", "slope", "edge distance", "radius²")
-# The dependence on the level is linear between these knots. Rare levels at both ends are twice as rough as
-# those in the middle.
+# The dependence on the level is linear between these knots. A single straight line would not do: the rare
+# levels at both ends are twice as rough as those in the middle.
 _LEVEL_KNOTS = np.linspace(0, 1, 7)
 COVARIATES = (
     *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
@@ -28,19 +30,21 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# The shapes that are tried, from much heavier tails than those of prints to a Gaussian.
+# Degrees of freedom of Student's t that are tried. They range from much heavier tails than residuals of
+# prints have to a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
-# Standard deviation of the optical spot, which blurs edges of the layout.
+# Standard deviation of the optical spot. The layout is blurred by it before its slope is computed.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
-# Limit on a step, which keeps exp() finite during the fit. It is twice the largest effect seen for noise of 1
-# to 100 nm.
+# Largest change of ln s² in one step of the fit, which keeps exp() finite. It is twice the largest effect of
+# a covariate that was seen for noise of 1 to 100 nm.
 _LARGEST_STEP = 2.0
 _STEPS = 60
 
 
 class VarianceModel(Record):
-    """The model ln s² = Σ β_j φ_j, where s is in nm. ``coefficients`` has the order of ``covariates``.
+    """A fitted model of the spread: ln s² = Σ β_j φ_j, where s is the scale of the residual in nm and φ_j are
+    the covariates. ``coefficients`` contains the β_j in the order of ``covariates``.
 
     The covariates are:
 
@@ -49,7 +53,7 @@ class VarianceModel(Record):
     - the distance to the nearest change of level, limited to 2 µm and divided by this limit;
     - the distance from the centre of the field, divided by half the diagonal of the field.
 
-    ``freedom`` is the number of degrees of freedom of Student's t with scale s, or None for a Gaussian.
+    ``freedom`` is the number of degrees of freedom of Student's t distribution, or None for a Gaussian.
     """
 
     covariates: list[str]
@@ -58,7 +62,7 @@ class VarianceModel(Record):
 
 
 def place_maps(scan: PrintedScan) -> dict[str, Array]:
-    """Return the values of ``PLACES`` at each pixel of a scan, as maps (ny, nx)."""
+    """Return, for each name in ``PLACES``, a map of its values at the pixels of a scan, of shape (ny, nx)."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
@@ -76,8 +80,8 @@ def place_maps(scan: PrintedScan) -> dict[str, Array]:
 
 
 def covariates_of(places: dict[str, Array]) -> Array:
-    """Return φ of each pixel, (..., covariates). ``places`` is the result of ``place_maps`` or a selection of
-    its pixels.
+    """Return the covariates φ of each pixel, with shape (..., covariates). ``places`` is the result of
+    ``place_maps``, or the values of these maps at some pixels.
     """
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
@@ -85,12 +89,16 @@ def covariates_of(places: dict[str, Array]) -> Array:
 
 
 def layout_slope(scan: PrintedScan) -> Array:
-    """Return the slope (height over length) of the layout blurred by the optical spot, (ny, nx)."""
+    """Blur the layout by the optical spot, and return its slope (height over length) at each pixel, with
+    shape (ny, nx).
+    """
     return np.hypot(*np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM), scan.pitch_um))
 
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
-    """Fit the scale (β in ln s² = X β) and the tails of the residuals by maximum likelihood."""
+    """Fit the scale of the residuals (β in ln s² = X β) and the shape of their distribution by maximum
+    likelihood. Return both.
+    """
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
         beta = fit_log_scale(covariates, residual, tails)
@@ -101,17 +109,19 @@ def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
 
 
 def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -> Array:
-    """Fit β of ln s² = X β by maximum likelihood with Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
+    """Fit β of ln s² = X β by maximum likelihood, for a given shape of the distribution. Each step of the
+    Fisher scoring is β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
 
-    The information I of a pixel about ln s² does not depend on s, so one matrix serves all steps.
+    Here w are weights and I is the Fisher information of a pixel about ln s². I does not depend on s, so one
+    matrix serves all steps.
 
     Args:
-        covariates: X, (pixels, k); some of its columns must add up to a constant.
-        residual: r, (pixels,).
-        tails: shape of r/s, which sets the weights w.
+        covariates: matrix X, of shape (pixels, k). Some of its columns must add up to a constant.
+        residual: residuals r, of shape (pixels,).
+        tails: distribution of r/s, which determines the weights w and the information I.
 
     Raises:
-        InputError: no pixels, or residuals that are all zero.
+        InputError: there are not more pixels than covariates, or all residuals are zero.
     """
     square = np.asarray(residual, np.float64) ** 2
     if square.size <= covariates.shape[1] or not square.any():
@@ -136,7 +146,9 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
 
 
 def scale_nm(beta: Array, covariates: Array) -> Array:
-    """Return s of each pixel, nm; ``covariates`` has shape (..., k)."""
+    """Return the scale s of each pixel, nm. ``covariates`` has shape (..., k), and the result has shape
+    (...).
+    """
     return np.exp(0.5 * covariates @ beta)
 
 

@@ -1,1 +1,1 @@
-"""Predict the heights of whole fields, tile by tile."""
+"""Predict the printed heights of whole layouts, tile by tile."""

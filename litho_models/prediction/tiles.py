@@ -1,5 +1,5 @@
-"""Predict whole fields of any size in tiles. For models with a receptive radius, the result is exact; for
-others, it is blended from overlapping tiles.
+"""Predict whole layouts of any size in tiles. For models with a receptive radius, the result equals that of
+one pass over the whole layout. For other models, the result is blended from overlapping tiles.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ TILE_PX = 1024
 
 
 def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
-    """Predict the height (b, 1, y, x), µm, of a layout (b, 1, y, x), µm. The height is differentiable in the
-    layout.
+    """Predict the printed height of a layout. Layout and height have shape (batch, 1, ny, nx) and are in µm.
+    The height is differentiable in the layout.
 
-    A field larger than ``tile_px`` is computed in tiles, each with a margin of the receptive radius. The
-    heights equal those of the whole field computed at once. For a model without a receptive radius, the field
-    is predicted by its ``forward``.
+    A layout larger than ``tile_px`` is computed in tiles, each with a margin as wide as the receptive radius.
+    The heights equal those of the whole layout computed at once. A model without a receptive radius is called
+    with the whole layout.
     """
     reach = model.reach_px
     ny, nx = layout_um.shape[-2:]
@@ -33,21 +33,21 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
 
 
 def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
-    """Predict the height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x -
-    2r), µm.
+    """Predict the height, µm, of the pixels that are at least the receptive radius r from the edge of the
+    layout. For a layout of shape (batch, 1, ny, nx), the result has shape (batch, 1, ny - 2r, nx - 2r).
 
-    The height is differentiable in the layout. The field is computed in tiles of at most ``tile_px``, which
+    The height is differentiable in the layout. It is computed in tiles of at most ``tile_px`` pixels, which
     does not change the result.
 
     Raises:
-        InputError: a model without a receptive radius, or a layout that has no interior.
+        InputError: the model has no receptive radius, or the layout has no interior.
     """
     reach = model.reach_px
     if reach is None or min(layout_um.shape[-2:]) <= 2 * reach:
         raise InputError(
             f"interior of a print by {model.name}",
             got=f"{tuple(layout_um.shape[-2:])} px and a receptive radius of {reach} px",
-            wanted="a field wider than twice the radius",
+            wanted="a layout wider than twice the radius",
         )
     ny, nx = (length - 2 * reach for length in layout_um.shape[-2:])
     rows = []
@@ -62,12 +62,13 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 
 
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
-    """Predict the height of the pixels farther than ``border_px`` from the edge, µm. The height is
-    differentiable in the layout.
+    """Predict the height, µm, of the pixels that are at least ``border_px`` pixels from the edge of the
+    layout. The height is differentiable in the layout.
 
-    The border must be less than half the layout. The result equals that of ``predict_field`` after the border
-    is cropped. If the model allows it, only the pixels that the result needs are computed: see
-    ``FrozenSimulator.inside``.
+    The border must be less than half as wide as the layout. The result equals that of ``predict_field`` with
+    the border cropped, except near the edge of the layout, where ``predict_field`` must assume how the layout
+    continues. If the model allows it, only the pixels of the result are computed (see
+    ``FrozenSimulator.inside``).
     """
     reach = model.reach_px
     if reach is None:
@@ -80,17 +81,18 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
 def blend_tiles(
     function: Callable[[Tensor], Tensor], layout_um: Tensor, tile: Tile, border_px: int = 0
 ) -> Tensor:
-    """Average ``function`` over overlapping tiles with weights that sum to one at each pixel.
+    """Compute ``function`` on overlapping tiles of a layout and blend the results. At each pixel, the result
+    is a weighted mean over the tiles that contain it, with weights that add up to one.
 
-    The first tile starts ``overlap_px`` outside the field. Outside the field, its outermost pixels are
-    repeated. Every pixel of the field is therefore covered by the same number of overlapping tiles.
+    The first tile starts ``overlap_px`` pixels outside the layout, where the outermost pixels of the layout
+    are repeated. The weights thus add up to one at the edge of the layout, too.
 
     Args:
-        function: maps tiles (b, 1, T, T) to their heights.
-        layout_um: (b, 1, y, x), any size, µm.
-        tile: side T and overlap.
-        border_px: width of the border that is cropped from the result; it must be less than half the field.
-            Tiles that lie entirely in the border are not computed.
+        function: receives tiles of shape (batch, 1, T, T) and returns their heights with the same shape.
+        layout_um: layout of any size, µm, with shape (batch, 1, ny, nx).
+        tile: side T of the tiles and their overlap.
+        border_px: width of the border that is cropped from the result. It must be less than half the width of
+            the layout. Tiles that lie entirely in the border are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.
@@ -98,7 +100,7 @@ def blend_tiles(
     size, overlap = tile
     stride = size - overlap
     window = blending_window(tile, layout_um)
-    # Positions are counted from the start of the first tile, ``overlap`` pixels before the field.
+    # Positions are counted from the start of the first tile, which is ``overlap`` pixels before the layout.
     (top, bottom), (left, right) = (
         (overlap + border_px, overlap + length - border_px) for length in layout_um.shape[-2:]
     )
@@ -131,8 +133,9 @@ def blend_tiles(
 
 
 def blending_window(tile: Tile, like: Tensor) -> Tensor:
-    """Return the weight of each pixel of a tile, (T, T): a sin² ramp over the overlap; neighbouring weights
-    add up to one.
+    """Return the weight of each pixel of a tile for blending, with shape (T, T), where T is the side of the
+    tile. Across the overlap, the weight rises as sin², so that the weights of two neighbouring tiles add up
+    to one.
 
     Raises:
         InputError: an overlap of more than half a tile.
@@ -149,7 +152,9 @@ def blending_window(tile: Tile, like: Tensor) -> Tensor:
 
 
 def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:
-    """Predict the height of one scan with a model, float32 (ny, nx) µm, without gradients."""
+    """Predict the printed height of the layout of one scan, without gradients. The result is in µm, float32
+    of shape (ny, nx).
+    """
     device = next(model.parameters(), torch.empty(0)).device
     with torch.no_grad():
         layout = torch.from_numpy(scan.layout_um)[None, None].to(device)

@@ -1,1 +1,3 @@
-"""Compute errors and metrics of one scan, over scans, and between models."""
+"""Score predictions: compute the errors and metrics of a model on one scan and over many scans, and compare
+models.
+"""

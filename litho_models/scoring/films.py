@@ -1,7 +1,7 @@
-"""Compare films by area and by missing, extra or merged features.
+"""Compare a predicted film with a measured film by its area and by its missing, extra or merged features.
 
-A feature is a connected part of the film or of the ground with at least four pixels. Pixels count as film if
-they are higher than half the height of the film.
+A pixel belongs to the film if it is higher than half the height of the film; other pixels belong to the
+ground. A feature is a connected part of the film or of the ground that has at least four pixels.
 """
 
 from typing import NamedTuple
@@ -21,8 +21,8 @@ FILMS_TEXT = (
 
 
 class FilmErrors(NamedTuple):
-    """The errors of a predicted film. ``area_error_percent`` is relative to the measured area, or None if the
-    measured area is zero. The other fields are counts of features.
+    """The errors of a predicted film. ``area_error_percent`` is the error of its area, relative to the
+    measured area; it is None if the measured area is zero. The other fields count features.
     """
 
     area_error_percent: float | None
@@ -32,21 +32,23 @@ class FilmErrors(NamedTuple):
 
 
 def films_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> FilmErrors:
-    """Compare the film of a scan with the predicted film after the per-scan terms are removed."""
+    """Compare the film of a scan with the predicted film. The measured map without the per-scan terms is the
+    prediction plus the residual.
+    """
     return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
 
 
 def film_edge_um(scan: PrintedScan) -> float:
-    """Return half the height of the film, µm."""
+    """Return the height of the contour that is the edge of the film, µm: half the height of the film."""
     return (scan.levels - 1) * scan.level_height_um / 2
 
 
 def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmErrors:
-    """Compare two films.
+    """Compare a measured with a predicted film.
 
     Args:
         measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
-        expected_um: the same shape, without NaN.
+        expected_um: predicted height, µm, with the same shape and without NaN.
         edge_um: height of the contour that is the edge of a film, µm.
     """
     known = np.isfinite(measured_um)
@@ -63,8 +65,8 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """For each part of either film that is large enough, count the parts of the other film that it
-    touches.
+    """Find the connected parts of two masks. For each part that is large enough, count the parts of the other
+    mask that it touches. Return the counts of the first and of the second mask.
     """
     from scipy.ndimage import label
 
@@ -77,7 +79,7 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
         [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
         for kept in (slice(None), real)
     )
-    # A part that touches only parts below the size limit has a partner but does not count as merging parts.
+    # A part that touches only parts below the size limit has a partner, but does not merge parts.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

@@ -1,8 +1,10 @@
-"""Apply the gamma test: compare residuals at pixels with similar surroundings.
+"""Separate noise from errors of a model by comparing residuals at pixels whose surroundings in the layout are
+similar (gamma test).
 
-Residuals that are the same in similar surroundings can still be learned by a model of the layout; differences
-between such residuals are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
-compared with pixels of other scans, so the datum, the gain and the bow of an individual scan count as noise.
+What residuals in similar surroundings have in common could still be learned by a model of the layout.
+Differences between them are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
+compared with pixels of other scans. The datum, the gain and the bow of a single scan therefore count as
+noise.
 """
 
 from collections.abc import Sequence
@@ -15,20 +17,21 @@ from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
-# With more partners, some would be less similar. With fewer, the products of two differences would be
-# noisier.
+# Number of pixels with which each pixel is compared. With more partners, some would be less similar. With
+# fewer, the mean of the products of two differences would be noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
 
 class LikePixels(NamedTuple):
-    """A sample of pixels, and for each pixel the most similar pixels of ``PARTNERS`` other scans.
+    """A random sample of n pixels and, for each of them, the m most similar pixels (partners), each from
+    another scan. m is at most ``PARTNERS``.
 
     Attributes:
-        owner: (n,) the number of the scan that contains each pixel.
-        pixel: (n,) the flat index of each pixel in its scan.
-        partners: (n, m) the positions in these arrays of the pixels that are most similar to each pixel. The
-            pixels in one row belong to different scans.
+        owner: number of the scan that contains the pixel; shape (n,).
+        pixel: flat index of the pixel in its scan; shape (n,).
+        partners: indices of the partners in the arrays ``owner`` and ``pixel``; shape (n, m). The partners in
+            one row belong to different scans.
     """
 
     owner: Array
@@ -36,15 +39,18 @@ class LikePixels(NamedTuple):
     partners: Array
 
     def noise_squared(self, residuals: Sequence[Array]) -> tuple[Array, Array]:
-        """Return an estimate of the noise variance at each pixel, (n,), and the squared residuals, (n,).
+        """Return an estimate of the noise variance at each pixel of the sample, and the squared residual
+        there. Both arrays have shape (n,).
 
-        Each residual r₀, r₁ ... r_m is noise plus a misfit that similar surroundings share. The mean of (r₀ −
-        r_j)(r₀ − r_k), j ≠ k, is therefore the variance of the noise in r₀ alone, whatever the noise of the
-        partners. Half of a squared difference would be too small for pixels with rare surroundings, which are
-        rougher than the surroundings of their partners.
+        The residual r₀ of a pixel and the residuals r₁ ... r_m of its partners are noise plus a misfit that
+        is the same for similar surroundings. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k is therefore the
+        variance of the noise in r₀ alone, whatever the noise of the partners. Half the squared difference of
+        two residuals would be too small for pixels with rare surroundings, because these are rougher than
+        their partners.
 
         Args:
-            residuals: one map (ny, nx) per scan. The results are in the square of its unit.
+            residuals: one residual map per scan, of shape (ny, nx). The results are in the square of its
+                unit.
         """
         value = np.empty(len(self.owner))
         for number, residual in enumerate(residuals):
@@ -56,16 +62,16 @@ class LikePixels(NamedTuple):
 
 
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
-    """Draw pixels at random. For each of them, find the pixels of other scans with the most similar
-    surroundings.
+    """Draw a random sample of pixels. For each of them, find the most similar pixels of other scans.
 
-    Only prints of one dose are compared, because the dose changes the height even for equal layouts.
+    Two pixels are similar if their surroundings in the layout are similar. Only scans at the same dose are
+    compared, because the dose changes the height even for equal layouts.
 
     Args:
-        scans: scans whose layouts vary. At least three of them must have the same dose. Otherwise, the result
-            is None.
-        scored: for each scan, bool (ny, nx), True for pixels that count.
-        seed: decides which pixels are drawn.
+        scans: scans to compare. The result is None unless at least three of them have the same dose and the
+            layouts are not flat.
+        scored: for each scan, a mask of shape (ny, nx) that is True at the pixels that may be drawn.
+        seed: determines which pixels are drawn.
     """
     from scipy.spatial import cKDTree
 
@@ -101,8 +107,8 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
 
 
 def _surroundings(scan: PrintedScan) -> Array:
-    """Return features that describe the surroundings of each pixel: blurred layouts and two slopes, all in
-    µm. The array is (k, ny·nx).
+    """Return k features that describe the surroundings of each pixel: blurred layouts and two slopes, all in
+    µm. The result has shape (k, ny·nx).
     """
     maps = [blurred_layout_um(scan, sigma_um) for sigma_um in _BLURS_UM]
     slopes = np.gradient(blurred_layout_um(scan, _SLOPE_BLUR_UM))
@@ -111,8 +117,8 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
-    """Return the layout of a scan blurred by a Gaussian, (ny, nx) float64. Beyond the edge of the layout, its
-    outermost pixels are repeated.
+    """Return the layout of a scan, µm, blurred by a Gaussian of standard deviation ``sigma_um``. Beyond its
+    edge, the layout is continued by repeating its outermost pixels. The result is float64 of shape (ny, nx).
     """
     from scipy.ndimage import gaussian_filter
 
@@ -120,7 +126,9 @@ def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
 
 
 def _whitened(feature: Array) -> Array:
-    """Return the features scaled to unit covariance, so that distances do not depend on their units."""
+    """Transform the features linearly so that their covariance is the unit matrix. Distances between pixels
+    then do not depend on the units of the features.
+    """
     centred = feature - feature.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov(centred.T))
     kept = values > 1e-9 * values.max()

@@ -1,7 +1,9 @@
-"""Define further metrics of a scan, each with a name, a unit and an explanation. Every report shows them.
+"""The metrics that are computed in addition to the errors, and a function that registers further ones. Every
+report shows all metrics with their unit and an explanation.
 
-A metric function receives one scan, the model's prediction, and the residual without the per-scan terms.
-Built-in metrics are fields of the results; registered ones are listed under ``metrics``.
+A metric is computed by a function that receives one scan, the prediction of the model, and the residual
+without the per-scan terms. In results, the metrics of ``MetricValues`` are fields, and all others are listed
+under ``metrics``.
 """
 
 import math
@@ -22,7 +24,7 @@ MetricFunction = Callable[[PrintedScan, Array, Array], float | None]
 
 
 class Metric(NamedTuple):
-    """The name of a metric, and the rule that combines its values over scans."""
+    """The name and the unit of a metric, and the rule that combines its values over scans."""
 
     name: str
     unit: str
@@ -37,10 +39,11 @@ class Metric(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """The metrics that a function returns, in the same order, and a sentence that explains them.
+    """A function that computes one or more metrics of a scan. ``metrics`` lists them in the order in which
+    the function returns them, and ``explanation`` explains them in a report.
 
-    ``of_films`` is True if only films have these metrics, False if only heights have them, and None if all
-    scans have them.
+    ``of_films`` is True if these metrics exist only for films, False if they exist only for scans of heights,
+    and None if they exist for all scans.
     """
 
     metrics: tuple[Metric, ...]
@@ -77,31 +80,31 @@ _MEASUREMENTS = [
 def register_metric(
     name: str, unit: str, function: MetricFunction, explanation: str, *, over_scans: Summary = "mean"
 ) -> Metric:
-    """Register a metric, which every later evaluation and benchmark of this process then computes.
+    """Register a metric. Every later evaluation and benchmark of this process then computes it.
 
-    ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps, both (ny, nx) in
-    µm. The first map is the prediction. The second map is the measured minus the predicted height after the
-    per-scan terms are removed; it is NaN at pixels that are not scored. The function returns a number, or
-    None if there is nothing to measure. Example::
+    ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps in µm, of shape
+    (ny, nx). The first map is the predicted height. The second map is the measured minus the predicted
+    height, after the per-scan terms are removed; it is NaN at pixels that are not scored. The function
+    returns a number, or None if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
             "worst_pixel is the largest error of a scan.",
         )
 
-    Results list it by scan and by model as ``metrics: {"worst_pixel_nm": …}``.
+    Results then contain ``metrics: {"worst_pixel_nm": …}`` for each scan and for the model.
 
     Args:
-        name: letters, digits and underscores.
-        unit: the same characters; ``1`` for a metric without a unit.
-        function: as above.
-        explanation: a sentence for the report.
-        over_scans: whether the value of a model is the ``mean`` or the ``sum`` of the known values of its
-            scans.
+        name: name of the metric: letters, digits and underscores.
+        unit: unit of the metric, with the same characters; ``1`` for a metric without a unit.
+        function: function that computes the metric of one scan, as described above.
+        explanation: sentence that explains the metric in the report.
+        over_scans: whether the metric of a model is the ``mean`` or the ``sum`` of its values for the scans,
+            without those that are None.
 
     Raises:
-        InputError: a name or unit that is not an identifier, a name that is already taken, or an unknown
-            value of ``over_scans``.
+        InputError: the name or the unit is not an identifier, the name is already taken, or ``over_scans`` is
+            neither of the two.
     """
     metric = Metric(name, unit, over_scans)
     if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):
@@ -115,7 +118,7 @@ def register_metric(
 
 
 def registered_metrics() -> list[Metric]:
-    """Return all metrics, in the order of the tables."""
+    """Return all metrics, in the order in which tables show them."""
     return [metric for measurement in _MEASUREMENTS for metric in measurement.metrics]
 
 
@@ -127,10 +130,11 @@ def metrics_text(keys: Collection[str]) -> str:
 
 
 def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> dict[str, Any]:
-    """Compute all metrics of one scan from maps (ny, nx) in µm. Return them as fields of ``MetricValues``.
+    """Compute all metrics of one scan from the predicted height and the residual, µm, of shape (ny, nx).
+    Return them as the fields of ``MetricValues``.
 
     Raises:
-        InputError: a metric that returns neither a number nor None.
+        InputError: the function of a metric returns neither a number nor None.
     """
     values: dict[str, float | None] = {}
     for measurement in _MEASUREMENTS:
@@ -142,8 +146,8 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
 
 
 def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
-    """Combine the metrics of scans into the metrics of a model: the mean or the sum of the known values of
-    each metric. Return them as fields of ``MetricValues``.
+    """Combine the metrics of scans into the metrics of a model. Each is the mean or the sum of the values
+    that are known. Return them as the fields of ``MetricValues``.
     """
     values = {}
     for metric in registered_metrics():
@@ -156,7 +160,7 @@ def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
 
 
 def _as_fields(values: Mapping[str, float | None]) -> dict[str, Any]:
-    """Arrange built-in metrics as fields, and all others under ``metrics``."""
+    """Arrange metrics as the fields of ``MetricValues``. Those without a field are put under ``metrics``."""
     own = {key: value for key, value in values.items() if key in ScanRow.model_fields}
     return {**own, "metrics": {key: value for key, value in values.items() if key not in own}}
 

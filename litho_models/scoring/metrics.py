@@ -1,4 +1,4 @@
-"""Compute the errors of one scan over its valid pixels."""
+"""Compute the errors of a prediction over the valid pixels of one scan."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -13,16 +13,17 @@ from litho_models.scan_terms import Blocks, CrossFit, NuisanceProtocol, cross_fi
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
-# Difference of the refractive index between resist and air at the red helium-neon line, for which the
-# elements are designed.
+# The designed elements are used with the red line of a helium-neon laser: its wavelength, and the difference
+# of the refractive index between resist and air at this wavelength.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 class PrintGain(NamedTuple):
-    """A fitted line, measured height = slope · prediction + intercept, and the standard error of its slope.
+    """A straight line fitted to a scan, measured height = slope · predicted height + intercept, and the
+    standard error of its slope.
 
-    A value is None if it cannot be computed: a constant prediction has no slope, and a single block gives no
-    error.
+    A value is None if it cannot be computed: there is no slope for a constant prediction, and no standard
+    error if there is only one block.
     """
 
     slope: float | None
@@ -33,17 +34,18 @@ class PrintGain(NamedTuple):
 def print_gain(
     height_um: Array, prediction_um: Array, used: Array, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
-    """Fit a least-squares line to the selected pixels of a scan.
+    """Fit a straight line by least squares to measured against predicted heights at the selected pixels of a
+    scan.
 
-    Residuals of neighbouring pixels are correlated, so the variance is computed from whole blocks (Liang and
-    Zeger 1986). In each block, the products of residual and regressor are summed. The sums of different
-    blocks are assumed to be independent, which holds if the blocks are wide compared with the correlation
-    length (7 px on the measured prints).
+    Residuals of neighbouring pixels are correlated, so the standard error is computed from blocks of pixels
+    (Liang and Zeger 1986). In each block, the products of residual and regressor are summed. The sums of
+    different blocks are assumed to be independent. This holds if the blocks are wide compared with the
+    correlation length, which is 7 px on the measured prints.
 
     Args:
-        height_um, prediction_um: (ny, nx), float.
-        used: (ny, nx), bool; True for the selected pixels, of which there is at least one.
-        block_px: side of a block.
+        height_um, prediction_um: measured and predicted height, µm, of shape (ny, nx).
+        used: mask of the selected pixels, of shape (ny, nx); at least one must be True.
+        block_px: side of a block, in pixels.
     """
     x, y = (np.asarray(a, np.float64)[used] for a in (prediction_um, height_um))
     middle, height = float(x.mean()), float(y.mean())
@@ -61,12 +63,13 @@ def print_gain(
 
 
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
-    """Score a prediction against a scan, both (ny, nx) in µm, on the pixels that ``cross_fit`` scores.
+    """Compute the errors of a prediction on one scan, over the pixels that ``cross_fit`` scores. Measured and
+    predicted height have shape (ny, nx) and are in µm; ``free`` is the result of ``cross_fit`` for them.
 
-    ``print_gain`` computes the slope and the intercept, which are the gain and the offset of the print.
+    The slope and the intercept of ``print_gain`` are the gain and the offset of the print.
 
     Raises:
-        InputError: no valid pixel.
+        InputError: no pixel is scored.
     """
     scored = np.isfinite(free.residual_um)
     if not scored.any():
@@ -87,16 +90,16 @@ def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: Cros
 
 
 def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtocol) -> Array:
-    """Return the measured minus the expected map of a scan after its per-scan terms are removed. The result
-    is (ny, nx) in µm, and NaN at pixels that are not scored.
+    """Return the measured minus the expected map of a scan, after the per-scan terms are removed. The result
+    is in µm, has shape (ny, nx), and is NaN at pixels that are not scored.
     """
     terms = policy_terms(protocol.policy)
     return cross_fit(scan.height_um, expected_um, scan.valid, terms, protocol.blocks).residual_um
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the datum-free error of a model under policy ``offset``, averaged over scans. ``heights_um``
-    contains the predicted heights (ny, nx) of each scan.
+    """Return the datum-free error of a model with the policy ``offset``, nm, averaged over scans.
+    ``heights_um`` contains the predicted height of each scan, µm, of shape (ny, nx).
     """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))
@@ -104,7 +107,7 @@ def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> 
 
 
 def phase_waves(height_error_um: float) -> float:
-    """Return the phase error, in waves, of light that passes through an element whose height is wrong by
-    ``height_error_um``.
+    """Return the phase error, in waves, of light that passes through an element at a place where its height
+    is wrong by ``height_error_um``.
     """
     return height_error_um * INDEX_STEP / WAVELENGTH_UM

@@ -1,8 +1,8 @@
-"""Estimate the noise floor of a dataset: the smallest possible error of any model, for each set of per-scan
-terms.
+"""Estimate the noise floor of a dataset, which is the smallest error that any model can have. It is estimated
+for each policy, that is, for each set of per-scan terms that may be fitted.
 
-The floor is measured on flat or repeated prints if there are any. Otherwise it is estimated from the
-out-of-fold residuals of a model, by comparing pixels with similar surroundings (``like_layouts``).
+If there are flat or repeated prints, the floor is measured on them. Otherwise it is estimated from the
+residuals of a model on held-out scans, by comparing pixels with similar surroundings (``like_layouts``).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,10 +25,10 @@ NOISE_FILE = "noise.json"
 
 
 class PolicyFloor(Record):
-    """The floor of the errors (in nm) under one nuisance policy, with 95 % confidence intervals over prints.
+    """The noise floor under one nuisance policy, nm, with 95 % confidence intervals over prints.
 
-    ``k`` is the number of terms per scan. If the policy includes line offsets, it is the effective number of
-    terms. The intervals are None if there are fewer than six prints.
+    ``k`` is the number of terms that are fitted to each scan; with line offsets, it is their effective
+    number. The intervals are None if there are fewer than six prints.
     """
 
     policy: Policy
@@ -40,12 +40,13 @@ class PolicyFloor(Record):
 
 
 class NoiseFloor(Record):
-    """The error that noise alone causes; ``kind`` states how it was estimated.
+    """The noise floor: the error that noise alone causes, nm. ``kind`` says how it was estimated, and
+    ``source`` says from what.
 
-    ``mae_nm`` and ``rmse_nm`` are the floors under policy ``offset``. ``by_policy`` has a floor for each
-    policy; it is empty in older result files, or if only the floor of ``offset`` is known. The kinds
-    ``lower-bound`` and ``literature`` occur in older files; ``lower-bound`` also occurs in loops on fewer
-    than three scans.
+    ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error under the
+    policy ``offset``. ``by_policy`` contains the floors under each policy. It is empty in older result files,
+    or if only the floor under ``offset`` is known. The kinds ``lower-bound`` and ``literature`` occur in
+    older files; ``lower-bound`` is also used by closed loops on fewer than three scans.
     """
 
     mae_nm: float | None
@@ -55,11 +56,11 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """Return the floor of the errors under this policy; None if it is unknown."""
+        """Return the noise floor under this policy, or None if it is unknown."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
-        """Return the floor of the mean absolute error under this policy, in nm; None if it is unknown."""
+        """Return the floor of the mean absolute error under this policy, nm, or None if it is unknown."""
         row = self.at(policy)
         return row.mae_nm if row else self.mae_nm if policy == "offset" else None
 
@@ -74,7 +75,7 @@ UNKNOWN_FLOOR = NoiseFloor(
 
 
 class _StatedFloor(Result, extra="ignore"):
-    """The parts of a noise analysis that this module reads: its dataset and the floor."""
+    """The parts of ``noise.json`` that this module reads: the dataset and the noise floor."""
 
     SCHEMA = "litho-models/noise/1"
     FILE_NAME = NOISE_FILE
@@ -84,15 +85,15 @@ class _StatedFloor(Result, extra="ignore"):
 
 
 def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
-    """Read the floor from a noise analysis; without an analysis, the floor is unknown.
+    """Return the noise floor that a noise analysis states. If no analysis is given, the floor is unknown.
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
-        analysis: path of ``noise.json`` or of its folder. The analysis must describe this dataset, or scans
-            without a dataset.
+        analysis: path of a ``noise.json`` or of its folder. It must belong to this dataset, or to single
+            scans that belong to no dataset.
 
     Raises:
-        InputError: no noise analysis at this path, or an analysis of another dataset.
+        InputError: there is no noise analysis at this path, or it belongs to another dataset.
     """
     if analysis is None:
         return UNKNOWN_FLOOR
@@ -109,13 +110,14 @@ def estimated_floor(
     blocks: Blocks | None = None,
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit on the floor under every policy, from predictions of held-out scans.
+    """Estimate an upper limit of the noise floor under every policy, from the predictions of a model for
+    held-out scans.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        maps_um: for each scan, the map that the model expects, (ny, nx) in µm.
-        blocks: selects the pixels to which terms are fitted and the pixels that are scored. Use the same
+        maps_um: height map that the model predicts for each scan, µm, of shape (ny, nx).
+        blocks: blocks that decide to which pixels terms are fitted and which pixels are scored. Use the same
             blocks as for the errors that are compared with the floor.
         seed: decides which pixels are drawn.
     """
@@ -128,8 +130,8 @@ def freed_by_policy(
     blocks: Blocks | None = None,
     policies: Iterable[Policy] = tuple(POLICIES),
 ) -> dict[Policy, list[CrossFit]]:
-    """Return the residuals of each scan under each policy. ``maps_um`` contains the expected maps, (ny, nx)
-    in µm.
+    """Return the residuals of each scan after the terms of each policy are removed. ``maps_um`` contains the
+    predicted map of each scan, µm, of shape (ny, nx).
     """
     return {
         policy: [
@@ -146,23 +148,24 @@ def floor_of_residuals(
     freed: Mapping[Policy, Sequence[CrossFit]],
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit on the floor from the residuals of held-out scans.
+    """Estimate an upper limit of the noise floor from the residuals of a model on held-out scans.
 
     On a random sample of pixels, ``LikePixels`` finds the fraction of the squared error that pixels with
-    similar surroundings do not share. The floor is the error over all scored pixels times the square root of
-    this fraction. For the mean absolute error, this assumes that the distributions of the noise and of the
-    residual have the same shape, that is, the same E|n|/σ. The noise need not be Gaussian, because nearly all
-    of the residual is noise. Suppose that half of the squared error came from a misfit with another
-    distribution than the noise (a Laplace distribution in Gaussian noise, or the reverse). Then the floor
-    would be wrong by up to 6 %.
+    similar surroundings do not have in common. The floor is the error over all scored pixels times the square
+    root of this fraction. For the mean absolute error, this assumes that noise and residual have the same
+    ratio of mean absolute value to standard deviation. The noise need not be Gaussian for this, because
+    nearly all of the residual is noise. If half of the squared error came from a misfit with another
+    distribution (a Laplace distribution beside Gaussian noise, or the reverse), the floor would be wrong by
+    up to 6 %.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        freed: result of ``freed_by_policy``, which must include the policy ``offset``.
+        freed: residuals under each policy, as returned by ``freed_by_policy``. They must include the policy
+            ``offset``.
         seed: decides which pixels are drawn.
     """
-    # Scans are taken in the order of their ids, so that the same scans always give the same pixels.
+    # The scans are sorted by id, so that the same pixels are drawn whatever their order.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
     scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]

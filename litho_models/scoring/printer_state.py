@@ -1,4 +1,6 @@
-"""Describe the state of the printer by values from one scan: gain, error, and the kind of layout."""
+"""Describe the state of the printer by values from single scans: the gain of the heights, the error of the
+model, and the kind of layout.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,14 +19,16 @@ _SURFACE = frozenset({"offset", "bow"})
 
 
 class ScanFigures(Record):
-    """Values that compare a scan with a model, after the offset, tilt and bow of the scan are removed.
+    """Values that compare a scan with the prediction of a model, after the offset, tilt and bow of the scan
+    are removed.
 
     ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is its
-    standard error, which is computed over blocks and is None for a single block (see ``print_gain``).
-    ``error_nm`` is the mean absolute error under policy ``full`` (k = 7), which also fits the gain. Its terms
-    are fitted on pixels other than those that are scored. ``order`` is the position in printing order.
-    ``relief_nm`` and ``steepness`` are the standard deviation and rms slope of the predicted height, which
-    characterise the layout. ``held_out`` is True if the model was not trained on the scan.
+    standard error, which is computed from blocks of pixels and is None if there is only one block (see
+    ``print_gain``). ``error_nm`` is the mean absolute error under the policy ``full``, which also fits the
+    gain (7 terms). The terms are fitted to other pixels than those that are scored. ``order`` is the position
+    of the scan in printing order. ``relief_nm`` and ``steepness`` are the standard deviation and the rms
+    slope of the predicted height, which characterise the layout. ``held_out`` is True if the model was not
+    trained on the scan.
     """
 
     scan: str
@@ -43,18 +47,19 @@ class ScanFigures(Record):
 def scan_figures(
     scan: PrintedScan, prediction_um: np.ndarray, *, held_out: bool = True
 ) -> ScanFigures | None:
-    """Return the values that compare a scan with a model; None for a flat layout, which has no gain.
+    """Return the values that compare a scan with the prediction of a model. Return None for a flat layout,
+    which has no gain.
 
-    Offset, tilt and bow are removed from both the measured and the predicted height. This gives the same gain
-    as a joint fit of all terms (Frisch and Waugh 1933).
+    Offset, tilt and bow are removed from both the measured and the predicted height before the gain is
+    fitted. This gives the same gain as a joint fit of all terms (Frisch and Waugh 1933).
 
     Args:
         scan: the scan.
-        prediction_um: the map that the model expects, (ny, nx) in µm.
-        held_out: whether the model was not trained on the scan.
+        prediction_um: height that the model predicts, µm, of shape (ny, nx).
+        held_out: True if the model was not trained on the scan.
 
     Raises:
-        InputError: input that ``cross_fit`` refuses.
+        InputError: ``cross_fit`` cannot process the scan, for example because it is too small.
     """
     blocks = Blocks()
     residual = cross_fit(scan.height_um, prediction_um, scan.valid, POLICIES["full"], blocks).residual_um

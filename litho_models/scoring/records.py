@@ -1,5 +1,5 @@
-"""Records of scoring: a prediction, the scores of a scan and of a model, and the paired scores of two
-models.
+"""The records of scoring: a prediction, the scores of a scan, the scores of a model, and the comparison of
+two models.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from litho_models.scoring.transfer import LevelError, TransferCurves
 
 LEADING: dict[Instrument, str] = dict.fromkeys(get_args(Instrument), "mae_datum_free_nm")
 LEADING["sem"] = "edge_mean_nm"
-"""The error by which models are ranked and compared, for each instrument."""
+"""For each instrument, the name of the leading error, by which models are ranked and compared."""
 
 
 class Prediction(NamedTuple):
-    """The maps that a model predicts for a scan, (ny, nx) in µm: the height of the print and, if it is known,
-    the background that all scans share.
+    """What a model predicts for a scan: the height of the print and what the microscope adds to it
+    (``background_um``), if this is known. Both are maps in µm, of shape (ny, nx).
     """
 
     height_um: Array
@@ -36,23 +36,25 @@ class Prediction(NamedTuple):
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """Make the prediction of a print, including a learned background if there is one."""
+        """Make a prediction from the height of a print and a learned background, if there is one."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
-        """Make the prediction of a print as seen through a learned measurement model."""
+        """Make a prediction from the height of a print and a learned measurement model."""
         return cls(height_um, measurement.expected_um(scan, height_um) - height_um)
 
     @property
     def map_um(self) -> Array:
-        """Return the map that the microscope is expected to show."""
+        """Return the height map that the microscope is expected to show, µm."""
         return self.height_um if self.background_um is None else self.height_um + self.background_um
 
 
 class PolicyError(Record):
-    """Mean absolute error under one nuisance policy, nm, with its confidence interval over scans."""
+    """The mean absolute error under one nuisance policy, nm, with its 95 % confidence interval over scans.
+    ``k`` is the number of terms that are fitted to each scan.
+    """
 
     policy: Policy
     k: float
@@ -61,11 +63,12 @@ class PolicyError(Record):
 
 
 class MetricValues(Record):
-    """Metrics in addition to the errors, computed on maps without the per-scan terms (``metric_registry``).
+    """The metrics that are computed in addition to the errors, from maps without the per-scan terms (see
+    ``metric_registry``).
 
-    ``structural_similarity`` computes the SSIM, and ``EdgePlacement`` explains the edge metrics. Other
-    metrics are listed by name and unit under ``metrics``. A metric is None if there was nothing to compare,
-    or if the result file is older than the metric.
+    ``ssim`` is explained at ``structural_similarity``, and the metrics of edges at ``EdgePlacement``. All
+    other metrics are in ``metrics``; their keys contain name and unit. A metric is None if there was nothing
+    to compare, or if the result file is older than the metric.
     """
 
     ssim: float | None = None
@@ -77,18 +80,18 @@ class MetricValues(Record):
     metrics: dict[str, float | None] = Field(default_factory=dict)
 
     def metric(self, key: str) -> float | None:
-        """Return the metric with this name in results; None if it was not measured."""
+        """Return the metric with this key, or None if it was not computed."""
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-# Older results also contain the error of the intercept.
+# Older results also contain the standard error of the intercept, which is ignored.
 class ScanErrors(Record, extra="ignore"):
-    """The error of one model on one scan over the scored pixels.
+    """The errors of one model on one scan, over the scored pixels.
 
-    ``*_abs`` and ``bias`` (measured minus predicted) are computed without any fit to the scan.
-    ``*_datum_free`` are computed after per-scan terms are removed, which are fitted on other pixels.
-    ``slope`` and ``intercept_nm`` are the gain and the offset of the measured height relative to the
-    predicted height (see ``print_gain``).
+    ``mae_abs_nm`` and ``bias_nm`` (measured minus predicted) are computed with nothing fitted to the scan.
+    The errors with ``datum_free`` in their name are computed after per-scan terms are removed, which are
+    fitted to other pixels. ``slope`` and ``intercept_nm`` are the gain and the offset of the measured height
+    relative to the predicted height (see ``print_gain``).
     """
 
     pixels: int
@@ -110,14 +113,14 @@ class ScanRow(MetricValues, ScanErrors):
     print: str
 
 
-# Older results also contain the spread of line offsets.
+# Older results also contain the spread of the line offsets, which is ignored.
 class ModelScores(MetricValues, extra="ignore"):
-    """All scores of one model: means over scans, sums of counts, and confidence intervals from resampled
-    scans.
+    """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
+    intervals come from resampling scans.
 
-    ``without_background`` contains the errors of ``by_policy`` as they are without the background of the
-    protocol. It covers only the policies without smooth terms, and is empty if the protocol has no
-    background. ``phase_rms_waves`` is the RMS phase error of light that passes through the print.
+    ``without_background`` contains the same errors as ``by_policy``, but computed without the background of
+    the protocol. It covers only the policies without smooth terms, and is empty if the protocol has no
+    background. ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes through the print.
     """
 
     model: str
@@ -141,30 +144,32 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_nm(self) -> float:
-        """Return the error by which models are ranked. For films it is the error of edges, and infinite if
-        there are no edges. Otherwise, it is the error of heights.
+        """Return the leading error, by which models are ranked, nm. For films it is the mean shift of the
+        edges, which is infinite if there are no edges. For other scans it is the datum-free error of the
+        height.
         """
         value = getattr(self, LEADING[self.seen_by])
         return math.inf if value is None else float(value)
 
     @property
     def leading_ci95_nm(self) -> Interval:
-        """Return the confidence interval of the leading error."""
+        """Return the 95 % confidence interval of the leading error."""
         return self.edge_mean_ci95_nm if self.seen_by == "sem" else self.mae_datum_free_ci95_nm
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """Return the leading error of every scan by id; NaN if a film has no edge."""
+        """Return the leading error of each scan by its id. The error is NaN if a film has no edges."""
         values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
         return {scan: math.nan if value is None else value for scan, value in values.items()}
 
 
 class Paired(Record):
-    """The leading error of the first model minus that of the second model, averaged over scans. A negative
-    mean favours the first model.
+    """The comparison of two models. ``mean_nm`` is the leading error of the first model minus that of the
+    second model, averaged over scans. A negative mean favours the first model. ``first_better`` counts the
+    scans in which the first model is better.
 
-    ``over_prints`` is the same comparison, but resamples whole prints. It is None for a single print and in
-    older result files.
+    ``over_prints`` is the same comparison, but with whole prints as units. It is None if there is only one
+    print, and in older result files.
     """
 
     first: str
@@ -178,16 +183,18 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of two models on the same scans. Scans are paired by id, because results
-    list scans by fold.
+    """Compare the leading errors of two models on the same scans. The scans are paired by id, because results
+    list them in the order of the folds.
 
     Raises:
-        InputError: scores of different scans.
+        InputError: the two models were scored on different scans.
     """
     errors = [score.leading_of_scans_nm for score in (first, second)]
     if errors[0].keys() != errors[1].keys():
         counts = " and ".join(str(len(found)) for found in errors)
-        raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
+        raise InputError(
+            "paired scores", got=f"{counts} scans", wanted="both lists of scores to cover the same scans"
+        )
     differences = [one - errors[1][scan] for scan, one in errors[0].items()]
     found = over_units(differences, seed=seed)
     return Paired(

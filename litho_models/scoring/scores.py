@@ -1,4 +1,4 @@
-"""Score a model: turn predictions of scans into one validated record."""
+"""Score a model: compute all errors and metrics from its predictions of scans."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms; only their errors depend on a smooth background.
+# Policies without smooth terms. Only the errors under these policies depend on a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 
@@ -25,17 +25,18 @@ def score_model(
     predictions: Sequence[Prediction],
     protocol: NuisanceProtocol,
 ) -> ModelScores:
-    """Score the predictions of one model on whole scans, under one protocol and under all policies.
+    """Score the predictions of one model. The main scores follow the given protocol; the mean absolute error
+    is also computed under every other policy.
 
     Args:
         name: name of the model.
         scans: the scans.
-        predictions: the prediction of the model for each scan.
-        protocol: states which terms are removed from the scans, and whether the predictions include
-            backgrounds.
+        predictions: predictions of the model, one for each scan.
+        protocol: states which terms are fitted to each scan, and whether the predictions include a
+            background.
 
     Raises:
-        InputError: predictions that are not finite, or a scan too small for the policies.
+        InputError: a prediction is not finite, or a scan is too small for the policies.
     """
     blocks = protocol.blocks
     maps = [prediction.map_um for prediction in predictions]

@@ -1,8 +1,9 @@
-"""Compare the shapes of printed maps: structural similarity and edge placement.
+"""Compare the shapes in a measured and a predicted map by their structural similarity and by the placement of
+their edges.
 
-Edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds their
-positions by linear interpolation between pixels. Nothing is smoothed, so the roughness of the measured
-contour is part of the error.
+The edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds them
+by linear interpolation between pixels. Nothing is smoothed, so the roughness of the measured contours is part
+of the error.
 """
 
 from typing import NamedTuple
@@ -19,7 +20,7 @@ SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
 _CANDIDATES, _MOST_HEIGHTS = 8, 24
-# Half the length of the longest possible piece of a contour, the diagonal of a pixel.
+# Half the length of the longest possible piece of a contour, which is the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
     f"SSIM is computed with a Gaussian window (σ {SSIM_SIGMA_PX:g} px, width {SSIM_WINDOW_PX} px) and a data "
@@ -35,12 +36,14 @@ EDGES_TEXT = (
 
 
 class EdgePlacement(NamedTuple):
-    """Distances between measured and expected contours. The contours are divided into pieces, each of which
-    lies within one pixel.
+    """The distances between measured and expected contours, and counts. The contours are divided into pieces,
+    each of which lies within one pixel.
 
-    A piece has a partner if the expected contour of the same height passes within the search distance and
-    rises to the same side. ``mean_nm`` and ``p95_nm`` cover the pieces with a partner and are None if no
-    piece has one.
+    A piece of a measured contour has a partner if an expected contour of the same height passes within the
+    search distance and rises to the same side. ``mean_nm`` and ``p95_nm`` are the mean and the 95th
+    percentile of the distances of the pieces with a partner; they are None if no piece has one. ``matched``
+    and ``unmatched`` count the pieces with and without a partner. ``unmatched_expected`` counts the pieces of
+    expected contours without a partner.
     """
 
     mean_nm: float | None
@@ -56,14 +59,16 @@ class _Contour(NamedTuple):
 
 
 def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> float | None:
-    """Return the SSIM between the predicted and the measured map. The measured map without its per-scan terms
-    is the prediction plus the residual.
+    """Return the structural similarity (SSIM) of the predicted and the measured map of a scan. The measured
+    map without the per-scan terms is the prediction plus the residual.
     """
     return structural_similarity(prediction_um + residual_um, prediction_um)
 
 
 def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> EdgePlacement:
-    """Compare the edges of a scan with the predicted edges after the per-scan terms are removed."""
+    """Compare the measured edges of a scan with the predicted edges. The measured map without the per-scan
+    terms is the prediction plus the residual.
+    """
     heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
     if scan.seen_by == "sem":
         heights, search_um = np.array([film_edge_um(scan)]), FILM_SEARCH_PX * scan.pitch_um
@@ -71,17 +76,19 @@ def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -
 
 
 def structural_similarity(measured_um: Array, expected_um: Array) -> float | None:
-    """Return the mean SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861), which is 1 for equal maps.
+    """Return the mean structural similarity (SSIM; Wang et al. 2004, doi:10.1109/TIP.2003.819861) of two
+    maps. It is 1 for equal maps.
 
-    The Gaussian window has the standard deviation ``SSIM_SIGMA_PX`` and the width ``SSIM_WINDOW_PX``; the
-    data range is ``SSIM_RANGE_UM`` for all maps. Only windows within the scored pixels count.
+    The Gaussian window has the standard deviation ``SSIM_SIGMA_PX`` and the width ``SSIM_WINDOW_PX``. The
+    data range is ``SSIM_RANGE_UM`` for all maps. The mean is taken over the windows that contain only scored
+    pixels.
 
     Args:
         measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
-        expected_um: the same shape.
+        expected_um: expected map, µm, with the same shape.
 
     Returns:
-        None if no window lies within the scored pixels.
+        The mean SSIM, or None if no window contains only scored pixels.
     """
     from scipy.ndimage import minimum_filter
     from skimage.metrics import structural_similarity as ssim
@@ -110,14 +117,14 @@ def edge_placement(
     pitch_um: float,
     search_um: float = SEARCH_UM,
 ) -> EdgePlacement:
-    """Compare the contours of two maps.
+    """Measure the distances between the contours of a measured and an expected map.
 
     Args:
-        measured_um: (ny, nx) in µm. Pixels that are not scored are NaN, and the contours of both maps end at
-            them.
-        expected_um: (ny, nx) in µm.
+        measured_um: measured map, µm, of shape (ny, nx). Pixels that are not scored are NaN; the contours of
+            both maps end there.
+        expected_um: expected map, µm, of shape (ny, nx).
         heights_um: heights of the contours, µm (see ``mid_step_heights_um``).
-        pitch_um: sampling of the maps, µm.
+        pitch_um: pixel pitch of the maps, µm.
         search_um: largest distance between a piece of contour and its partner, µm.
     """
     expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
@@ -139,8 +146,8 @@ def edge_placement(
 
 
 def mid_step_heights_um(levels: int, level_height_um: float) -> Array:
-    """Return the heights halfway between neighbouring nominal levels, in µm. If there are many levels, return
-    only 24 evenly spaced heights.
+    """Return the heights halfway between neighbouring nominal levels, µm. If there are more than 24 such
+    heights, return 24 evenly spaced heights instead.
     """
     steps = min(levels - 1, _MOST_HEIGHTS)
     return np.arange(0.5, steps, dtype=np.float64) * ((levels - 1) / steps * level_height_um)
@@ -157,8 +164,9 @@ def _contour(map_um: Array, height_um: float) -> _Contour:
 
 
 def _distance_px(of: _Contour, to: _Contour, search_px: float) -> Array:
-    """Return the distance from the middle of each piece of one contour to the nearest piece of the other
-    contour that rises to the same side; inf if there is none.
+    """Return, for each piece of contour ``of``, the distance from its middle to the nearest piece of contour
+    ``to`` that rises to the same side. The distance is infinite if there is no such piece within
+    ``search_px``.
     """
     from scipy.spatial import KDTree
 

@@ -1,6 +1,6 @@
-"""Compute statistics over scans, or over prints. Pixels of a scan are correlated, so whole scans are
-resampled, and sign-flip tests flip whole scans. If the scans of a print share a day and a batch, whole prints
-are resampled instead of scans.
+"""Confidence intervals and tests whose units are scans or prints. The pixels of a scan are correlated, so
+whole scans are resampled, and sign-flip tests flip the sign of whole scans. The scans of a print may share a
+day and a batch; then prints are the units instead of scans.
 """
 
 from collections.abc import Hashable, Sequence
@@ -12,24 +12,28 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 
-# An interval is None if there are fewer than ``FEWEST_FOR_INTERVAL`` units.
+# The ends of a confidence interval, or None if there are fewer than FEWEST_FOR_INTERVAL units.
 Interval = tuple[float, float] | None
-# Smallest number of units for which p can be below 0.05: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
+# Smallest number of units for which the p value of a sign-flip test can be below 0.05: 2 / 2**5 > 0.05, but 2
+# / 2**6 < 0.05.
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
 PERMUTATIONS = 1999
-# The ends of a 95 % interval are written in this way because 0.025 differs in its last bits.
+# The quantiles at the ends of a 95 % interval. They are written in this way because 0.025 would differ in its
+# last bits, which would change published results.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
-# For up to this many scans, every combination of signs is used. Screening tests all directions at once, so
-# its limit is one scan lower than in a comparison of two models, which halves its table.
+# Largest number of scans for which a test uses every combination of signs, in screening and in a comparison
+# of two models. Screening tests all directions at once. Its limit is one scan lower, which halves its table
+# of signs.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
-# The flips include the observed signs. Rounding must not place their sum below the observed sum.
+# The combinations include the observed signs. This factor keeps rounding errors from placing their sum below
+# the observed sum.
 _ROUNDING = 1 - 1e-12
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root of the mean square."""
+    """Return the root mean square of the values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -40,14 +44,14 @@ def bootstrap_interval(
     draws: int = BOOTSTRAP_DRAWS,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Return the percentile interval of the mean over scans, from resampling whole scans or whole groups of
-    scans.
+    """Return the 95 % bootstrap confidence interval (percentiles) of the mean over scans. Whole scans, or
+    whole groups of scans, are resampled.
 
-    A single scan or group cannot be resampled, so both ends are NaN.
+    If there is only one scan or group, both ends are NaN, because it cannot be resampled.
 
     Args:
-        values: one per scan.
-        groups: the print of each scan, if prints are resampled instead of scans.
+        values: one value per scan.
+        groups: print of each scan, if whole prints are resampled instead of scans.
     """
     sums, counts = _by_group(values, groups)
     if sums.size < 2:
@@ -56,15 +60,15 @@ def bootstrap_interval(
 
 
 def pixel_interval(values: Array, owner: Array, groups: Sequence[Hashable]) -> Interval:
-    """Return the confidence interval of a mean over pixels. Whole prints are resampled, and each print is
-    weighted by its number of pixels.
+    """Return the 95 % confidence interval of a mean over pixels. Whole prints are resampled, and each print
+    has a weight equal to its number of pixels.
 
     Return None if the pixels come from fewer than ``FEWEST_FOR_INTERVAL`` prints.
 
     Args:
-        values: one per pixel.
-        owner: the number of the scan that contains each pixel.
-        groups: the print of each scan.
+        values: one value per pixel.
+        owner: number of the scan that contains the pixel, for each pixel.
+        groups: print of each scan.
     """
     sums, counts = (
         _by_group(np.bincount(owner, own, minlength=len(groups)), groups)[0] for own in (values, None)
@@ -83,8 +87,8 @@ def _resampled(sums: Array, counts: Array, draws: int, seed: int) -> tuple[float
 
 
 def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Array, Array]:
-    """Return the sum and the number of the values in each group. Without groups, each value is a group of its
-    own.
+    """Return the sum and the number of the values in each group. If ``groups`` is None, each value is a group
+    of its own.
     """
     sample = np.asarray(values, np.float64)
     if groups is None:
@@ -94,13 +98,14 @@ def _by_group(values: ArrayLike, groups: Sequence[Hashable] | None) -> tuple[Arr
 
 
 def interval(values: Sequence[float]) -> Interval:
-    """Return the result of ``bootstrap_interval``, or None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
+    """Return ``bootstrap_interval(values)``, or None for fewer than ``FEWEST_FOR_INTERVAL`` scans."""
     return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
-    """Return combinations of signs, (draws, count); the observed signs come first. For up to ``exact_scans``
-    scans, all combinations are returned. For more scans, 10,000 combinations are returned.
+    """Return combinations of signs for a sign-flip test, with shape (combinations, count). The first row is
+    the observed signs, all +1. For up to ``exact_scans`` scans, all combinations are returned; for more, the
+    observed signs and 9,999 random combinations.
     """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
@@ -109,27 +114,30 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
 
 
 def one_sided_flip_p(values: Array) -> float:
-    """Return the share of sign flips for which the sum of the values is at least the observed sum."""
+    """Return the one-sided p value of a sign-flip test: the share of combinations of signs for which the sum
+    of the values is at least the observed sum.
+    """
     return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
 
 def smallest_flip_p(count: int) -> float:
-    """Return the smallest two-sided sign-flip p that this many scans or prints allow: 2 divided by the number
-    of combinations of signs.
+    """Return the smallest p value that a two-sided sign-flip test of this many scans or prints can give. If
+    all combinations of signs are used, it is 2 divided by their number.
 
-    With six prints, p is at least 2 / 2^6 = 0.031, however large the difference.
+    With six prints, for example, p is at least 2 / 2^6 = 0.031, however large the difference.
     """
     return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
 
 
 class OverUnits(Record):
-    """The confidence interval and p value of a mean difference over scans, from resampling whole scans or
-    prints.
+    """The confidence interval and the p value of a mean difference over scans. The units that are resampled
+    are scans or prints.
 
-    ``count`` is the number of units, and ``positive`` the number of units with a positive difference.
+    ``count`` is the number of units, and ``positive`` is the number of units with a positive difference.
     ``ci95_nm`` is a bootstrap interval, or None if there are fewer than ``FEWEST_FOR_INTERVAL`` units. ``p``
-    is that of a two-sided sign-flip test. For up to 14 units, the test uses all combinations of signs. For
-    more units, it uses the observed signs and 9,999 random combinations. ``p`` is never below ``smallest_p``.
+    is the p value of a two-sided sign-flip test. For up to 14 units, the test uses all combinations of signs.
+    For more units, it uses the observed signs and 9,999 random combinations. ``smallest_p`` is the smallest p
+    value that this test can give.
     """
 
     count: int
@@ -142,11 +150,11 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test a difference that is given for each scan, by resampling scans. If ``groups`` states the print of
-    each scan, whole prints are resampled instead.
+    """Test whether the mean of a difference, which is given for each scan, could be chance. The units are
+    scans or, if ``groups`` states the print of each scan, prints.
 
     Raises:
-        InputError: no difference.
+        InputError: no difference is given.
     """
     if not len(differences_nm):
         raise InputError("differences", got="none", wanted="one for each scan")
@@ -163,9 +171,7 @@ def over_units(
 
 
 def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
-    """Test a difference that is given for each scan, by resampling whole prints. Return None if there is only
-    one print.
-    """
+    """Call ``over_units`` with prints as units. Return None if there is only one print."""
     return over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
 
 
@@ -173,11 +179,12 @@ class ByPrint(Record):
     """A one-way analysis of variance of one estimate per scan, with prints as groups.
 
     Args:
-        f: mean square between prints divided by the mean square within prints.
+        f: F statistic: mean square between prints divided by the mean square within prints.
         degrees: degrees of freedom between prints and within prints.
-        icc: share of the variance that scans of one print have in common; a negative estimate is set to 0.
-        p: share of permutations of the scans for which ``f`` is at least as large as in the observed order.
-            The observed order is one of the permutations.
+        icc: intraclass correlation, which is the share of the variance that scans of one print have in
+            common. A negative estimate is set to 0.
+        p: p value of a permutation test: the share of permutations of the scans for which ``f`` is at least
+            as large as in the observed order. The observed order is one of the permutations.
     """
 
     f: float
@@ -190,12 +197,13 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     """Test whether scans of one print are more similar than scans of different prints.
 
     Args:
-        values: (scans,) or (scans, k) estimates; each column is divided by its spread, so that all columns
-            have equal weight.
+        values: estimates for each scan, of shape (scans,) or (scans, k). Each column is divided by its
+            standard deviation, so that all columns have equal weight.
         prints: print of each scan.
 
     Returns:
-        None if there is only one print, if no print has two scans, or if the estimates are constant.
+        The analysis, or None if there is only one print, if no print has two scans, or if the estimates are
+            constant.
     """
     names, members = np.unique(np.asarray(prints, str), return_inverse=True)
     columns = np.reshape(values, (len(members), -1)).astype(np.float64)
@@ -215,6 +223,6 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     f = float(ratios[0])
     size = (len(members) - float((counts**2).sum()) / len(members)) / between
     icc = max((f - 1) / (f + size - 1), 0.0)
-    # Rounding must not place the statistic of the observed order below the observed statistic.
+    # The factor keeps rounding errors from placing the statistic of the observed order below itself.
     p = float((ratios >= f * (1 - 1e-12)).mean())
     return ByPrint(f=f, degrees=(between, within), icc=icc, p=p)

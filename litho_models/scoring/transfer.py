@@ -1,4 +1,4 @@
-"""Measure how an error depends on level and spatial frequency."""
+"""Measure how the error of a model depends on the layout level and on the spatial frequency."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,8 +16,8 @@ _TINY = float(np.finfo(float).tiny)
 
 
 class LevelError(Record):
-    """The error at the pixels printed with one level, nm. ``scans`` counts the scans in which the level
-    occurs.
+    """The error at the pixels that are printed with one level: its mean (``bias_nm``) and its standard
+    deviation (``sd_nm``). ``scans`` is the number of scans in which the level occurs.
     """
 
     level: int
@@ -28,11 +28,11 @@ class LevelError(Record):
 
 
 class TransferCurves(Record, extra="ignore"):
-    """A comparison of the spectra of the prediction H and the measurement Z along x and y. At each frequency,
-    it states the gain |H·Z*| / |Z|² and the coherence γ².
+    """A comparison of the spectra of the predicted height H and the measured height Z, along x and along y.
+    At each frequency, it states the gain |H·Z*| / |Z|² and the coherence γ².
 
-    ``error_psd`` is the one-sided power spectral density of the error along lines, in nm² per cycle/µm. The
-    mean of each line is removed first.
+    ``error_psd_x`` and ``error_psd_y`` are the one-sided power spectral density of the error, nm² per
+    cycle/µm. The mean of each line is removed first.
     """
 
     frequency_per_um: list[float]
@@ -50,7 +50,8 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
     Args:
         scans: the scans.
-        residuals_um: measured minus predicted (ny, nx); NaN at pixels that are not scored.
+        residuals_um: measured minus predicted height of each scan, µm, of shape (ny, nx); NaN at pixels that
+            are not scored.
     """
     levels = np.concatenate([s.mask_level[np.isfinite(r)] for s, r in zip(scans, residuals_um, strict=True)])
     errors = np.concatenate([r[np.isfinite(r)] for r in residuals_um]) * NM_PER_UM
@@ -66,7 +67,8 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
-    """Compute transfer, coherence and error from the spectra of all lines (Hann window, line mean removed).
+    """Compute the gain, the coherence and the error density from the spectra of all lines. The mean of each
+    line is removed, and a Hann window is applied.
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
@@ -90,10 +92,11 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Return five rows, (5, bands): cross, measured, predicted, error and count. Each value is a sum over all
-    lines and over the frequencies of one band.
+    """Return an array of shape (5, bands). Its rows are the cross power, the power of the measurement, the
+    power of the prediction, the error density, and the number of terms. Each value is a sum over all lines
+    and over the frequencies of one band.
 
-    The error is a one-sided density (µm² per cycle/µm), and the count is the number of terms in its sum.
+    The error density is one-sided, in µm² per cycle/µm. The number of terms is that of its sum.
     """
     window = np.hanning(height.shape[1])
     measured, predicted = (

@@ -1,7 +1,9 @@
-"""Divide scans into training and held-out scans; ``litho_data.store.lock_box`` chooses the locked scans.
+"""Divide scans into training scans and held-out scans. The locked scans are chosen elsewhere, in
+``litho_data.store.lock_box``.
 
-The unit of the split is the whole scan, because the quadrants of one scan share its datum, tip and day. Every
-choice follows from a hash of the ids and a seed, so the same ids always give the same split.
+Except in the split ``paper``, whole scans are held out, because the quadrants of one scan share its datum,
+tip and day. Every choice follows from a hash of the scan ids and a seed, so the same ids always give the same
+split.
 """
 
 from collections.abc import Sequence
@@ -21,7 +23,7 @@ QUADRANTS = (0, 1, 2, 3)
 
 
 class Split(Record):
-    """How a dataset is divided into folds. ``lock_box`` lists its locked scans, whether or not they were
+    """How a dataset is divided into folds. ``lock_box`` lists the locked scans, whether or not they were
     scored.
     """
 
@@ -31,9 +33,10 @@ class Split(Record):
 
 
 class ScoredSplit(Split):
-    """The scored scans; ``lock_box_opened`` says whether any locked scan was scored.
+    """A split, and the ids of the scans that were scored with it. ``lock_box_opened`` says whether any locked
+    scan was scored.
 
-    ``first_folds`` is the number of folds that were fitted and scored; None stands for all.
+    ``first_folds`` is the number of folds that were fitted and scored, or None if all of them were.
     """
 
     seed: int = 0
@@ -45,13 +48,13 @@ class ScoredSplit(Split):
 
 @dataclass(frozen=True)
 class Crop:
-    """A quadrant of a scan: 0 top left, 1 top right, 2 bottom left, 3 bottom right."""
+    """A quadrant of a scan: number 0 is top left, 1 top right, 2 bottom left, and 3 bottom right."""
 
     scan_id: str
     quadrant: int
 
     def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Return the rows and columns of the quadrant in an array of ``shape`` (ny, nx)."""
+        """Return the slices of rows and columns that cut the quadrant out of an array of shape (ny, nx)."""
         half_y, half_x = shape[0] // 2, shape[1] // 2
         row, column = divmod(self.quadrant, 2)
         return (
@@ -62,8 +65,8 @@ class Crop:
 
 @dataclass(frozen=True)
 class Fold:
-    """The scans to learn from and the scans to predict. ``locked`` is True if the predicted scans are those
-    of the lock box.
+    """The scans on which models are trained and the held-out scans that they predict. ``locked`` is True if
+    the held-out scans are the locked scans.
     """
 
     number: int
@@ -81,11 +84,13 @@ def plan_folds(
     seed: int = 0,
     open_lock_box: bool = False,
 ) -> list[Fold]:
-    """Return the folds of a split. The split ``paper`` leaks, and it also uses the scans of the lock box. The
-    other splits use these scans only if ``open_lock_box`` is set.
+    """Return the folds of a split. In the split ``paper``, training and held-out sets contain quadrants of
+    the same scans, and locked scans are used. The other splits use the locked scans only if ``open_lock_box``
+    is set: they are then held out in one more fold.
 
     Raises:
-        InputError: too few scans, no lock box to open, or an unknown split.
+        InputError: there are too few scans, there are no locked scans although ``open_lock_box`` is set, or
+            the split is unknown.
     """
     if split == "paper":
         held_out = paper_draw([scan.id for scan in scans], seed)
@@ -122,10 +127,11 @@ def plan_folds(
 
 
 def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
-    """Divide the scans into ``k`` folds. Return the ids that each fold holds out.
+    """Divide scans into ``k`` folds. Return, for each fold, the ids of the scans that it holds out.
 
     Raises:
-        InputError: repeated ids, fewer than two ids, or a ``k`` that is below 2 or above the number of scans.
+        InputError: an id is repeated, there are fewer than two ids, or ``k`` is below 2 or above the number
+            of scans.
     """
     require_unique(ids)
     if len(ids) < 2:
@@ -139,10 +145,11 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
 
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
-    """Return one fold per print, in the order of the print names; each fold holds out all scans of its print.
+    """Return one fold per print, in the order of the names of the prints. Each fold is the list of the ids of
+    all scans of its print, which it holds out.
 
     Raises:
-        InputError: fewer than two prints.
+        InputError: there are fewer than two prints, or an id is repeated.
     """
     require_unique(ids)
     prints = sorted(set(print_ids))
@@ -155,10 +162,11 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 
 
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
-    """Draw quadrants at random, and return them as the held-out crops. The paper draws 24 of 96 in this way.
+    """Draw a quarter of all quadrants at random. Return them as the held-out crops. The paper draws 24 of 96
+    quadrants in this way.
 
-    Quadrants of one scan are in both the training and the held-out set, so this split leaks. Use it only for
-    comparison with the paper.
+    The training set and the held-out set both contain quadrants of the same scans, so errors are too small.
+    Use this split only for comparison with the paper.
     """
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
@@ -168,8 +176,8 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose the training scans that are set aside to select the checkpoint. These are ``count`` scans, but
-    at most a quarter of all.
+    """Choose the ids of the training scans that are set aside to choose the best round of a training. There
+    are ``count`` such scans, but at most a quarter of all scans.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))

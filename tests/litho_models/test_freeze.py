@@ -61,7 +61,7 @@ def test_values_on_a_bound_are_named_in_card_and_page(tmp_path):
         model.raw_alpha.fill_(-5.0)
     folder = save_frozen(model, tmp_path / "model")
     assert ModelCard.read(folder).at_bounds == {"alpha": 0.0, "sigma_diffusion_um": 2.5}
-    assert "the best fit may lie outside: alpha (0), sigma_diffusion_um (2.5)." in (
+    assert "the best values may lie beyond it: alpha (0), sigma_diffusion_um (2.5)." in (
         folder / README_FILE
     ).read_text(encoding="utf-8")
 
@@ -313,7 +313,7 @@ def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_
         assert card.undetermined_effects == {}
         assert card.attributed == {"slope-thinning": side}
         page = (tmp_path / side / README_FILE).read_text(encoding="utf-8")
-        assert f"do not show the cause: slope-thinning to the {side}." in page
+        assert f"when the model was frozen: slope-thinning to the {side}." in page
     # A design includes effects of the printer, but not those of the microscope.
     layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
     heights = [load_frozen(tmp_path / name)(layout) for name in ("printer", "microscope", "kept")]
@@ -342,7 +342,7 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     assert float((heights["source"] - heights["left"]).abs().max()) > 0.01
     assert (cards["left"].undetermined_effects, cards["left"].attributed) == ({"scan-axis": {}}, {})
     assert cards["microscope"].measurement_effects == {"scan-axis": {}}
-    assert "a part for measured maps" in cards["microscope"].limitations[-1]
+    assert "a part for predicting measured maps" in cards["microscope"].limitations[-1]
     assert cards["printer"].process_effects == {}
     assert cards["again"].attributed == {"scan-axis": "printer"}
     with pytest.raises(InputError, match="frozen without it"):

@@ -294,8 +294,8 @@ def test_a_tilted_scan_does_not_change_its_dose_row():
 
 def test_without_two_doses_there_is_no_matrix_and_a_note_says_so():
     for scans, reason in (
-        ([ladder(1.0), ladder(1.0, seed=1)], "every dose in the store is 1"),
-        (make_scans(2, size_px=64), "needs a column 'dose'"),
+        ([ladder(1.0), ladder(1.0, seed=1)], "all scans in the store have the same dose, 1"),
+        (make_scans(2, size_px=64), "no scan in the store states a dose (column 'dose'"),
     ):
         found, (note,) = dose_matrix(scans)
         assert found is None
