@@ -63,10 +63,10 @@ class SimulatorConfig(BaseModel):
     LENGTHS: ClassVar[tuple[str, ...]] = ()
 
     variant: Variant = "default"
-    pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
-    level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
-    levels: int = Field(13, ge=2, le=65536, description="number of layout levels, 0 included")
-    fixed: tuple[str, ...] = Field((), description="names, as in ranges, of parameters that no fit changes")
+    pitch_um: float = Field(0.1, gt=0, description="pixel pitch of layouts and heights, µm")
+    level_height_um: float = Field(0.1, gt=0, description="nominal height of one layout level, µm")
+    levels: int = Field(13, ge=2, le=65536, description="number of layout levels, level 0 included")
+    fixed: tuple[str, ...] = Field((), description="names of parameters that no fit changes")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:

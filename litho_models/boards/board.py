@@ -150,7 +150,7 @@ def command_loop(command: str) -> Loop:
     words = shlex.split(command)
     if not words or not shutil.which(words[0]):
         wanted = "a program that can be run, with its arguments"
-        raise InputError("command of the loop", got=command or "nothing", wanted=wanted)
+        raise InputError("command that runs the loop", got=command or "nothing", wanted=wanted)
 
     def loop(store: Path, folder: Path) -> Answer:
         code = subprocess.run([*words, str(store), str(folder)], check=False).returncode

@@ -138,8 +138,7 @@ def check(
     ] = None,
     strict: Annotated[bool, option(f"exit with code {EXIT_ALARM} on an alarm", "--strict")] = False,
 ) -> None:
-    """Tell whether new prints differ from the reference prints of a model, and when to measure the next
-    prints.
+    """Tell whether new prints differ from the reference prints of a model, and when to measure again.
 
     Example: litho-models check printer new-prints.zarr --out check
     """

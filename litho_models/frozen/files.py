@@ -176,7 +176,9 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
         raise InputError(f"hyper_parameters beside {weights}", got=first_error(error)) from error
     stated = (card.pitch_um, card.level_height_um, card.levels)
     if stated != (config.pitch_um, config.level_height_um, config.levels):
-        raise InputError("card", got=f"geometry {stated}", wanted="that of the hyper_parameters")
+        raise InputError(
+            "pitch, level height and levels in the card", got=stated, wanted="those of its hyper_parameters"
+        )
     lowest, highest = card.calibrated_range_um
     if not 0 <= lowest < highest <= config.full_height_um:
         raise InputError(

@@ -3,8 +3,8 @@
 In Hopkins' theory (Proc. R. Soc. A 217, 408 (1953)), the intensity is I(x) = Σ T(f₁) T*(f₂) C(f₁, f₂) exp(2πi
 (f₁ - f₂) x), where T is the spectrum of the mask t. The transmission cross coefficients are C(f₁, f₂) = Σ_s
 P(f₁ + s) P*(f₂ + s), a sum over the points s of the source, where P is the pupil. C is the matrix A⁺A with
-A(s, f) = P(s + f). The right singular vectors of A, times the singular values, are therefore kernels h_k with
-I = Σ_k |h_k * t|² (Cobb, PhD thesis, Berkeley 1998).
+A(s, f) = P(s + f). The right singular vectors of A, times the singular values, are therefore the transfer
+functions of kernels h_k with I = Σ_k |h_k * t|² (Cobb, PhD thesis, Berkeley 1998).
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
     source = np.flatnonzero(filled)
     if not len(source):
         raise InputError(
-            "source of a lens", got=f"radii {optics.inner:g} to {optics.outer:g}", wanted="a wider ring"
+            "source of the lens",
+            got=f"a ring of radii {optics.inner:g} to {optics.outer:g}",
+            wanted="a wider ring",
         )
     # All kernels are 0 at frequencies that no point of the source shifts into the pupil.
     reach = 1 + np.hypot(y[source], x[source]).max() / cutoff

@@ -89,7 +89,10 @@ def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
     hint = "use --reference STORE, or --new PRINT to compare it with the other prints of this store"
     if not frozen.card["baseline"]:
         raise InputError(
-            f"card of {frozen.name}", got="no values of reference prints", wanted="a reference", hint=hint
+            f"card of {frozen.name}",
+            got="no values of reference prints",
+            wanted="reference values",
+            hint=hint,
         )
     if made_of_these_prints(frozen, dataset):
         raise InputError(

@@ -149,7 +149,9 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     scans, residuals = found.scans, found.residuals_nm
     if len(scans) < 3:
         raise InputError(
-            "scans for a calibration", got=len(scans), wanted="at least 3, so that some can be left out"
+            "scans to fit and judge a spread",
+            got=len(scans),
+            wanted="at least 3, so that some can be left out of the fit",
         )
     places = [place_maps(scan) for scan in scans]
     drawn = [_sample(residual, seed + number) for number, residual in enumerate(residuals)]

@@ -126,7 +126,7 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
     square = np.asarray(residual, np.float64) ** 2
     if square.size <= covariates.shape[1] or not square.any():
         raise InputError(
-            "residuals for a variance",
+            "residuals from which to fit a spread",
             got=f"{square.size} pixels, {np.count_nonzero(square)} not zero",
             wanted="more pixels than covariates, and some nonzero residuals",
         )

@@ -66,8 +66,7 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     layout. The height is differentiable in the layout.
 
     The border must be less than half as wide as the layout. The result equals that of ``predict_field`` with
-    the border cropped, except near the edge of the layout, where ``predict_field`` must assume how the layout
-    continues. If the model allows it, only the pixels of the result are computed (see
+    the border cropped. If the model allows it, only the pixels of the result are computed (see
     ``FrozenSimulator.inside``).
     """
     reach = model.reach_px

@@ -193,7 +193,7 @@ def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Pai
     if errors[0].keys() != errors[1].keys():
         counts = " and ".join(str(len(found)) for found in errors)
         raise InputError(
-            "paired scores", got=f"{counts} scans", wanted="both lists of scores to cover the same scans"
+            "scores to compare", got=f"{counts} scans", wanted="the same scans in both lists of scores"
         )
     differences = [one - errors[1][scan] for scan, one in errors[0].items()]
     found = over_units(differences, seed=seed)

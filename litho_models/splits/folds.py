@@ -101,7 +101,7 @@ def plan_folds(
     if open_lock_box and not locked:
         raise InputError(
             "lock box to open",
-            got=f"none: {len(scans)} scans are too few for one",
+            got=f"no locked scans, because {len(scans)} scans are too few",
             wanted="at least 3 scans",
             hint="run without --open-lock-box",
         )
@@ -136,7 +136,7 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
     require_unique(ids)
     if len(ids) < 2:
         raise InputError(
-            "scans to divide into folds", got=len(ids), wanted="at least 2, so that one can be held out"
+            "scans to divide into folds", got=len(ids), wanted="at least 2, so that one scan can be held out"
         )
     if not 2 <= k <= len(ids):
         raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
@@ -154,7 +154,9 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
     require_unique(ids)
     prints = sorted(set(print_ids))
     if len(prints) < 2:
-        raise InputError("leave-one-print-out", got=f"{len(prints)} print", wanted="at least 2 prints")
+        raise InputError(
+            "prints for leave-one-print-out", got=f"{len(prints)} print", wanted="at least 2 prints"
+        )
     return [
         sorted(scan_id for scan_id, name in zip(ids, print_ids, strict=True) if name == held_out)
         for held_out in prints

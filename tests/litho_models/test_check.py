@@ -354,7 +354,7 @@ def test_an_older_card_asks_for_a_reference_and_takes_one(lab, tmp_path):
     assert len(card.pop("baseline")) == 20
     file.write_text(json.dumps(card))
     with pytest.raises(
-        InputError, match="got no values of reference prints, wanted a reference; use --reference"
+        InputError, match="got no values of reference prints, wanted reference values; use --reference"
     ):
         check(tmp_path / "older", lab / "same.zarr", tmp_path / "out")
     given = check(tmp_path / "older", lab / "same.zarr", tmp_path / "out", reference=lab / "made.zarr")
