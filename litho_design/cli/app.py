@@ -40,16 +40,16 @@ def score(
     judge: Annotated[
         list[str] | None,
         typer.Option(
-            help="judge: NAME=MODEL, MODEL or `none`; MODEL may be the truth/ folder of a virtual fab; "
-            "repeatable. Without a judge, scan or photograph, the zoo's models of the same printer are "
-            "the judges"
+            help="model that judges the design: NAME=MODEL, MODEL or `none`; MODEL may be the truth/ folder "
+            "of a virtual fab; repeatable. Without a judge, scan or photograph, the zoo's models of the same "
+            "printer are the judges"
         ),
     ] = None,
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="how the judges treat the element: thin, or thick (wave propagation method); the default is "
-            "that of the design"
+            help="how the judges treat the element: thin, or thick (wave propagation method); by default, as "
+            "the design states"
         ),
     ] = None,
     stream: Annotated[
@@ -60,8 +60,8 @@ def score(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design by the print that models predict, an AFM scan of the print, or a photograph of its
-    image.
+    """Score a design by the prints that models predict, by an AFM scan of its print, or by a photograph of
+    the image behind the print.
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
@@ -100,7 +100,8 @@ def export(
     dose_curve: Annotated[
         Path | None,
         typer.Option(
-            help="CSV with the printed height_um of each grey value; the default is a linear relation"
+            help="CSV with the columns grey and height_um (printed height of each grey value); by default, "
+            "the height is linear in the grey value"
         ),
     ] = None,
     marks: Annotated[

@@ -47,8 +47,8 @@ Target = Annotated[str, typer.Option(help=f"target image: {_TARGET_HELP}")]
 SpreadOf = Annotated[
     Path | None,
     typer.Option(
-        help="dataset store whose measured prints, except the locked scans, give the spread of gain and "
-        "offset",
+        help="dataset store from whose measured prints, except the locked scans, the spread of gain and "
+        "offset is computed",
         hidden=True,
     ),
 ]
@@ -209,14 +209,19 @@ def lens(
 @takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
 def compare(
     models: Annotated[
-        str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")
+        str,
+        typer.Option(
+            help="models to design with (the arms), separated by commas: none, NAME=MODEL or MODEL (a "
+            "folder, or zoo:NAME)"
+        ),
     ],
     out: Out,
     given: Given,
     judge: Annotated[
         list[str] | None,
         typer.Option(
-            help="further judge: NAME=MODEL or MODEL (or the truth/ folder of a virtual fab); repeatable"
+            help="further model that only judges: NAME=MODEL or MODEL (or the truth/ folder of a virtual "
+            "fab); repeatable"
         ),
     ] = None,
     task: Annotated[
@@ -232,7 +237,7 @@ def compare(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Make a design with every arm and print it with every judge, to measure the design-to-manufacturing gap.
+    """Design with every model (arm), and compare how every judge predicts the prints of these designs.
 
     Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
     """

@@ -59,8 +59,9 @@ class Given:
     """The settings given on a command line.
 
     Attributes:
-        options: values given by options and by ``--set``, by path.
-        names: option by which each value was given, for messages.
+        options: values given by options and by ``--set``, as a mapping from the path of a setting to its
+            value.
+        names: mapping from the path of a setting to the option that gave its value; used in messages.
         config: path of the settings file, if one was given.
     """
 
@@ -69,11 +70,12 @@ class Given:
     config: Path | None
 
     def over(self, preset: BaseModel, task: str) -> dict[str, Any]:
-        """Return the values by path; values from the command line override those from the file.
+        """Return a dict from the path of each given setting to its value; values from the command line
+        override those from the file.
 
         Args:
-            preset: settings that define the paths.
-            task: what is designed, for messages.
+            preset: settings of the task, whose fields define the valid paths.
+            task: name of the task, used in messages.
 
         Raises:
             InputError: an option does not belong to this task, or the file contains an unknown name.
@@ -102,9 +104,10 @@ _FIRST = {
 def takes_settings(
     *presets: BaseModel, leave_out: Collection[str] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command an option for each setting that defines one, plus ``--set`` and ``--config``.
+    """Return a decorator that gives a command one option for each setting that names an option, and the
+    options ``--set`` and ``--config``.
 
-    The command receives these settings as a ``Given`` object in its argument ``given``.
+    The command receives the values of these options as a ``Given`` object in its argument ``given``.
 
     Args:
         presets: settings, one record per task; the help shows their values as defaults.
@@ -146,10 +149,10 @@ def takes_settings(
 
 
 def takes_parts(**parts: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command one option for each field of some record classes. The command receives one record of
-    each class as a keyword argument.
+    """Return a decorator that gives a command one option for each field of the given record classes.
 
-    A record is None if none of its options was given.
+    The command receives one record of each class as a keyword argument. A record is None if none of its
+    options was given.
     """
     found = {
         part: {name: leaf_of(field, f"{part}.{name}") for name, field in kind.__pydantic_fields__.items()}
@@ -192,8 +195,8 @@ def _made(kind: type[Any], leaves: Mapping[str, Leaf], values: Mapping[str, Any]
 
 
 def as_toml(settings: BaseModel) -> str:
-    """Return the text of a settings file for ``--config``, which states the meaning, unit, choices and option
-    of each setting.
+    """Return the text of a settings file for ``--config``. A comment above each setting states its meaning,
+    unit, choices and option.
     """
     lines: list[str] = []
     # Each table is written once, even if its settings are not adjacent.

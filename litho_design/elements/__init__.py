@@ -1,3 +1,3 @@
-"""The printer as an optical element for your own programs. The element takes free levels and returns a
-modulated wave.
+"""A printed optical element for your own programs. A frozen model turns its free levels into heights, and the
+heights modulate a wave.
 """

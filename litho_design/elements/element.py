@@ -33,9 +33,10 @@ class Element(nn.Module):
 
     The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and
     clipped to the range of the layout; a straight-through estimator gives the gradient of this step. A frozen
-    model prints the levels, surrounded by its guard ring. The printed height h becomes the phase 2 pi
-    (n(wavelength) - surroundings) h / wavelength. The wave therefore always belongs to a printable layout.
-    For the first steps of a search, ``whole = False`` leaves the levels unrounded.
+    model predicts the print of these levels, which are surrounded by a guard ring of level 0. The printed
+    height h delays the wave by the phase 2 pi (n(wavelength) - surroundings) h / wavelength. The wave
+    therefore always belongs to a printable layout. During the first steps of a search, you can set
+    ``element.whole = False`` to leave the levels unrounded.
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
@@ -84,13 +85,14 @@ class Element(nn.Module):
         self.whole = True
 
     def forward(self, field: Tensor, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
-        """Illuminate the element with ``field``, and return the wave behind it, complex (..., size, size).
+        """Return the wave behind the element when ``field`` illuminates it, a complex tensor of shape
+        (..., size, size).
 
         Args:
-            field: the wave on the pixels of the layout, complex (..., size, size).
+            field: the incident wave on the pixels of the layout, a complex tensor of shape (..., size, size).
             wavelength_um: wavelength in vacuum.
-            height_um: heights of a known print (size, size), for example measured heights. These heights
-                replace those that the model predicts for the levels.
+            height_um: heights of a known print, for example measured heights, in µm, shape (size, size). They
+                replace the heights that the model predicts for the levels.
         """
         height = self.height_um() if height_um is None else height_um
         self._check_map("field", field)
@@ -101,8 +103,10 @@ class Element(nn.Module):
         return through_relief(field * kept, height, self.layout.pitch_um, self.optics(wavelength_um))
 
     def transmission(self, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
-        """Return the complex factor (size, size) of the thin element: exp(2 pi j (n - n0) h / wavelength - a
-        h / 2).
+        """Return the complex transmission of the thin element, shape (size, size).
+
+        The transmission is exp(2 pi j (n - n0) h / wavelength - a h / 2), where n and n0 are the refractive
+        indices of the resin and its surroundings, h is the height, and a is the absorption coefficient.
         """
         height = self.height_um() if height_um is None else height_um
         self._check_map("height", height)
@@ -110,7 +114,7 @@ class Element(nn.Module):
         return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
 
     def height_um(self) -> Tensor:
-        """Return the printed height (size, size), µm; gradients flow to the free levels."""
+        """Return the printed height, µm, shape (size, size). Gradients flow to the free levels."""
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
 
     def _print(self, level: Tensor) -> Tensor:
@@ -120,7 +124,7 @@ class Element(nn.Module):
         return self.printer.print_in_tiles(around, self.tile_px)
 
     def levels(self) -> np.ndarray:
-        """Return the layout to be printed, uint8 (size, size)."""
+        """Return the integer levels of the layout to be printed, a uint8 array of shape (size, size)."""
         return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
 
     def optics(self, wavelength_um: float) -> Optics:
@@ -139,14 +143,16 @@ class Element(nn.Module):
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
-        """Set the free levels to those of a layout (size, size), whose levels need not be integers."""
+        """Set the free levels to those of a layout of shape (size, size). Its levels need not be integers."""
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
-        """Start from the levels whose print gives a target phase (size, size), in radians, apart from a
-        constant.
+        """Set the free levels to those whose print comes closest to a target phase, apart from a constant
+        phase.
+
+        ``phase`` is in radians and has shape (size, size).
         """
         self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))

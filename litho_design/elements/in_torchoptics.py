@@ -16,7 +16,7 @@ class PrintedElement(PolychromaticModulationElement):
     Args:
         element: the printed element, whose parameters become those of this module.
         z, offset: as in torchoptics.
-        unit_um: the unit of length that is used in torchoptics, in µm.
+        unit_um: size, in µm, of the unit of length that your program uses in torchoptics.
     """
 
     def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
@@ -26,7 +26,7 @@ class PrintedElement(PolychromaticModulationElement):
         self.element, self.unit_um = element, unit_um
 
     def modulation_profile(self, wavelength: Any = None) -> Tensor:
-        """Return the complex transmission (size, size) at a wavelength, which is given in the unit of
-        torchoptics.
+        """Return the complex transmission, shape (size, size), at a wavelength that is given in the unit of
+        length used in torchoptics.
         """
         return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

@@ -15,7 +15,9 @@ Print = Callable[[Tensor], Tensor]
 
 
 def printed_anyhow(run: Print, level: Tensor) -> Tensor:
-    """Return ``run(level)``, computed as one opaque step if a transform cannot trace it."""
+    """Return ``run(level)``. If a transform of ``torch.func`` cannot trace this call, it is computed as one
+    opaque step.
+    """
     if "torch._dynamo" in sys.modules:
         run = torch.compiler.disable(run)
     if not torch._C._functorch.is_functorch_wrapped_tensor(level):

@@ -48,14 +48,17 @@ _SUFFIX: dict[str, str] = {
 }  # fmt: skip
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
-# Beyond this size, the other formats would need about 3 GiB of memory (images) or more (solids).
+# Largest number of pixels for the formats that are not written in parts. For more pixels, these formats would
+# need about 3 GiB of memory (images) or more (solids).
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
 
 @dataclass(frozen=True)
 class _Source:
-    """A layout to export: its levels (ny, nx), geometry and hash, and the design from which it comes."""
+    """A layout to export: its levels of shape (ny, nx), its geometry and hash, and the design from which it
+    comes.
+    """
 
     levels: LevelRows
     layout: LayoutSettings
@@ -81,13 +84,13 @@ def export(
     written and read one band of rows at a time, so memory does not grow with the height of an element.
 
     Args:
-        design: a design (its folder, or the result of ``load_design``), an ``Element``, an array (ny, nx), or
-            a file NAME.npy with an array. Arrays of integers are levels. Arrays of floats are heights in µm,
-            which are rounded to the nearest level.
+        design: a design (its folder, or the result of ``load_design``), an ``Element``, an array of shape
+            (ny, nx), or a file NAME.npy with such an array. Arrays of integers are levels. Arrays of floats
+            are heights in µm, which are rounded to the nearest level.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; it may already hold exports of the same layout in other formats.
-        pitch_um, level_height_um: pixel side and level height, used only for an array; designs and elements
-            have their own values.
+        pitch_um, level_height_um: side of a pixel and height of a level, used only for arrays. Designs and
+            elements state these values themselves.
         dose_curve: CSV with the columns ``grey,height_um``, which gives the printed height of each grey
             value, for the greyscale formats bmp, png16 and dxf. Without it, the grey value is linear in
             height.
@@ -99,8 +102,8 @@ def export(
 
     Raises:
         InputError: the design is incomplete, the format cannot represent it or would need too much memory, or
-            no printer can do the job. The error is also raised if the element is too small for marks, or the
-            folder contains other files.
+            the settings of the print job do not suit the layout. The error is also raised if the element is
+            too small for marks, or ``out`` contains other files.
     """
     require_known("format", format, _SUFFIX)
     made = changed(PrintJob(), job)
@@ -150,14 +153,17 @@ def export(
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
             raise AssertionError(f"the {format} file does not contain the layout that was exported")
-        # The sidecar comes last: until then, the file has no sidecar or an outdated one, and is refused.
+        # The sidecar is moved last. Until then, the file has no sidecar or an outdated one, so it cannot be
+        # read back by mistake.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
     return place / name
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """Return the level map of an exported file, uint8 (ny, nx) with row 0 at the top, and the file's sidecar.
+    """Return the level map of an exported file and the sidecar of the file.
+
+    The level map is a uint8 array of shape (ny, nx) with row 0 at the top.
 
     Raises:
         InputError: there is no sidecar, or the file was changed after the export.
@@ -192,13 +198,13 @@ def _loaded(file: str | Path) -> Any:
 
 
 def _levels(array: Any, level_height_um: float) -> np.ndarray:
-    """Convert an array of levels, or of heights in µm, to uint8 levels (ny, nx)."""
+    """Convert an array of levels, or of heights in µm, to uint8 levels of shape (ny, nx)."""
     if not isinstance(array, np.ndarray):
         wanted = "a design's folder, an Element, or an array of levels or heights in µm"
         raise InputError("layout to export", got=type(array).__name__, wanted=wanted)
     if array.ndim != 2 or not array.size or array.dtype.kind not in "buif" or not np.isfinite(array).all():
         got = f"{array.dtype} of shape {array.shape}"
-        raise InputError("array to export", got=got, wanted="finite levels or heights in µm (ny, nx)")
+        raise InputError("array to export", got=got, wanted="a map of finite levels or heights in µm")
     levels = np.rint(array / level_height_um) if array.dtype.kind == "f" else array
     if levels.min() < 0 or levels.max() > 255:
         got = f"levels from {levels.min():g} to {levels.max():g}"

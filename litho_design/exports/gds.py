@@ -33,15 +33,15 @@ def write_gds(
     """Write rectangles in units of 1 µm on a grid of 1 nm, with y upwards. Return the number of rectangles in
     the file.
 
-    Layer k contains {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0). Runs
-    along a row are merged with equal runs in the rows below, so every shape is a rectangle. The cell LAYOUT
-    references one cell for each part. The cell of a part references one cell for every 128 rows, which in
-    turn references the cells of blocks 128 pixels wide. Equal blocks share a cell. Only the shapes of one
-    block are in memory at a time.
+    Layer k contains the pixels with level >= k (``cumulative``; k starts at 1) or the pixels with level == k
+    (``exclusive``; k starts at 0). Runs of such pixels along a row are merged with equal runs in the rows
+    below, so every shape is a rectangle. The cell LAYOUT references one cell for each part. The cell of a
+    part references one cell for every 128 rows, which in turn references the cells of blocks 128 pixels wide.
+    Equal blocks share a cell. Only the shapes of one block are in memory at a time.
 
     Args:
-        parts: maps the name of each part to its first and last row and its first and last column. By default,
-            the whole map is one part, named ELEMENT.
+        parts: mapping from the name of each part to its box (first row, end row, first column, end column),
+            where the ends are exclusive. By default, the whole map is one part, named ELEMENT.
     """
     import gdstk
 
@@ -90,10 +90,11 @@ def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]
 
 
 def rectangles(masks: np.ndarray) -> np.ndarray:
-    """Cover boolean masks (n, ny, nx) with disjoint rectangles. Return an array (m, 5) whose columns are the
-    number of the mask, top, bottom, left and right.
+    """Cover the True pixels of n boolean masks, shape (n, ny, nx), with disjoint rectangles.
 
-    The row ``bottom`` and the column ``right`` lie just outside the rectangle.
+    The result has shape (m, 5). Its columns are the number of the mask, the rows ``top`` and ``bottom``, and
+    the columns ``left`` and ``right`` of a rectangle. The row ``bottom`` and the column ``right`` lie just
+    outside the rectangle.
     """
     edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
     mask, row, left = np.nonzero(edges > 0)

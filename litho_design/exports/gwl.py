@@ -21,10 +21,10 @@ def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: f
     """Write one field after the other, each from the lowest slice of the pedestal upwards. Return the number
     of lines.
 
-    The lines of a slice lie at the middle of its thickness. Across the lines, each line lies at the middle of
-    its hatching distance. A line runs along x from the first edge to the last edge of a run of pixels that
-    reach the slice. The origin of x and y is the lower left corner of the element, and y points upwards. In
-    galvo mode, the stage moves to the middle of each field, which is then the origin.
+    The lines of a slice lie at the middle of its thickness. Perpendicular to the lines, each line lies at the
+    middle of its hatching distance. A line runs along x from the first edge to the last edge of a run of
+    pixels that reach the slice. The origin of x and y is the lower left corner of the element, and y points
+    upwards. In galvo mode, the stage moves to the middle of each field, which is then the origin.
 
     Raises:
         InputError: the level height or the pedestal is not a multiple of the slicing distance, or the pitch
@@ -78,8 +78,8 @@ def _head(job: Gwl) -> str:
 
 
 def _runs(mask: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Yield the row, the start and the end of each run of True pixels in a mask (ny, nx), beginning with the
-    lowest row.
+    """Yield the row, the start and the end of each run of True pixels in a mask of shape (ny, nx), beginning
+    with the bottom row.
     """
     edges = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)[::-1]
     row, begin = np.nonzero(edges > 0)

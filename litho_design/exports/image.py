@@ -21,8 +21,8 @@ _CLASSIC_BYTES = 2**32 - 2**24
 
 
 def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
-    """Return grey values that are linear in the height of the levels, with the largest step that ``bits``
-    allow.
+    """Return the grey value of each level. The grey values are linear in height, with the largest step that
+    ``bits`` bits per pixel allow.
 
     Raises:
         InputError: there are more levels than grey values.
@@ -34,8 +34,8 @@ def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
 
 
 def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list[int]:
-    """Return the grey values whose measured heights, apart from a constant offset, equal the heights of the
-    levels.
+    """Return, for each level, the grey value whose measured height equals the height of the level, apart from
+    an offset that is the same for all levels.
 
     Args:
         curve: CSV with the columns ``grey`` and ``height_um``, for example from a dose matrix. The values in

@@ -14,7 +14,7 @@ _MOST = LEVEL_HEIGHT_UM.high
 
 
 class Gwl(Record):
-    """How a Nanoscribe prints the slices."""
+    """Settings with which a Nanoscribe printer prints the slices of a GWL file."""
 
     mode: Literal["galvo", "piezo"] = setting("galvo", "What moves the focus", option="--gwl-mode")
     field_um: float = setting(
@@ -40,7 +40,7 @@ class PrintJob(Record):
     hatching_um: float = setting(0.1, "Hatching distance", unit="µm", option="--hatching-um", gt=0, le=_MOST)
     gds_layers: GdsLayers = setting(
         "cumulative",
-        "Whether layer k contains the pixels with level >= k or those with level == k",
+        "Pixels in layer k: those with level >= k (cumulative), or those with level == k (exclusive)",
         option="--gds-layers",
     )
     gwl: Gwl = setting(Gwl(), "GWL")

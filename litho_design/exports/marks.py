@@ -18,13 +18,13 @@ Box = tuple[int, int, int, int]
 # An F looks different in all eight orientations.
 _LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 _STROKE_UM = 1.0
-# Width of the middle of the witness, out of reach of its edges.
+# Width of the middle part of the witness area, which lies beyond the reach of the printer from the edges.
 _FLAT_UM = 4.0
 
 
 class Marks(Record):
     """Positions of the element, the orientation mark and the witness area in an exported map. Each position
-    is the first and last row and the first and last column, in pixels.
+    is a box in pixels (first row, end row, first column, end column), where the ends are exclusive.
 
     ``witness_height_um`` is the height above the ground that the design's model predicts for the middle of
     the witness area.
@@ -44,17 +44,17 @@ class Marks(Record):
 def with_marks(
     levels: LevelRows, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
 ) -> tuple[np.ndarray, Marks]:
-    """Add an F and a square of the highest level to the right of a level map (size, size).
+    """Add an F and a square of the highest level to the right of a level map of shape (size, size).
 
     The F, the square and the element are separated by at least the reach of the printer, so none of them
     changes the print of another. The element and both marks consist of whole cells.
 
     Args:
         guard_um: reach of the printer, µm.
-        level_heights_um: height to which a wide field of each level is printed.
+        level_heights_um: printed height, µm, of a wide uniform field of each level.
 
     Returns:
-        The wider map, uint8 (size, width), and the positions of the parts.
+        The wider map, a uint8 array of shape (size, width), and the positions of its parts.
 
     Raises:
         InputError: the element has too few rows for both the mark and the witness area.

@@ -13,13 +13,13 @@ from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_arra
 
 
 class LevelRows(Protocol):
-    """A level map (ny, nx) in memory or on disk, with row 0 at the top. The rows of the map can be sliced
-    like those of an array.
+    """A level map of shape (ny, nx) in memory or on disk, with row 0 at the top. Its rows can be sliced like
+    those of an array.
     """
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Return (ny, nx)."""
+        """Return the shape (ny, nx) of the map."""
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
         """Return all columns of these rows."""
@@ -27,18 +27,18 @@ class LevelRows(Protocol):
 
 @dataclass(frozen=True)
 class RingRows:
-    """The level map of a lens of rings; only the requested rows are computed.
+    """The level map of a lens in rings, which computes only those rows that are requested.
 
     Args:
-        ring_level: level of each pixel along the radius, uint8. Beyond the aperture, the corners have the
-            last of these levels.
+        ring_level: level of each pixel along the radius, uint8. In the corners of the map, beyond the
+            aperture, all pixels have the last of these levels.
     """
 
     ring_level: np.ndarray
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return (ny, nx)."""
+        """Return the shape (ny, nx) of the map."""
         return (2 * len(self.ring_level),) * 2
 
     def __getitem__(self, rows: slice) -> np.ndarray:
@@ -63,6 +63,8 @@ def layout_rows(folder: str | Path) -> LevelRows:
 
 
 def bands_of(levels: LevelRows, band_px: int) -> Iterator[slice]:
-    """Yield the rows of a map in bands of ``band_px`` rows; the last band may have fewer."""
+    """Yield slices that divide the rows of a map into bands of ``band_px`` rows; the last band may have
+    fewer.
+    """
     height = levels.shape[0]
     return (slice(top, min(top + band_px, height)) for top in range(0, height, band_px))

@@ -45,8 +45,8 @@ class Sidecar(Result):
     pedestal_um: float
     slicing_um: float
     hatching_um: float
-    # Grey of every level in grey formats; ``white_height_um`` is the height of the highest grey if grey is
-    # linear.
+    # Grey value of every level, for greyscale formats. If grey values are linear in height,
+    # ``white_height_um`` is the height that belongs to the highest grey value of the format.
     greys: list[int] | None
     white_height_um: float | None
     gds_layers: GdsLayers | None
@@ -75,7 +75,7 @@ def cell_of(layout: LayoutSettings) -> int:
 
 
 def of_layout(layout: LayoutSettings, shape_px: tuple[int, int]) -> dict[str, Any]:
-    """Return the fields of the sidecar that describe a map of this shape."""
+    """Return the fields of the sidecar that describe an exported map with the shape ``shape_px``."""
     return {
         "shape_px": shape_px,
         "pitch_um": layout.pitch_um,

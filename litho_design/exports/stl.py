@@ -23,12 +23,14 @@ _BELOW = -1
 def write_stl(
     path: Path, levels: np.ndarray, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> int:
-    """Write the surface ``pedestal_um + level * level_height_um``; return the number of triangles.
+    """Write the solid whose top lies at the height ``pedestal_um + level * level_height_um``. Return the
+    number of triangles.
 
     Every edge belongs to two faces, even where columns touch only along an edge; see ``step_solid``.
 
     Args:
-        levels: integer levels per cell (ny, nx), with row 0 at the top. In the file, y points upwards.
+        levels: integer level of each cell, shape (ny, nx), with row 0 at the top. In the file, y points
+            upwards.
         cell_um: side of one cell.
         pedestal_um: height of the base under level 0; must be positive.
 
@@ -55,17 +57,18 @@ def write_stl(
 
 
 def step_solid(levels: np.ndarray) -> np.ndarray:
-    """Return the triangles (m, 3, 3) of the solid that has one column per cell, as x y z, float32.
+    """Return the triangles of the solid that has one column per cell.
 
     Every edge belongs to two faces, which traverse it in opposite directions. To achieve this, each end of a
     wall has a vertex at the height of every column top that meets there.
 
     Args:
-        levels: non-negative integers (ny, nx); y increases with the row.
+        levels: non-negative integers, shape (ny, nx); y increases with the row.
 
     Returns:
-        Corners of triangles, with x and y in cells and z in levels (-1 for the underside). Seen from outside,
-        the corners of a triangle run counter-clockwise.
+        Float32 array of shape (m, 3, 3) with axes triangle, corner and coordinate (x, y, z). The unit of x
+        and y is one cell, and that of z is one level; the underside lies at -1. Seen from outside, the
+        corners of a triangle run counter-clockwise.
     """
     cells = np.pad(np.asarray(levels, np.int16), 1, constant_values=_BELOW)
     around = np.stack([cells[:-1, :-1], cells[:-1, 1:], cells[1:, :-1], cells[1:, 1:]], axis=-1)
@@ -88,8 +91,10 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Return the positions (n, 3) of points (n, 2), which are given as row and column. The points marked in
-    ``moved`` are shifted towards a cell.
+    """Return the positions x, y and z, shape (n, 3), of grid points.
+
+    The points are given as row and column, shape (n, 2). Those marked in ``moved`` are shifted slightly in
+    the direction ``way``, towards one of the cells around them.
     """
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)

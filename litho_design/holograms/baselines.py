@@ -19,7 +19,7 @@ from litho_design.optimisation.phases import gerchberg_saxton
 _ITERATIONS = 40
 _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
-# Figures that are defined for any image.
+# Names of the figures that are defined for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
 
 
@@ -31,8 +31,8 @@ def hologram_baselines(
     ``diffraction-limited`` is an element with free amplitude and phase whose image has a flat phase, found by
     forty Gerchberg-Saxton steps. ``continuous phase`` has one arbitrary phase per cell and needs neither a
     printer nor levels. The search for these phases starts from Gerchberg-Saxton and takes a hundred descent
-    steps on the loss of the design. This loss is one of the scores. ``weighted GS`` also has one phase per
-    cell, found by forty weighted Gerchberg-Saxton steps.
+    steps on the loss of the design. The loss that they reach is one of the scores. ``weighted GS`` also has
+    one phase per cell, found by forty weighted Gerchberg-Saxton steps.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -56,11 +56,13 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Search for the phases that put the most power on the signal {T > 0.5}, starting from a print, and
-    return this power.
+    """Search for the phases that put the most power on the signal, starting from a print, and return the
+    share of the power that reaches the signal.
 
-    Each step is u <- exp(j arg P^H S P u), where S selects the signal; every pixel has its own phase. P^H S P
-    is positive, so no step reduces the power, and the result is never below that of the print.
+    The signal is the set of pixels whose target exceeds 0.5. Each step is u <- exp(j arg P^H S P u), where u
+    is the wave behind the element, P is the propagator and S is the mask of the signal; every pixel has its
+    own phase. The operator P^H S P is positive semidefinite, so no step reduces the power, and the result is
+    never below that of the print.
     """
     signal = target > 0.5
     wave = element_field(height_um, bench.grid, bench.optics)
@@ -80,8 +82,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """Return the wave (size, size) of unit power whose image comes closest to sqrt(target) with a flat
-    phase.
+    """Return the wave of unit power, shape (size, size), whose image comes closest to the amplitude
+    sqrt(target) with a flat phase.
     """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)

@@ -23,24 +23,27 @@ from litho_design.images.similarity import (
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
-# These values are for a 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its camera.
+# Pixel side in the image plane and NA of an assumed camera: pixels of 3.45 µm behind an objective with a
+# magnification of 10 and an NA of 0.3. The paper does not state its camera.
 _CAMERA_PITCH_UM, _CAMERA_NA = 0.345, 0.3
 
 Waves = Sequence[tuple[float, Tensor]]
 
 
 class HologramBench(ElementBench):
-    """The image of a holographic element, and its score."""
+    """Compute the image behind a holographic element, and the score of this image."""
 
     @torch.no_grad()
     def score(self, height_um: Tensor, target: Tensor) -> HologramScore:
-        """Score printed heights (size, size), µm, against ``target`` (size, size)."""
+        """Score the image behind printed heights, µm, against the target image. Both arguments have shape
+        (size, size).
+        """
         element = element_field(height_um, self.grid, self.optics)
         waves = list(self.waves(height_um))
         return hologram_score(waves, element, target, self.grid, self.optics)
 
     def resolved(self, target: Tensor) -> Tensor:
-        """Return ``target`` (size, size) at the resolution of the element."""
+        """Return the target image of shape (size, size), blurred to the resolution of the element."""
         return at_resolution(target, self.grid, self.optics)
 
 
@@ -52,17 +55,19 @@ class HologramScore(Record):
     eff_window: float = Field(description="share of the incident power in the window")
     zero_order_share: float = Field(description="share of the incident power in the zero order")
     si_psnr_db: float = Field(description="scale-invariant PSNR, dB")
-    rmse_paper: float = Field(description="RMSE at the paper's scale")
+    rmse_paper: float = Field(description="RMSE of the image, scaled as in the paper")
     ssim: float = Field(description="SSIM")
     si_psnr_resolved_db: float = Field(
         description="scale-invariant PSNR relative to the target at the element's resolution, dB"
     )
     ssim_resolved: float = Field(description="SSIM against the target at the element's resolution")
-    clipped_share: float = Field(description="share of pixels clipped for SSIM")
-    ssim_camera: float = Field(description="SSIM as the camera sees it")
-    speckle_contrast: float = Field(description="speckle contrast on the signal")
+    clipped_share: float = Field(description="share of pixels that are clipped before SSIM is computed")
+    ssim_camera: float = Field(description="SSIM of the image as a camera records it")
+    speckle_contrast: float = Field(description="speckle contrast (standard deviation / mean) on the signal")
     uniformity: float = Field(description="uniformity on the signal")
-    background_ratio: float = Field(description="mean signal over mean background")
+    background_ratio: float = Field(
+        description="mean intensity of the signal divided by that of the background"
+    )
 
 
 class WindowedHologramScore(HologramScore):
@@ -82,13 +87,13 @@ def hologram_score(
     is computed on c I, clipped to [0, 1], with an 11 px Gaussian window, sigma 1.5 and a data range of 1.
 
     Args:
-        waves: one pair for each wave, namely the share of the light in this wave, and the complex field (m,
-            m) of the wave in the image plane for unit incident power, 1/µm.
-        element: complex field (n, n) just behind the element, on the same pixels. The mean of this field
-            determines the zero order, which is the share of the power that continues undiffracted as a plane
-            wave.
-        target: real (m, m) in [0, 1].
-        grid: geometry of the waves.
+        waves: one pair for each wave: the share of the light in this wave, and its complex field in the image
+            plane for unit incident power, 1/µm, shape (m, m).
+        element: complex field just behind the element, shape (n, n), on pixels of the same size. The mean of
+            this field determines the zero order, which is the share of the power that continues undiffracted
+            as a plane wave.
+        target: target image with values in [0, 1], shape (m, m).
+        grid: grid of the pixels in the image plane.
     """
     area = math.prod(grid.pitch_um)
     share = _added(waves) * area
@@ -106,10 +111,11 @@ def hologram_score(
 
 
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
-    """Blur a real target (m, m) to the resolution of an element of the same size.
+    """Blur a target image of shape (m, m) to the resolution of an element of the same size.
 
     The target is convolved with the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
-    where NA is the sine of the angle from the axis to the edge. The target is dark beyond the window.
+    where NA is the sine of the angle, seen from the image, between the axis and the edge of the element. The
+    target is dark beyond the window.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
@@ -136,8 +142,8 @@ def _added(waves: Waves) -> Tensor:
 
 
 def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics) -> float:
-    """Return the SSIM between the image that a camera records of the waves, and the target sampled on the
-    camera's pixels.
+    """Return the SSIM between the image that a camera records of the waves and the target, which is sampled
+    on the pixels of the camera.
     """
     import cv2
 

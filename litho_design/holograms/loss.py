@@ -14,8 +14,8 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Return a mask (size, size) of the pixels near the target's light. Only these pixels count in the error.
-    Return None if all pixels count.
+    """Return a mask, shape (size, size), of the pixels near the target's light. Only these pixels count in
+    the error. Return None if all pixels count.
     """
     if not settings.signal_window_um:
         return None
@@ -35,11 +35,12 @@ def hologram_loss(
     """Return the loss of an image, and the named parts of this loss.
 
     Args:
-        share: share of the incident power on each pixel (size, size).
-        target: target intensity in [0, 1], (size, size).
-        counted: mask of the pixels that count in the error, bool (size, size); None if all pixels count.
-        total: function that sums over the pixels of the whole image, needed only if the other arguments cover
-            a part of the image.
+        share: share of the incident power on each pixel of the image, shape (size, size).
+        target: target intensity in [0, 1], shape (size, size).
+        counted: boolean mask of the pixels that count in the error, shape (size, size), or None if all pixels
+            count.
+        total: function that sums values over the pixels of the whole image. It is needed only if the other
+            arguments cover a part of the image.
     """
     total = total or torch.sum
     efficiency = total(share[target > 0])

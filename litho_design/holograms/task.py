@@ -49,7 +49,8 @@ class HologramTask(Task):
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
-    # This function sums over the pixels of the whole element; target and cells may cover only a part of it.
+    # This function sums over the pixels of the whole element, because the target and the cells of this
+    # process may cover only a part of it.
     total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
@@ -101,7 +102,9 @@ class HologramTask(Task):
         return nearest_levels(phase, level_phase)
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
-        """Return the score of the image behind a print (size, size), µm."""
+        """Return the score of the image behind a print, which is given as heights in µm of shape
+        (size, size).
+        """
         score = self.bench.score(height_um, self.target)
         if self.counted is None:
             return score
@@ -115,8 +118,8 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Search from the print for the continuous phase that puts the most power on the signal, and return
-        the signal efficiency.
+        """Return the signal efficiency of the continuous phase that puts the most power on the signal. The
+        search for this phase starts from the print.
         """
         return best_signal_efficiency(self.bench, height_um, self.target)
 

@@ -14,24 +14,27 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of random draws within a measurement's uncertainty; with so many, their rms is known to 25 %.
+# Number of random draws within the uncertainty of a measurement. With this number, their rms is known to
+# 25 %.
 DRAWS = 8
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
 
 def white_noise(values: np.ndarray) -> float:
-    """Return the standard deviation of the white noise in a map (ny, nx), from its highest frequencies."""
+    """Return the standard deviation of the white noise in a map of shape (ny, nx), from its highest
+    frequencies.
+    """
     window, high = _window_and_band(values.shape)
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()
     return float(np.sqrt(power[high].mean()))
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Return two standard deviations of the noise in a photograph (ny, nx): that in the dark, and that
-    relative to the light.
+    """Return two standard deviations of the noise in a photograph of shape (ny, nx): that of the noise in the
+    dark, and that of the noise proportional to the light, relative to the light.
 
-    The second value includes noise that is proportional to the light, such as speckle.
+    The second value includes speckle.
 
     The variance at the highest frequencies is fitted by dark^2 + (share * light)^2, where ``dark`` and
     ``share`` are the two standard deviations.

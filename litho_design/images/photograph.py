@@ -113,13 +113,13 @@ class Photograph:
     """A photograph, and the position of the expected image on it.
 
     Attributes:
-        counts: counts (ny, nx) of the cleaned, upright photograph, minus the dark level.
+        counts: counts of the cleaned, upright photograph minus the dark level, shape (ny, nx).
         window_to_photo: projective map (3, 3) from window pixels to photograph pixels.
         side_px: side of the window, in window pixels.
         pitch_um: side length of a window pixel.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
-        expected: expected counts (m, m), used for pixels that lie beyond the photograph.
+        expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
     """
 
     counts: np.ndarray
@@ -131,8 +131,8 @@ class Photograph:
     expected: np.ndarray
 
     def image(self) -> np.ndarray:
-        """Return the photograph resampled on the window (m, m), in counts per camera pixel. Some counts may
-        be negative because of noise.
+        """Return the photograph resampled on the pixels of the window, shape (m, m), in counts per camera
+        pixel. Some counts may be negative because of noise.
         """
         return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
@@ -195,7 +195,8 @@ def photographed_image(
     another orientation better than ``orientation`` is refused.
 
     Args:
-        wanted: expected image (m, m), in any unit. ``wanted_pitch_um`` is the side of its pixels, µm.
+        wanted: expected image in any unit, shape (m, m).
+        wanted_pitch_um: side of its pixels, µm.
         source: greyscale image of any bit depth whose counts are proportional to the light. If the dark level
             is unknown, it is chosen so that the darkest pixels have the expected brightness.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
@@ -537,8 +538,8 @@ def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """Return the shift (x, y) of ``moving`` (n, n), in whole pixels, at which its correlation with
-    ``reference`` is largest.
+    """Return the shift (x, y) of the image ``moving``, in whole pixels, at which its correlation with the
+    image ``reference`` is largest. Both images have shape (n, n).
     """
     correlation = correlate(moving - moving.mean(), reference - reference.mean(), method="fft")
     y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)

@@ -59,8 +59,8 @@ def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
-    """Return the SI-PSNR and the SSIM of an image (m, m) relative to its target, and relative to the target
-    at the resolution of the element.
+    """Return the SI-PSNR and the SSIM of an image relative to its target, and relative to the target at the
+    resolution of the element. All images have shape (m, m).
     """
     figures = {}
     for name, wanted in (("", target), ("_resolved", resolved)):
@@ -71,8 +71,8 @@ def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float
 
 
 def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
-    """Compare an estimate (n, n) with the true object (n, n) in [0, 1], and return ``mae_NAME``,
-    ``psnr_NAME_db`` and ``ssim_NAME``.
+    """Compare an estimate with the true object, which has values in [0, 1] (both have shape (n, n)), and
+    return ``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME``.
 
     For PSNR and SSIM, the estimate is clipped to [0, 1].
     """
@@ -86,8 +86,8 @@ def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
 
 
 def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
-    """Return the shares of the light in an image (m, m), and the uniformity of the image on the signal {T >
-    0.5}.
+    """Return the shares of the light in an image of shape (m, m), and the uniformity of the image on the
+    signal, which is the pixels whose target exceeds 0.5.
     """
     lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))

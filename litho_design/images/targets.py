@@ -35,7 +35,7 @@ class TargetRecord(Record):
 
     @classmethod
     def of_array(cls, name: str, pixels: np.ndarray, unit: str) -> TargetRecord:
-        """Make the record of a drawing or an array (ny, nx) that is used unchanged."""
+        """Make the record of a drawing, or of an array that is used unchanged, shape (ny, nx)."""
         return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
@@ -51,7 +51,9 @@ def object_name(item: ImagedObject) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """A target image, float32 (size, size) in [0, 1] with row 0 at the top, and its record."""
+    """A target image and its record. The image is a float32 array of shape (size, size) with values in [0, 1]
+    and row 0 at the top.
+    """
 
     pixels: np.ndarray
     record: TargetRecord
@@ -63,7 +65,8 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
     Args:
         source: text, ring, chart, spots or letters; an image file, which is converted to grey values and
-            fitted to the square; or an array (size_px, size_px) in [0, 1], which is used unchanged.
+            fitted to the square; or an array of shape (size_px, size_px) with values in [0, 1], which is used
+            unchanged.
 
     Raises:
         InputError: the source is neither a drawing nor a readable image, or the image has no light.
@@ -84,8 +87,8 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:
-    """Return the stroke width, px, of a target (size, size) in [0, 1], which is the median of the widths
-    along the centre lines of the strokes.
+    """Return the width of the strokes of a target, in pixels: the median of the widths along the centre lines
+    of the strokes. The target has shape (size, size) and values in [0, 1].
     """
     import cv2
 
@@ -98,7 +101,9 @@ def stroke_width_px(pixels: np.ndarray) -> float:
 
 
 def draw_target(name: str, size_px: int) -> np.ndarray:
-    """Draw a target with anti-aliased edges, float32 (size, size) in [0, 1]."""
+    """Draw a target with anti-aliased edges, as a float32 array of shape (size, size), values in
+    [0, 1].
+    """
     fine = size_px * _OVERSAMPLE
     draw = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name]
     # The drawing lies on a unit square with the origin in the middle and y down.
@@ -169,8 +174,8 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
-    """Read an image as greyscale (ny, nx) without rescaling its values, and list the conversions, one phrase
-    each.
+    """Return an image as a greyscale array of shape (ny, nx), and a list of the conversions, one phrase each.
+    The values are not rescaled.
 
     Raises:
         InputError: the file does not exist or is not a readable image.
@@ -201,7 +206,8 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
         what: name of the image in error messages.
 
     Returns:
-        float32 (size, size) in [0, 1], and the conversions, one phrase each.
+        The image as a float32 array of shape (size, size) with values in [0, 1], and a list of the
+        conversions, one phrase each.
 
     Raises:
         InputError: the image is not readable, has values that are not numbers, or has no light.

@@ -39,19 +39,19 @@ class LoadedDesign:
     Attributes:
         folder: folder of the design.
         record: the contents of ``design.json``.
-        level: layout (size, size).
-        expected_um: height (size, size), µm, of the print that the design expects.
+        level: levels of the layout, shape (size, size).
+        expected_um: height, µm, of the print that the design expects, shape (size, size).
         task: the task that the layout was designed for.
-        target: target image (size, size) of a hologram; None for other tasks.
+        target: target image of a hologram, shape (size, size), or None for other tasks.
         bench: the optics, which turn a height map into an image or a PSF.
 
     Args:
         folder: a design folder; its arrays are checked against the hashes in the record. For a lens of rings,
             levels and heights are given along a radius, not over a plane.
         device: where prints and waves are computed.
-        element: ``thin`` or ``thick``, if it is not to be the kind that the design states (see ``Optics``).
-        band_px: largest number of rows in a band, if a large hologram is to be printed and scored band by
-            band.
+        element: ``thin`` or ``thick``, to override the kind of element that the design states (see
+            ``Optics``).
+        band_px: if given, a large hologram is printed and scored in bands of at most this many rows.
 
     Raises:
         InputError: the folder is incomplete or was altered, the task is not registered here, this machine
@@ -111,7 +111,7 @@ class LoadedDesign:
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
-        """Return the height (size, size), µm, of the layout as printed by ``judge``."""
+        """Return the height, µm, of the layout as ``judge`` predicts its print, shape (size, size)."""
         self.task.check_printer(judge)
         return self.task.printed_um(self.level, judge)
 
@@ -121,11 +121,11 @@ class LoadedDesign:
         return self.bench(height_um).cpu().numpy()
 
     def score(self, height_um: Tensor) -> Record:
-        """Return the score of a print (size, size), µm."""
+        """Return the score of a print, given as heights in µm of shape (size, size)."""
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """Scale an image to its target, to show it in reports. A PSF is shown as the square root of PSF /
+        """Return an image scaled to match its target, for reports. A PSF is shown as the square root of PSF /
         peak.
         """
         return self.task.display(image)

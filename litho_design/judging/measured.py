@@ -98,7 +98,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         source: the scan, in any format that ``litho-data inspect`` reads.
 
     Returns:
-        Height (size, size), µm, and its record.
+        The height of the print, µm, shape (size, size), and the record of the measurement.
 
     Raises:
         InputError: the scan cannot be registered, covers too little of the element, or does not
@@ -181,8 +181,8 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
 
 
 def _defects(off_um: np.ndarray) -> np.ndarray:
-    """Return a mask of dust and scars. ``off_um`` (ny, nx) is the deviation of a print from the expected
-    print, after tilt and bow are removed.
+    """Return a mask of dust and scars. ``off_um`` is the deviation of a print from the expected print after
+    tilt and bow are removed, shape (ny, nx).
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
@@ -199,8 +199,8 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
 
 class _Placed(NamedTuple):
-    """A scan resampled on the pixels of the layout (ny, nx): heights, mask of measured pixels, orientation,
-    warning and position uncertainty.
+    """A scan resampled on the pixels of the layout: heights and mask of measured pixels, both of shape
+    (ny, nx), orientation, warning and position uncertainty.
     """
 
     height_um: np.ndarray
@@ -242,8 +242,8 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
 
 @dataclass(frozen=True)
 class Background:
-    """Tilt and bow of a scan. ``map_um`` (ny, nx) is their sum and has zero mean; the other fields are the
-    slopes (x, y) of the tilt and the range of the bow.
+    """Tilt and bow of a scan. ``map_um`` is their sum, shape (ny, nx), with zero mean. The other fields are
+    the slopes of the tilt along x and y, and the range of the bow.
     """
 
     map_um: np.ndarray
@@ -254,7 +254,9 @@ class Background:
 def fitted_background(
     height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
 ) -> Background:
-    """Fit tilt and bow of a scan (ny, nx) by least squares, together with the gain of the expected print."""
+    """Fit the tilt and bow of a scan by least squares, together with the gain of the expected print. All maps
+    have shape (ny, nx).
+    """
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
@@ -274,8 +276,8 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield prints (ny, nx), µm, that are as plausible as the measured one, with different noise, position,
-    height scale and tip.
+    """Yield prints in µm, shape (ny, nx), that are as plausible as the measured one. They differ in noise,
+    position, height scale and tip.
     """
     from scipy.ndimage import shift
 

@@ -132,8 +132,8 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Compare a registered photograph (m, m) with its target and with the target at the resolution of the
-    element, and return the figures.
+    """Compare a registered photograph with its target and with the target at the resolution of the element,
+    and return the figures. All three images have shape (m, m).
     """
     share = torch.from_numpy(image).double()
     found = likeness(share, target, resolved) | light_figures(share, target)
@@ -156,7 +156,8 @@ def score_lens_photo(
         loaded: the design of a lens.
         source: an upright photograph (a lens rotates its image by 180°), or one whose ``orientation`` says
             how to make it upright.
-        printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
+        printed_um: measured height of the print, µm, shape (size, size), from which the calibrated PSF is
+            computed.
 
     Raises:
         InputError: there is no object, the object is unknown, two objects share its name, or
@@ -199,7 +200,9 @@ def score_lens_photo(
 
 
 def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
-    """Return the object (n, n) in [0, 1] that a photograph shows, and its name or record."""
+    """Return the object that a photograph shows, shape (n, n) with values in [0, 1], and its name or
+    record.
+    """
     settings = task.settings.imaging
     items = (*settings.objects, *settings.test_objects)
     names = [object_name(item) for item in items]

@@ -99,10 +99,12 @@ class Judgement:
 
     Attributes:
         scores: one per judge.
-        pictures: maps titles to images (m, m) as shown in reports: the target image, and the image or PSF
-            behind each print. These images are ``side_um`` wide.
-        photos: for a lens, maps titles to images (n, n): the object, the photograph and the reconstructions.
-            These images are ``frame_um`` wide.
+        pictures: mapping from titles to the images that reports show, shape (m, m): the target image, and the
+            image or PSF behind each print.
+        side_um: width of these images, µm.
+        photos: for a photographed lens, mapping from titles to images of shape (n, n): the object, the
+            photograph and the reconstructions.
+        frame_um: width of these images, µm.
     """
 
     scores: list[JudgedScore]

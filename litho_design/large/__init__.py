@@ -1,1 +1,1 @@
-"""Design elements too large for one process, in bands of rows that several processes share."""
+"""Design elements that are too large for one process, in bands of rows that several processes share."""

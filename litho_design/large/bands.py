@@ -1,4 +1,4 @@
-"""Divide a large element into bands of rows, in which it is printed and transformed.
+"""Divide a large element into bands of rows. The element is printed and propagated band by band.
 
 The bands depend only on the layout. An element has the same bands, numbered in the same way, whether one
 process or many compute them.
@@ -15,21 +15,21 @@ from litho_data.foundation.errors import InputError
 from litho_design.optimisation.ranks import ALONE, Ranks
 from litho_design.printers.printer import Printer
 
-# Maximum number of rows of a band. The memory of a print grows with the square of this number, and an element
-# cannot be shared by more processes than it has bands. If a band is narrower than about four times the
-# model's reach, most of the time is spent on rows that are printed twice.
+# Default for the largest number of rows in a band. The memory that a print needs grows with the square of
+# this number, and no more processes can share an element than it has bands. If a band is narrower than about
+# four times the model's reach, most of the time is spent on rows that are printed twice.
 BAND_PX = 512
 
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a square element, and the subset that this process holds.
+    """The bands of a square element, and those of them that this process holds.
 
     Args:
         size_px: side of the element.
         most_px: largest number of rows of a band. All bands have the same number of rows, except the last,
             which may have fewer.
-        ranks: the processes.
+        ranks: the processes that share the element.
         cell_px: side of a free cell. No cell is divided between two bands.
 
     Raises:
@@ -62,7 +62,9 @@ class Bands:
         return -(-self.size_px // self.band_px)
 
     def rows(self, rank: int | None = None) -> range:
-        """Return the rows of the element that the process ``rank`` holds. By default, it is this process."""
+        """Return the rows of the element that the process ``rank`` holds. By default, these are the rows of
+        this process.
+        """
         own = self.ranks.share(self.count, rank)
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
@@ -72,7 +74,7 @@ class Bands:
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 
     def check_halo(self, halo: int) -> None:
-        """Refuse bands so narrow that a row would lie in the halos of two other bands.
+        """Check that the bands are wide enough, so that no row lies in the halos of two other bands.
 
         Raises:
             InputError: a band has fewer rows than twice the halo, or the last band has fewer rows than the
@@ -88,8 +90,8 @@ class Bands:
             )
 
     def with_halo(self, values: Tensor, halo: int) -> Tensor:
-        """Return the rows of this process (rows, x), extended on both sides by ``halo`` rows of the
-        neighbouring process, or by zeros at the edge of the element.
+        """Return the rows of this process, extended on both sides by ``halo`` rows of the neighbouring
+        process, or by zeros at the edge of the element. ``values`` has shape (rows, x).
 
         At most two bands contribute to the gradient of a row, so the order of summation has no effect.
         """
@@ -107,10 +109,10 @@ class Bands:
 
 
 def require_reach(printer: Printer) -> None:
-    """Refuse a printer that cannot print an element in parts.
+    """Check that a printer can print an element in parts.
 
     Raises:
-        InputError: the print depends on the whole image or on the position in the write field.
+        InputError: the print at one place depends on the whole layout or on the position in the write field.
     """
     whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     if whole or printer.depends_on_position:

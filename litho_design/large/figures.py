@@ -1,7 +1,7 @@
 """Score an image of any size, in memory or on disk, one band of rows at a time.
 
-The figures have the names and meanings of ``HologramScore``. Figures that need the whole image at once
-(camera, resolved target, uniformity) are omitted.
+The figures have the names and meanings of ``HologramScore``. Figures that need the whole image at once are
+omitted: those of the camera and of the resolved target, and the uniformity.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from litho_design.large.bands import Bands
 
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
-    """Compare an image (size, size), in shares of the incident power, with its target in [0, 1], and return
-    the figures.
+    """Compare an image with its target, and return a dict of the figures. Both have shape (size, size). The
+    image is in shares of the incident power, and the target is in [0, 1].
     """
     sums = np.sum([_sums(*_read(image, target, band)) for band in bands.own()], axis=0)
     lit, signal, lit_square, dark, paper, power, square, both, wanted, wanted_square = sums.tolist()

@@ -1,5 +1,5 @@
-"""The task of designing a hologram in bands. In contrast to the task in one piece, each process holds only
-its own rows.
+"""The task of designing a hologram in bands. Each process holds only its own rows, in contrast to the task of
+a hologram in one piece.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LEFT_OUT = (
     "that need the whole image at once"
 )
 _PREVIEW_PX = 1024
-# Settings of the light and the search, with the only values that a large element supports.
+# Settings of the light, the search and the hologram, each with the only value that a large element supports.
 LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
@@ -53,7 +53,8 @@ HOLOGRAM: dict[str, Any] = {"loss.signal_window_um": 0.0, "layout.symmetry": "no
 
 
 class BandedHologram(HologramTask):
-    """A hologram whose rows several processes share; each process computes the loss of the whole element.
+    """A hologram whose rows are divided among several processes. Each process obtains the loss of the whole
+    element.
 
     All processes run this task with the same arguments, and all of them must be able to write to the same
     folder. The resulting layout does not depend on the number of processes.
@@ -62,11 +63,12 @@ class BandedHologram(HologramTask):
         settings: settings of the hologram; ``only`` checks the settings of the search.
         printer: frozen model with a finite reach, or nominal heights.
         bands: bands of the element.
-        inputs: contains ``target``, the target image (size, size) in [0, 1], in memory or on disk.
+        inputs: contains ``target``, the target image with values in [0, 1], shape (size, size), in memory or
+            on disk.
         record: source of the target.
 
     Raises:
-        InputError: the settings of the light, or the printer, are not supported for a large element.
+        InputError: the settings of the light or the printer are not supported for a large element.
     """
 
     in_one_piece = False
@@ -93,7 +95,7 @@ class BandedHologram(HologramTask):
         ]
 
     def check_printer(self, printer: Printer) -> None:
-        """Refuse a printer whose reach is not finite or is too wide for the bands."""
+        """Check that the reach of a printer is finite and not too wide for the bands."""
         require_reach(printer)
         self.bands.check_halo(printer.halo_px)
 
@@ -104,7 +106,7 @@ class BandedHologram(HologramTask):
         return f"bands of {self.bands.band_px}"
 
     def make_cells(self) -> CellMap:
-        """Return the cells of the rows of this process."""
+        """Return the map between the cells and the pixels in the rows of this process."""
         return CellMap(self.settings.layout, self.bands.rows())
 
     def make_bench(self, optics: Optics) -> Any:
@@ -112,14 +114,14 @@ class BandedHologram(HologramTask):
         return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Return the height of the rows of this process, µm."""
+        """Return the printed height, µm, of the rows of this process."""
         halo = printer.halo_px
         around = F.pad(self.bands.with_halo(level[0, 0], halo), (halo, halo))
         return printer.print_in_tiles(around[None, None], self.bands.band_px)[0, 0]
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of the whole element and its parts, from the levels of this process (1, 1, rows,
-        size).
+        """Return the loss of the whole element, and the parts of this loss. ``level`` contains the levels in
+        the rows of this process, shape (1, 1, rows, size).
         """
         loss, parts = super().objective(level)
         # Every process returns the whole loss, but the gradient must count it once.
@@ -127,7 +129,9 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Any:
-        """Return the figures of a print (size, size), µm, if one process holds the whole element."""
+        """Return the figures of a print in µm, shape (size, size). This works only if one process holds the
+        whole element.
+        """
         figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
         wave = element_field(height_um, self.bench.grid, self.settings.optics)
         return Figures(**figures, zero_order_share=zero_order_share(wave))
@@ -173,16 +177,16 @@ class BandedBench(nn.Module):
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the shares of the incident power on the pixels (rows, size) that this process holds in the
-        image plane. ``height_um`` contains the heights of its rows.
+        """Return the share of the incident power on each pixel of the image plane that this process holds,
+        shape (rows, size). ``height_um`` contains the heights in the rows of this process.
         """
         field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
         return intensity_share(self.propagator(field), self.rows)
 
 
 def only(settings: Record, values: dict[str, Any]) -> None:
-    """Refuse settings that a large element does not support. ``values`` maps the path of each setting to the
-    only value allowed.
+    """Check that settings are supported for a large element. ``values`` maps the path of each restricted
+    setting to the only value that is allowed.
 
     Raises:
         InputError: a setting has a different value.
@@ -197,8 +201,8 @@ def only(settings: Record, values: dict[str, Any]) -> None:
 
 
 def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
-    """Write arrays from the rows (rows, size) of each process. The first process returns a dict of the
-    SHA-256 by file name; the others return an empty dict.
+    """Write each array to one file, to which every process contributes its rows, shape (rows, size). The
+    first process returns a dict from file name to SHA-256; the others return an empty dict.
     """
     size, rows, hashes = bands.size_px, bands.rows(), {}
     for name, values in arrays.items():

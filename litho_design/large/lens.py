@@ -28,8 +28,8 @@ from litho_design.tasks.task import Task
 
 
 class RadiusMap(CellMap):
-    """Map values of free rings (..., rings) to the pixels of one radius (..., pixels), as ``CellMap`` does
-    for a plane.
+    """Spread one value per free ring, shape (..., rings), over the pixels along one radius, shape
+    (..., pixels). ``CellMap`` does the same for a plane.
     """
 
     area: Tensor
@@ -44,19 +44,21 @@ class RadiusMap(CellMap):
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the area-weighted mean, over each ring, of real or complex ``pixels`` along the radius."""
+        """Return the mean over each ring of real or complex pixels along the radius, weighted with the area
+        of the circle that each pixel stands for.
+        """
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
         return sums[0] / sums[1]
 
 
 class RingLens(DirectLensTask):
-    """A direct lens of rings, printed along a radius in tiles.
+    """A lens in rings that focuses light. It is printed only along a radius, in tiles.
 
     Args:
-        settings: settings of the lens, with rings, a circular aperture and a thin element.
+        settings: settings of the lens. They must state rings, a circular aperture and a thin element.
         printer: a frozen model with a finite reach, or nominal heights.
-        tile_px: length of the tiles in which the strip is printed.
+        tile_px: length, in pixels, of the tiles in which the strip along the radius is printed.
 
     Raises:
         InputError: the settings or the printer are not supported for a lens of rings.
@@ -73,7 +75,7 @@ class RingLens(DirectLensTask):
         self.notes = ["a lens of rings has levels and heights along one radius, but no layout of the plane"]
 
     def check_printer(self, printer: Printer) -> None:
-        """Refuse a printer whose reach is not finite."""
+        """Check that the reach of a printer is finite."""
         require_reach(printer)
 
     def inputs_sha256(self) -> str:
@@ -81,7 +83,7 @@ class RingLens(DirectLensTask):
         return "rings"
 
     def make_cells(self) -> CellMap:
-        """Return the map from rings to the pixels of the radius."""
+        """Return the map that spreads the values of rings over the pixels along the radius."""
         return RadiusMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
@@ -101,8 +103,8 @@ class RingLens(DirectLensTask):
         return focusing_levels(wave.angle().float().cpu(), level_phase.cpu())
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Return the printed height, µm, of each pixel of the radius, from levels along the radius (1, 1,
-        pixels).
+        """Return the printed height, µm, of each pixel along the radius. ``level`` contains the levels along
+        the radius, shape (1, 1, pixels).
         """
         rings = self.cells.average(level[0, 0])
         strip = rings[strip_rings(self.settings.layout, printer.halo_px, len(rings))]

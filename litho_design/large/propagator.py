@@ -29,8 +29,8 @@ class BandedPropagator:
     """A propagator between equal grids, like the one that ``make_propagator`` returns, for a field whose rows
     are divided among several processes.
 
-    The field and the result contain only the rows of this process, complex64 (rows, size). The kernel is even
-    along both axes, so only half of each column of its transform is kept.
+    The field and the result contain only the rows of this process, as complex64 of shape (rows, size). The
+    kernel is even along both axes, so only half of each column of its transform is kept.
 
     Args:
         pitch_um: side of a pixel, µm.
@@ -38,7 +38,8 @@ class BandedPropagator:
         bands: bands of the element.
 
     Raises:
-        InputError: the Rayleigh-Sommerfeld kernel is requested but aliased at this distance.
+        InputError: the Rayleigh-Sommerfeld propagator is requested, but its kernel is aliased at this
+            distance.
     """
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: Device = "cpu"):
@@ -86,7 +87,7 @@ class BandedPropagator:
 
     def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
         """Transform the rows of this process band by band, exchange them with the other processes, and return
-        whole columns (size, own columns).
+        the whole columns that belong to this process, shape (size, columns).
         """
         bands, ranks = self.bands, self.bands.ranks
         rows = self._room(len(bands.rows()), self.length)
@@ -100,8 +101,8 @@ class BandedPropagator:
         return got.reshape(bands.size_px, width)
 
     def _to_rows(self, columns: Tensor) -> Tensor:
-        """Exchange the columns (size, columns) of this process with the other processes, and return its rows
-        (rows, length).
+        """Exchange the columns of this process, shape (size, columns), with the other processes, and return
+        the rows of this process, shape (rows, length).
         """
         bands, ranks = self.bands, self.bands.ranks
         if ranks.count == 1:
@@ -125,7 +126,8 @@ class BandedPropagator:
         """
         pitch, size = self.source.pitch_um[0], self.bands.size_px
         check_distance(optics.distance_um, self.source, self.target, optics.wavelength_um)
-        # Pixel distances between source and target in wrapped order; unused entries repeat the largest.
+        # Distances between source and target in pixels, in the order that an FFT needs. Unused entries repeat
+        # the largest distance.
         index = torch.arange(self.length)
         wrapped = torch.minimum(index, self.length - index).clamp(max=size - 1)
         away_um, below_um = wrapped.double() * pitch, torch.arange(size).double() * pitch
@@ -141,8 +143,9 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space. For small elements, its period must be larger than the
-        side of the element.
+        """Compute the transfer function of free space. For a small element, the period that keeps steep rays
+        from wrapping around is longer than the transform of this propagator. ``ASMPropagator`` then computes
+        the kernel.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]

@@ -1,1 +1,3 @@
-"""Multi-level diffractive lenses: direct focusing, and imaging with deconvolution."""
+"""Multi-level diffractive lenses that focus light directly, or that form images which are then
+deconvolved.
+"""

@@ -21,13 +21,13 @@ from litho_design.optics.imaging import Blur, bin_pixels
 from litho_design.optics.source import require_one_wave
 from litho_design.printers.layout import LayoutSettings
 
-# Side of the central box in the centre-to-background ratio, as in the paper.
+# Side of the central box, µm, from which the centre-to-background ratio is computed, as in the paper.
 CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """Base class of the benches for a plane and for rings, with the aperture, the focal window and the
-    perfect lens.
+    """Base class of the two benches of a lens, for a plane and for rings. It has what they share: the
+    numerical aperture, the focal window and the perfect lens.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
@@ -39,19 +39,21 @@ class LensOptics(nn.Module):
 
     @property
     def numerical_aperture(self) -> float:
-        """Return the sine of the angle, as seen from the focus, between the axis and the edge of the aperture
-        in the direction of x or y.
+        """Return the numerical aperture, which is the sine of the angle, seen from the focus, between the
+        axis and the edge of the aperture along x or y.
         """
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
 
     def ratio(self, psf: Tensor) -> Tensor:
-        """Return the centre-to-background ratio of a PSF (window, window)."""
+        """Return the centre-to-background ratio of a PSF of shape (window, window)."""
         centre_px = round(CENTRE_UM / self.layout.pitch_um)
         return centre_to_background(psf, centre_px, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of a PSF (window, window), -log(centre-to-background ratio), and its parts."""
+        """Return the loss of a PSF, -log(centre-to-background ratio), and a dict of its parts. The PSF has
+        shape (window, window).
+        """
         ratio = self.ratio(psf)
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
 
@@ -81,14 +83,14 @@ class LensBench(LensOptics):
         self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the PSF of a height map (size, size), µm. Each window pixel gives its share of the incident
-        power.
+        """Return the PSF of a height map in µm, shape (size, size). Each pixel of the PSF is the share of the
+        incident power on this pixel of the window.
         """
         field = element_field(height_um, self.grid, self.optics, self.aperture)
         return intensity_share(self.propagator(field), self.window)
 
     def radius_um(self) -> Tensor:
-        """Return the distance of each pixel (size, size) from the axis."""
+        """Return the distance of each pixel from the axis, shape (size, size), µm."""
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
         return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
@@ -113,7 +115,9 @@ class RadialLensBench(LensOptics):
         self._incident = math.pi * (rings * layout.pitch_um) ** 2
 
     def forward(self, ring_height_um: Tensor) -> Tensor:
-        """Return the PSF (window, window) of a lens with the ring heights (rings,), µm."""
+        """Return the PSF, shape (window, window), of a lens whose rings have the given heights in µm, shape
+        (rings,).
+        """
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
         # The wave is interpolated instead of the intensity, because only the wave is smooth on the scale of a
@@ -122,18 +126,18 @@ class RadialLensBench(LensOptics):
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
     def radius_um(self) -> Tensor:
-        """Return the distance of the middle of each ring (rings,) from the axis."""
+        """Return the distance of the middle of each ring from the axis, shape (rings,), µm."""
         rings = torch.arange(self.propagator.rings, dtype=torch.float64, device=self.share.device)
         return (rings + 0.5) * self.layout.pitch_um
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
-    """Return the mean intensity in the central box, divided by the mean intensity in the rest of an image
-    plane as large as the element.
+    """Return the mean intensity in the central box of a PSF, divided by the mean intensity in the rest of an
+    image plane that is as large as the element.
 
-    All light outside the box counts as background, even if it misses this image plane: its share (1 - box) is
-    spread over the area of the element. A ratio computed only within the PSF window would reward light sent
-    outside the window.
+    All light outside the box counts as background, even if it misses this image plane. The share of this
+    light (1 minus that in the box) is therefore divided by the area of the element outside the box. A ratio
+    computed only within the PSF window would reward light sent outside the window.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()
@@ -151,11 +155,11 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 
 
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
-    """Return sensor images (n, size, size). Each is the convolution of an object with the PSF, plus read
-    noise and photon noise drawn with ``seed``.
+    """Return n sensor images, shape (n, size, size). Each of them is the convolution of one object with the
+    PSF, plus read noise and photon noise that are drawn with ``seed``.
 
-    Photon noise is drawn from a Gaussian distribution with the variance of Poisson noise. For the gradient,
-    its standard deviation counts as constant.
+    Photon noise is drawn from a Gaussian distribution with the variance of Poisson noise. No gradient flows
+    through its standard deviation.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)

@@ -17,23 +17,25 @@ from litho_design.lenses.settings import LensSettings
 _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
-# Name of this array among the inputs of a lens: (pictures, size, size), the design's pictures first.
+# Name of an array among the inputs of a lens. The array has shape (pictures, size, size) and contains first
+# the pictures used in the search, then the held-out ones.
 PICTURES = "object_pictures"
 
 
 def object_stack(
     objects: Sequence[ImagedObject], size_px: int, pictures: Iterable[np.ndarray] = ()
 ) -> Tensor:
-    """Return objects (n, size, size) in [0, 1] with a dark border of one eighth.
+    """Return n objects with values in [0, 1], shape (n, size, size). Each of them has a dark border, one
+    eighth of its size wide on every side.
 
     Args:
         objects: names of drawings, and records of pictures.
         size_px: side of the frame, in sensor pixels.
-        pictures: pixels of each picture among the objects, float32 (size, size) in [0, 1], in the order of
-            the objects.
+        pictures: for each object that is a picture, its pixels as a float32 array of shape (size, size) in
+            [0, 1], in the order of ``objects``.
 
     Raises:
-        InputError: the pixels of a picture are missing or do not have this size.
+        InputError: the pixels of a picture are missing or do not have the shape (size, size).
     """
     border, brought, frames = size_px // _BORDER_SHARE, iter(pictures), []
     for item in objects:
@@ -52,16 +54,18 @@ def object_stack(
 def with_objects(
     settings: LensSettings, objects: Sequence[str | Path], held_out: Sequence[str | Path]
 ) -> tuple[LensSettings, dict[str, np.ndarray]]:
-    """Return the ``settings`` of a computational lens, with your own pictures as objects.
+    """Return the settings of a computational lens that has your own pictures as objects, and the pixels of
+    these pictures.
 
-    A path is either a picture or a folder that contains only pictures and hidden files. Without ``held_out``,
-    the pictures are sorted by name, and the last quarter, but at least two of them, are not used in the
-    design and serve only for scores. Without ``objects``, the design uses the drawings.
+    Each path is that of a picture, or of a folder that contains only pictures and hidden files. If
+    ``held_out`` is empty, the pictures are sorted by name, and the last quarter of them, but at least two,
+    are not used in the search and serve only for scores. If ``objects`` is empty, the search uses the
+    built-in drawings.
 
     Returns:
         The settings and the inputs of the task. The settings contain the name, the SHA-256 and the
-        conversions of each picture, and the inputs contain the pixels. Without paths, the settings are
-        unchanged and there are no inputs.
+        conversions of each picture, and the inputs contain the pixels of all pictures. If no paths are given,
+        the settings are unchanged and the inputs are empty.
 
     Raises:
         InputError: the task does not image objects, a file is not a picture, a picture has no light or is
@@ -118,7 +122,8 @@ def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
     """Read one picture as an object of ``size_px`` sensor pixels, including its dark border.
 
     Returns:
-        float32 (size, size) in [0, 1], and its record.
+        The pixels as a float32 array of shape (size, size) with values in [0, 1], and the record of the
+        picture.
 
     Raises:
         InputError: the file is not a picture, or the picture has no light.

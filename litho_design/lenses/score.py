@@ -1,4 +1,4 @@
-"""Score the PSF of a lens against that of a perfect lens, and score its images."""
+"""Score the PSF of a lens against the PSF of a perfect lens, and score the images that the lens forms."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class LensScore(Record):
 
     focusing_efficiency: float = Field(description="share of the aperture's power within the focusing radius")
     focusing_radius_um: float = Field(description="focusing radius: 3 x ideal FWHM, µm")
-    strehl: float = Field(description="peak over the peak of a perfect lens")
-    mtf_volume_ratio: float = Field(description="volume of the MTF over that of a perfect lens")
+    strehl: float = Field(description="peak of the PSF divided by that of a perfect lens")
+    mtf_volume_ratio: float = Field(description="volume of the MTF divided by that of a perfect lens")
     mtf_half_cutoff: float = Field(description="MTF at half the cut-off NA / wavelength")
     fwhm_um: float = Field(description="full width at half maximum, µm")
     fwhm_ideal_um: float = Field(description="full width at half maximum of a perfect lens, µm")
@@ -34,10 +34,11 @@ class LensScore(Record):
 
 
 class ImagingScore(Record):
-    """The score of images: means and standard deviations over test objects and noise seeds that the design
-    never used.
+    """The score of the images of a lens: means and standard deviations over test objects and noise seeds that
+    the search never used.
 
-    ``design`` deconvolves with the PSF that the design expected, and ``calibrated`` with the PSF of the print
+    Each name says which image a figure belongs to. ``design`` is the sensor image deconvolved with the PSF
+    that the design expected, and ``calibrated`` is the sensor image deconvolved with the PSF of the print
     itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
     """
 
@@ -63,7 +64,7 @@ class ImagingScore(Record):
 
 @torch.no_grad()
 def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensScore:
-    """Score the PSF of printed heights, µm: a plane (size, size), or rings (rings,)."""
+    """Score the PSF of printed heights, µm, on a plane, shape (size, size), or on rings, shape (rings,)."""
     psf, ideal = (bench(height).double() for height in (height_um, bench.ideal_height_um()))
     pitch = bench.layout.pitch_um
     fwhm_ideal = half_maximum_width_um(ideal, pitch)
@@ -88,7 +89,8 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
     """Return the diameter, µm, of the circle whose area equals that of the region above half the maximum.
 
-    The PSF is interpolated fourfold (zero-padded spectrum), so that its pixels do not limit the result.
+    The PSF is interpolated to four times as many pixels per side by zero-padding its spectrum, so that the
+    size of its pixels does not limit the result.
     """
     fine = 4
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
@@ -101,14 +103,16 @@ def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
 
 
 def mtf(psf: Tensor) -> Tensor:
-    """Return the MTF, |FFT(psf)| / DC, (n, n), with the zero frequency first."""
+    """Return the MTF of a PSF, |FFT(psf)| divided by its value at zero frequency. The result has shape (n, n)
+    and begins with the zero frequency.
+    """
     transfer = torch.fft.fft2(psf).abs()
     return transfer / transfer[0, 0]
 
 
 def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
-    """Return the MTF at one frequency, cycles/µm: the mean over both axes, with linear interpolation between
-    samples.
+    """Return the MTF at one frequency, given in cycles/µm, as the mean of its values along both axes. The MTF
+    is interpolated linearly between its samples.
     """
     curve = mtf(psf)
     position = frequency_per_um * psf.shape[-1] * pitch_um
@@ -122,11 +126,13 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 def imaging_score(
     psf: Tensor, design_psf: Tensor, objects: Tensor, settings: ImagingSettings
 ) -> dict[str, float]:
-    """Image objects (n, size, size) through ``psf`` and reconstruct them with both PSFs (see
-    ``ImagingScore``).
+    """Form sensor images of objects through ``psf``, reconstruct the objects with each of the two PSFs, and
+    return the scores (see ``ImagingScore``). The objects have shape (n, size, size).
 
     Args:
-        psf, design_psf: (window, window), share of the incident power on each pixel of the window.
+        psf: PSF of the print, which is the share of the incident power on each pixel of the window, shape
+            (window, window).
+        design_psf: PSF that the design expected, in the same form.
     """
     real, expected = (sensor_psf(one, settings.pixel_px).float() for one in (psf, design_psf))
     draws = []
@@ -148,7 +154,7 @@ def black_images(objects: Tensor) -> dict[str, float]:
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Return the values of every figure for all draws and objects."""
+    """Return a dict from the name of each figure to its values for all draws and objects."""
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):
         for image, wanted in zip(images, objects, strict=True):

@@ -22,7 +22,7 @@ from litho_design.optimisation.settings import (
 )
 from litho_design.printers.layout import LayoutSettings
 
-# This is a difference in grey, with white = 1, as in the published code.
+# The smooth L1 loss is quadratic below this difference in grey (white is 1), as in the published code.
 SMOOTH_BELOW = 0.1
 
 LensTaskName = Literal["direct", "computational"]
@@ -32,9 +32,9 @@ class LensView(Record):
     """Aperture, PSF window and search path of a lens.
 
     The PSF window around the focus is ``window_px`` pixels wide; its pixels have the pitch of the layout.
-    With ``path="radial"``, the search uses a strip through the centre and the ring propagator instead of the
-    whole plane. The radial path needs a circular aperture and a ring layout; scores are always computed on
-    the plane.
+    With ``path="radial"``, the search prints only a strip along one radius and propagates light from rings,
+    instead of using the whole plane. This needs a circular aperture and a layout of rings. Scores are always
+    computed on the plane.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"centre_um"})
@@ -51,14 +51,17 @@ class ImagingSettings(Record):
     test.
 
     An object is given by the name of a drawing or by the record of a picture (see ``with_objects``).
-    ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses all light;
-    the paper does not state its read noise. The image of an object has a width of ``object_px * pixel_px``
-    layout pixels. Light outside the PSF window does not contribute to this image.
+    ``read_noise`` is the standard deviation of the read noise, relative to the brightness of a white object
+    behind a lens that focuses all light. The paper does not state its read noise. The image of an object has
+    a width of ``object_px * pixel_px`` layout pixels. Light outside the PSF window does not contribute to
+    this image.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
     objects: tuple[ImagedObject, ...] = setting(("text", "chart", "spots"), "Drawings imaged in the search")
-    test_objects: tuple[ImagedObject, ...] = setting(("ring", "letters"), "Drawings that are only scored")
+    test_objects: tuple[ImagedObject, ...] = setting(
+        ("ring", "letters"), "Drawings imaged only for the scores"
+    )
     object_px: int = setting(
         128,
         "Computational lens: side of the objects, in sensor pixels",
@@ -89,8 +92,8 @@ class ImagingSettings(Record):
         return self
 
 
-# A display 36 mm wide at a distance of 140 mm has an image 102.9 µm wide at 400 µm. Objects have a dark
-# border of 1/8 on each side.
+# The paper images a display that is 36 mm wide at a distance of 140 mm; at 400 µm behind the lens, its image
+# is 102.9 µm wide. 137 sensor pixels are this width plus a dark border of 1/8 on each side.
 PAPER_IMAGING = ImagingSettings(pixel_px=10, object_px=137)
 
 
@@ -105,7 +108,8 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # Each draw computes a whole plane, which costs as much as ten steps of the search along a radius.
+    # There are few draws for the yield, because each draw computes a whole plane, which takes as long as ten
+    # steps of the search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")

@@ -122,11 +122,13 @@ class LensTask(Task):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_print(self, level: Tensor, printer: Printer) -> Tensor:
-        """Return the height of the rings (rings,) or of the plane (size, size), µm."""
+        """Return the printed height, µm, of the rings, shape (rings,), or of the plane, shape
+        (size, size).
+        """
         return self.printed_rings(level, printer) if self.radial else self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
-        """Return the area of each ring; None if the search runs on the plane."""
+        """Return the area of each ring, or None if the search runs on the plane."""
         bench = self.scenes[0][1]
         if not isinstance(bench, RadialLensBench):
             return None
@@ -152,7 +154,7 @@ class LensTask(Task):
         return {"perfect lens": self.score(ideal).model_dump(), "no lens": flat}
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the Strehl ratio and centre-to-background ratio."""
+        """Return the Strehl ratio and the centre-to-background ratio of a PSF."""
         return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self.bench.ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
@@ -160,9 +162,10 @@ class LensTask(Task):
         return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
-        """Print a strip along a radius, and return the heights (rings,), µm, inside the aperture.
+        """Print a strip along a radius, and return the heights of the rings inside the aperture, shape
+        (rings,), µm.
 
-        The strip continues the rings beyond the aperture, as the layout's corners do.
+        Beyond the aperture, the strip has the levels that the layout has in its corners.
         """
         rings, halo = self.cells.average(level[0, 0]), printer.strip_halo_px
         strip = rings[strip_rings(self.settings.layout, halo, len(rings))][None, None]
@@ -195,7 +198,9 @@ class ComputationalLensTask(LensTask):
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the error of the objects' images after Richardson-Lucy deconvolution, and its parts."""
+        """Return the error of the objects' images after Richardson-Lucy deconvolution, and a dict of further
+        figures.
+        """
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
         image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
@@ -207,8 +212,9 @@ class ComputationalLensTask(LensTask):
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
-        """Return the figures of the PSF and of the images of test objects; by default, ``expected_um`` is the
-        print.
+        """Return the figures of the PSF and of the images of test objects.
+
+        ``expected_um`` is the print that the design expected; by default, it is the scored print.
         """
         with torch.no_grad():
             psf, design_psf = (self.bench(height_um if one is None else one) for one in (None, expected_um))
@@ -236,7 +242,7 @@ def _narrow_window(bench: LensBench) -> list[str]:
 
 @lru_cache(maxsize=8)
 def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
-    """Return the number of the ring to which each pixel of a strip along the radius belongs.
+    """Return the number of the ring to which each pixel of a strip along a radius belongs.
 
     The strip consists of two central rows of pixels, from ring 0 to the edge of the aperture, and of a halo
     on all sides. Pixels beyond the last of the ``rings`` are assigned to the last ring.
@@ -270,7 +276,9 @@ def _check(settings: LensSettings) -> None:
 
 
 def _check_outermost_zone(settings: LensSettings) -> None:
-    """Check that two cells fit into the outermost zone, whose width is wavelength / sin(angle of the rim)."""
+    """Check that at least two cells fit into the outermost zone of the lens. The width of this zone is the
+    wavelength divided by the sine of the angle between the axis and the ray from the rim.
+    """
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_px * layout.pitch_um / 2
     zone_um = optics.wavelength_um * math.hypot(radius_um, optics.distance_um) / radius_um

@@ -1,4 +1,6 @@
-"""Scalar diffraction in pure, differentiable functions, tested against closed-form solutions."""
+"""Scalar diffraction as differentiable functions without side effects, tested against closed-form
+solutions.
+"""
 
 from __future__ import annotations
 

@@ -15,26 +15,29 @@ from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import KernelPropagator, wrapped_order
 from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
 
-# Longest period along each axis, in pixels; making a kernel of this size takes half a gibibyte.
+# Longest period along each axis, in pixels. Computing a kernel of this size takes half a gibibyte of memory.
 _LONGEST_PERIOD = 4096
 
 
 class ASMPropagator(KernelPropagator):
-    """Propagate a complex field to a parallel plane with the transfer function of free space.
+    """Propagate a complex field to a parallel plane by means of the transfer function of free space.
 
-    H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so evanescent waves decay instead of
-    becoming NaN. Because H is sampled, the field repeats with a period. Up to 4096 pixels, this period is
-    long enough to keep the steepest rays from wrapping around. Frequencies whose rays are too steep for the
-    period are removed (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). The kernel is stored
-    only at the separations that occur between the two grids, so a longer period costs nothing after
-    construction. A negative distance propagates waves backwards and drops evanescent ones.
+    The transfer function is H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so
+    evanescent waves decay instead of becoming NaN. Because H is sampled, the field repeats with a period. The
+    period is made long enough to keep the steepest rays from wrapping around, but at most 4096 pixels long.
+    Frequencies whose rays are too steep for the period are removed (after Matsushima and Shimobaba 2009,
+    doi:10.1364/OE.17.019662). The kernel is stored only at the separations that occur between the two grids,
+    so a longer period costs nothing after construction. A negative distance propagates waves backwards and
+    drops the evanescent waves.
 
-    If pixels are larger than half a wavelength, their band limits the angles of the rays, and the result is
-    exact for waves within this band. Smaller pixels admit rays up to grazing incidence. In this case, 1 % of
-    the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the better choice.
+    Pixels larger than half a wavelength can represent only rays up to a certain angle, and the result is
+    exact for waves that contain only such rays. Smaller pixels admit rays up to grazing incidence. In this
+    case, 1 % of the wave behind a rough element is missing or wrapped around, so ``RSPropagator`` is the
+    better choice.
 
     Args:
-        source, target: grids of equal pitch; shape and origin are free.
+        source, target: grids of the two planes. Their pitches must be equal; their shapes and origins are
+            free.
         distance_um: separation of the planes, µm; may be zero or negative.
         wavelength_um: wavelength in the medium, µm.
         dtype: torch.complex64 or torch.complex128.
@@ -68,8 +71,9 @@ class ASMPropagator(KernelPropagator):
 class SpectrumAxis:
     """One axis of the spectrum of a wave between two grids.
 
-    ``frequency`` is in cycles/µm, and ``inside`` is the mask of the frequencies that are kept. ``kept``
-    contains the indices of the stored kernel samples, and ``start_um`` is the shift between the grids.
+    ``frequency`` contains the frequencies in cycles/µm, and ``inside`` is the mask of those that are not
+    removed. ``kept`` contains the indices of the kernel samples that are stored, and ``start_um`` is the
+    shift from the source grid to the target grid.
     """
 
     frequency: Tensor
@@ -91,8 +95,8 @@ def spectrum_axes(
 
 
 def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
-    """Return the transfer function of free space, complex128 (y, x); it is 0 at frequencies whose rays are
-    too steep for the period.
+    """Return the transfer function of free space, complex128 of shape (y, x). It is 0 at frequencies whose
+    rays are too steep for the period of the field.
     """
     fy, fx = y.frequency[:, None], x.frequency[None, :]
     band = y.inside[:, None] & x.inside[None, :]

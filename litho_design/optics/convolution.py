@@ -1,4 +1,6 @@
-"""Convolve by FFT; the convolution and its gradient compute only the samples that are kept."""
+"""Convolve by FFT. The convolution and its gradient compute only those samples of the result that are
+kept.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,11 @@ from litho_design.optics.sampling import fast_length
 class KernelPropagator(nn.Module):
     """Propagate a field from one plane to another by convolution with a kernel.
 
-    The grid of the kernel may be finer than the grids of the source and the target; the factors are integers.
+    The grid of the kernel may be finer than the grids of the source and the target, by integer factors.
 
     Args:
-        kernel: complex128 (ky, kx) at the separations of ``wrapped_order``.
-        finer: numbers of kernel pixels per source pixel (y, x) and per target pixel (y, x).
+        kernel: complex128 array of shape (ky, kx), at the separations that ``wrapped_order`` returns.
+        finer: two pairs: the numbers (y, x) of kernel pixels per source pixel, and per target pixel.
         dtype: torch.complex64 or torch.complex128.
     """
 
@@ -39,14 +41,15 @@ class KernelPropagator(nn.Module):
         self.register_buffer("transfer", torch.fft.fft2(kernel).to(dtype), persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Propagate complex ``field`` (..., ny, nx) to (..., my, mx)."""
+        """Propagate a complex field of shape (..., ny, nx); the result has shape (..., my, mx)."""
         here, there = self._finer
         found = convolve(_spread(field, here), self.transfer, fine_shape(self.target.shape, there))
         return found[..., :: there[0], :: there[1]]
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply P^H, the adjoint of ``forward``, which sends a field back: complex (..., my, mx) to (..., ny,
-        nx).
+        """Apply P^H, the adjoint of ``forward``, which sends a field back.
+
+        It turns a complex field of shape (..., my, mx) into one of shape (..., ny, nx).
         """
         here, there = self._finer
         found = convolve(_spread(field, there), self.transfer.conj(), fine_shape(self.source.shape, here))
@@ -60,8 +63,8 @@ def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int
 
 
 def wrapped_order(here: int, there: int) -> Tensor:
-    """Return the separations, in pixels, between ``here`` source pixels and ``there`` target pixels along an
-    axis.
+    """Return the separations, in pixels, that occur between ``here`` source pixels and ``there`` target
+    pixels along an axis, in the order that an FFT needs.
 
     Negative separations come last. Unused entries repeat a used separation.
     """
@@ -74,20 +77,20 @@ def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Ten
     """Convolve with a kernel given by its transform, and keep the first ``out_shape`` samples.
 
     Args:
-        field: complex (..., ny, nx).
-        transfer: complex (ky, kx), FFT of the kernel in wrapped order; ky >= ny + my - 1, and likewise for
-            kx.
-        out_shape: (my, mx).
+        field: complex tensor of shape (..., ny, nx).
+        transfer: FFT of the kernel in the order of ``wrapped_order``, complex, shape (ky, kx), where ky >= ny
+            + my - 1, and likewise for kx.
+        out_shape: shape (my, mx) of the result.
 
     Returns:
-        complex (..., my, mx).
+        A complex tensor of shape (..., my, mx).
     """
     return _Convolution.apply(field, transfer, out_shape)
 
 
 class _Convolution(torch.autograd.Function):
-    """A convolution, whose adjoint is a convolution with the conjugate transfer function, with input and
-    output shapes exchanged.
+    """A convolution with its gradient. The adjoint of the convolution is a convolution with the conjugate
+    transfer function, whose input and output shapes are exchanged.
 
     The gradient is implemented explicitly, because autograd would keep padded copies and transform rows that
     are cropped afterwards.

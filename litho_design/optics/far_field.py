@@ -1,5 +1,5 @@
-"""Propagate to the far field, the focal plane of an ideal lens behind the element, where positions stand for
-angles.
+"""Propagate to the far field: the focal plane of an ideal lens behind the element, where each position
+corresponds to an angle.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from litho_data.foundation.grid import PixelGrid
 class FarFieldPropagator(nn.Module):
     """Propagate a field to the focal plane of an ideal lens.
 
-    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx, where position p corresponds to the sine p / f.
-    The sum is exact for any two grids and uses one matrix per axis. Pixels are treated as squares, not as
-    points (Goodman, Fourier Optics, ch. 5).
+    U(p) = 1 / (j λ f) sum u(q) exp(-2πj p·q / (λ f)) dy dx. The position p corresponds to the direction whose
+    sine is p / f. The sum is exact for any two grids and uses one matrix per axis. Pixels are treated as
+    squares, not as points (Goodman, Fourier Optics, ch. 5).
 
     Args:
-        source, target: grids of the two planes, µm; any shapes and pitches.
+        source, target: grids of the two planes, µm. Their shapes and pitches are free.
         distance_um: focal length f.
 
     Raises:
-        InputError: the image is wider than λ f / pitch; beyond this width, the light of a sampled element
-            repeats.
+        InputError: the image is wider than λ f / pitch. Beyond this width, the computed light of a sampled
+            element repeats.
     """
 
     along_y: Tensor
@@ -59,9 +59,11 @@ class FarFieldPropagator(nn.Module):
             self.register_buffer(name, matrix.to(dtype), persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Propagate complex ``field`` (..., ny, nx) to (..., my, mx)."""
+        """Propagate a complex field of shape (..., ny, nx); the result has shape (..., my, mx)."""
         return -1j * (self.along_y @ field @ self.along_x.T)
 
     def adjoint(self, field: Tensor) -> Tensor:
-        """Apply P^H, the adjoint of ``forward``: complex (..., my, mx) to (..., ny, nx)."""
+        """Apply P^H, the adjoint of ``forward``, to a complex field of shape (..., my, mx). The result has
+        shape (..., ny, nx).
+        """
         return 1j * (self.along_y.mH @ field @ self.along_x.conj())

@@ -9,8 +9,8 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Number of steps in a block that the backward pass recomputes. If all steps fit into the memory stated below,
-# at about twenty values per pixel and step, they are kept instead.
+# The backward pass recomputes the steps in blocks of this many steps. If all steps together fit into the
+# memory stated below (about twenty values per pixel and step), they are kept and not recomputed.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
@@ -23,8 +23,8 @@ class Blur:
     The PSF has odd sides, and its middle sample is the origin, so images do not shift.
 
     Args:
-        psf: real (k, k) with any sum; gradients flow to it.
-        frame: (ny, nx) of the object and of the recorded image.
+        psf: real PSF of shape (k, k) with any sum; gradients flow to it.
+        frame: shape (ny, nx) of the object and of the recorded image.
     """
 
     def __init__(self, psf: Tensor, frame: tuple[int, int]):
@@ -40,11 +40,13 @@ class Blur:
         self._transfer = torch.fft.rfft2(middle_first.roll((-(rows // 2), -(columns // 2)), (0, 1)))
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return psf * image, (..., ny, nx)."""
+        """Return the convolution of an image with the PSF; both have shape (..., ny, nx)."""
         return self._filter(image, self._transfer)
 
     def transpose(self, image: Tensor) -> Tensor:
-        """Apply the transposed operator (correlation with the PSF), (..., ny, nx)."""
+        """Apply the transposed operator, which is the correlation with the PSF, to an image of shape
+        (..., ny, nx).
+        """
         return self._filter(image, self._transfer.conj())
 
     def _filter(self, image: Tensor, transfer: Tensor) -> Tensor:
@@ -54,7 +56,9 @@ class Blur:
 
 
 def bin_pixels(image: Tensor, factor: int) -> Tensor:
-    """Return the sums over blocks of ``factor`` x ``factor`` pixels, (..., ny / factor, nx / factor)."""
+    """Return the sums over blocks of ``factor`` x ``factor`` pixels. The result has shape
+    (..., ny / factor, nx / factor).
+    """
     blocks = image.unflatten(-1, (-1, factor)).unflatten(-3, (-1, factor))
     return blocks.sum((-3, -1))
 
@@ -62,17 +66,20 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
 def richardson_lucy(recorded: Tensor, psf: Tensor, iterations: int = 50) -> Tensor:
     """Estimate the object behind a recorded image.
 
-    Each step is e <- e * H^T (b / H e) / (H^T 1), from a flat start with the right flux (Richardson 1972,
+    Each step replaces the estimate e by e * H^T (b / H e) / (H^T 1), where b is the recorded image and H is
+    the blur by the PSF. The first estimate is flat and has the total light of the image (Richardson 1972,
     Lucy 1974). Because of the division by H^T 1, the result is correct at the borders and for a PSF with any
     sum. The estimate approaches the object itself, and sum(H e) = sum(b) after every step.
 
     Args:
-        recorded: image (..., ny, nx); negative values (read noise) count as dark.
-        psf: real (k, k) with odd k, on the same pixels.
+        recorded: recorded image, shape (..., ny, nx). Negative values, which read noise causes, count as
+            dark.
+        psf: real PSF on the same pixels, shape (k, k) with odd k.
 
     Returns:
-        Estimate (..., ny, nx); gradients flow to both arguments. For large images, the backward pass
-        recomputes the steps block by block, so memory does not grow with ``iterations``.
+        The estimate, shape (..., ny, nx). Gradients flow to the recorded image and to the PSF. For large
+        images, the backward pass recomputes the steps block by block, so memory does not grow with
+        ``iterations``.
     """
     blur = Blur(psf, (int(recorded.shape[-2]), int(recorded.shape[-1])))
     seen = recorded.clamp(min=_DARKEST)

@@ -1,4 +1,4 @@
-"""Choose the propagator of a scene: the requested one, or one that is valid at the scene's distance."""
+"""Choose a propagator: the one that the settings request, or one that is valid at the given distance."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def make_propagator(
 ) -> Propagator:
     """Make the propagator of waves from ``source`` to ``target`` in ``optics``.
 
-    ``auto`` uses the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter distances, it
-    uses the angular spectrum, whose period is then long enough without further padding. ``far-field`` uses
-    the distance as the focal length of an ideal lens.
+    The propagation ``auto`` uses the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter
+    distances, it uses the angular spectrum, whose period is then long enough without further padding.
+    ``far-field`` uses the distance as the focal length of an ideal lens.
 
     Raises:
         InputError: the distance is below the sampling limit and ``rayleigh-sommerfeld`` is requested, or the
@@ -34,8 +34,8 @@ def make_propagator(
 
 
 def takes_spectrum(source: PixelGrid, target: PixelGrid, optics: Optics) -> bool:
-    """Return whether to use the angular spectrum, because it is requested or because the sum would be
-    aliased.
+    """Return True if the angular spectrum is to be used, because it is requested or because the
+    Rayleigh-Sommerfeld kernel would be aliased.
     """
     near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
     return optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)

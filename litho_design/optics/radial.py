@@ -1,4 +1,6 @@
-"""Propagate ring-symmetric fields by Rayleigh-Sommerfeld, with a matrix instead of a 2-D transform."""
+"""Propagate ring-symmetric fields by the Rayleigh-Sommerfeld integral, as a matrix product instead of a 2-D
+transform.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,14 @@ _CHUNK_ENTRIES = 1 << 23
 class RadialPropagator(nn.Module):
     """Propagate a field of concentric rings to points at given radii of a parallel plane.
 
-    U(p) = sum over rings of u times the integral of h over the ring, with h as in ``RSPropagator``. Each ring
-    is integrated with two Gauss-Legendre nodes across it and the midpoint rule around it. For a periodic
-    integrand, the error of the midpoint rule falls exponentially once the phase is resolved.
+    U(p) is the sum over all rings of u times the integral of h over the ring, where u is the field on the
+    ring and h is the kernel in ``RSPropagator``. Each ring is integrated with two Gauss-Legendre nodes across
+    it and the midpoint rule around it. For a periodic integrand, the error of the midpoint rule falls
+    exponentially once the phase is resolved.
 
     Args:
-        rings: number of rings; ring i covers radii [i, i + 1) * ring_width_um.
-        ring_width_um: radial pitch of the source, µm.
+        rings: number of rings; ring i covers the radii from i to i + 1 times ``ring_width_um``.
+        ring_width_um: width of each ring, µm.
         target_radius_um: radii of the output points, shape (n,), µm.
         distance_um, wavelength_um: as in ``RSPropagator``.
 
@@ -54,11 +57,13 @@ class RadialPropagator(nn.Module):
 
     @property
     def ring_area_um2(self) -> Tensor:
-        """Return the area of each ring, float64 (rings,), µm^2; the sum of |u|^2 times area is a power."""
+        """Return the area of each ring, µm^2, float64 of shape (rings,). The sum of |u|^2 times this area is
+        a power.
+        """
         return math.pi * self.ring_width_um**2 * (2 * torch.arange(self.rings, dtype=torch.float64) + 1)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Propagate complex ``field`` (..., rings) to (..., n)."""
+        """Propagate a complex field of shape (..., rings); the result has shape (..., n)."""
         return field @ self.matrix.T
 
 
@@ -82,8 +87,8 @@ def _ring_matrix(
 def _half_circle(
     source_radius_um: float, target_radius_um: Tensor, distance_um: float, wavelength_um: float
 ) -> tuple[Tensor, float]:
-    """Return midpoint angles on (0, pi) and their step, which resolves the fastest phase change around any
-    ring.
+    """Return the midpoints of equal steps between the angles 0 and pi, and the size of a step. The steps
+    resolve the fastest phase change around any ring.
     """
     target = float(target_radius_um.max())
     far = math.hypot(source_radius_um + target, distance_um)

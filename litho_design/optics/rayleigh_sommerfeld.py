@@ -1,4 +1,6 @@
-"""Propagate by Rayleigh-Sommerfeld: an exact discrete convolution between two planes."""
+"""Propagate by the Rayleigh-Sommerfeld integral, computed as an exact discrete convolution between two
+planes.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +22,13 @@ class RSPropagator(KernelPropagator):
     """Propagate a complex field from one plane to a parallel plane (first Rayleigh-Sommerfeld integral).
 
     U(p) = sum over source pixels q of u(q) h(p - q) dy dx, with h = z / (2 pi r^2) (1/r - j k) exp(j k r),
-    r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In this time convention, exp(+j k r) runs outwards
-    (Goodman, Fourier Optics, ch. 3). The sum is exact: the kernel is centred and spans all separations. If
-    the two pitches differ, their ratio must be a ratio of small integers; the kernel is then sampled at the
-    largest pitch that divides both.
+    r^2 = x^2 + y^2 + z^2 and k = 2 pi / wavelength. In the time convention used here, exp(+j k r) is a wave
+    that runs outwards (Goodman, Fourier Optics, ch. 3). The sum is computed exactly, because the kernel
+    covers all separations between the two grids. If the two pitches differ, their ratio must be a ratio of
+    small integers; the kernel is then sampled at the largest pitch that divides both.
 
     Args:
-        source, target: grids of the two planes, origin and pitch in µm.
+        source, target: grids of the two planes, with origin and pitch in µm.
         distance_um: separation of the planes, µm.
         wavelength_um: wavelength in the medium, µm.
         dtype: torch.complex64 or torch.complex128; kernels are computed in double precision.
@@ -67,8 +69,8 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return into how many equal parts the first and the second pitch must be divided to match, given their
-    ratio.
+    """Return into how many equal parts each of two pitches must be divided so that the parts are equally
+    long. ``pitches`` is the ratio of the second pitch to the first.
 
     Return None if too many parts are needed.
     """
@@ -79,8 +81,8 @@ def _ratio(pitches: float) -> tuple[int, int] | None:
 
 
 def rs_kernel(y_um: Tensor, x_um: Tensor, distance_um: float, wavelength_um: float) -> Tensor:
-    """Return h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128, at broadcast
-    separations.
+    """Return the kernel h(x, y) of the first Rayleigh-Sommerfeld integral, 1/µm^2, complex128. The
+    separations ``y_um`` and ``x_um`` are broadcast against each other.
     """
     wavenumber = 2 * math.pi / wavelength_um
     squared = y_um.double() ** 2 + x_um.double() ** 2 + distance_um**2

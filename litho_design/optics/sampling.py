@@ -8,16 +8,16 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
-# Replicas of the spectrum lie at 1/pitch; after two decay lengths, 4e-6 of the evanescent wave at this
-# frequency remains.
+# Sampling repeats the spectrum at the frequency 1/pitch. After this many decay lengths, 4e-6 of the
+# evanescent wave at this frequency remains.
 _DECAY_LENGTHS = 2.0
 
 
 def centred_grid(
     shape: tuple[int, int], pitch_um: float, centre_um: tuple[float, float] = (0.0, 0.0)
 ) -> PixelGrid:
-    """Make a grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes
-    alike.
+    """Make a grid of square pixels whose middle lies at the position ``centre_um`` (y, x). This holds for
+    even and odd numbers of pixels.
     """
     grid = PixelGrid.square(shape, pitch_um)
     height, width = grid.size_um
@@ -42,7 +42,7 @@ def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float
 
 
 def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wavelength_um: float) -> None:
-    """Refuse a distance at which the Rayleigh-Sommerfeld kernel would be aliased.
+    """Check that the Rayleigh-Sommerfeld kernel is not aliased at a distance.
 
     Raises:
         InputError: ``distance_um`` is not positive, or below ``sampling_limit_um``.

@@ -9,8 +9,8 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_design.optics.thin_element import Optics
 
-# Number of points per (wavelength / side)^2 of the area of a source in sines; these points lie closer
-# together than an element resolves.
+# Number of directions per area (wavelength / side)^2, where the source is an area in the plane of sines. The
+# directions lie closer together than an element resolves.
 _POINTS_PER_AREA = 3
 _FEWEST = 8
 _MOST = 128
@@ -20,8 +20,8 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
     """Return monochromatic plane waves whose images add up to that of the source.
 
-    Each wave is given by its share of the light and its optics. The wavelengths are the nodes of a
-    Gauss-Hermite quadrature over a Gaussian spectrum. Directions are spread evenly over a disc of sines
+    For each wave, the result contains its share of the light and its optics. The wavelengths are the nodes of
+    a Gauss-Hermite quadrature over a Gaussian spectrum. Directions are spread evenly over a disc of sines
     around the direction of ``optics``. The images of neighbouring waves lie closer together than lambda z /
     D, the finest detail of an element of side D. For a monochromatic point source, there is only one wave,
     with the given ``optics``.
@@ -76,7 +76,7 @@ def _checked(count: int, what: str) -> int:
 
 
 def require_one_wave(optics: Optics, what: str) -> None:
-    """Refuse an extended, broadband or near source for computations that use a single plane wave.
+    """Check that the source is suitable for a computation that uses a single plane wave.
 
     Raises:
         InputError: the source is not a distant, monochromatic point source.

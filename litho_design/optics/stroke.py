@@ -1,5 +1,5 @@
-"""The stroke of a print, and the share of light that a staircase with this stroke sends into a diffraction
-order.
+"""The stroke of a print, and the share of the light that a staircase grating with this stroke sends into a
+diffraction order.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels, treated as one period of a blaze; figures for one wave are None if the
-    gain is not positive.
+    """Printed heights of the levels, and the figures of a blazed grating whose periods consist of these
+    levels.
+
+    ``print_gain`` is the printed height range divided by the nominal one. The figures for one wave are None
+    if this gain is not positive.
     """
 
     printed_height_um: list[float]
@@ -29,7 +32,8 @@ def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
     """Return the scalar efficiency of a blazed grating with ``steps`` equal steps whose stroke is ``gain``
     waves.
 
-    eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2.
+    eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2, where m is the order, N is the number
+    of steps and g is the stroke in waves.
     """
     detuning = math.pi * (gain - order)
     narrow = steps * math.sin(detuning / steps)
@@ -42,22 +46,22 @@ def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
 def measure_stroke(
     printed_height_um: Sequence[float], wave_height_um: float, *, level_height_um: float
 ) -> Stroke:
-    """Return the stroke of the printed levels, and their efficiency as one period of a blaze.
+    """Return the stroke of the printed levels, and the efficiency of a blazed grating with these levels.
 
     Args:
         printed_height_um: printed height of a wide uniform area of each level, µm.
-        wave_height_um: height of one wave, µm.
-        level_height_um: nominal step, µm.
+        wave_height_um: height that delays the wave by one period, µm.
+        level_height_um: nominal height of one level, µm.
 
     Returns:
-        The stroke, and the efficiency of a blaze with this stroke in the first and zero order. The record
-        also has the number of levels and the height per level, either of which would make the print reach one
-        wave.
+        The stroke, and the efficiency of a blazed grating with this stroke in the first and the zero order.
+        The record also states how many levels of the same height, or which height of the same number of
+        levels, would make the stroke one wave.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]
     gain = stroke_um / ((count - 1) * level_height_um) if count > 1 else 0.0
-    # A period of N equal steps spans N/(N-1) of the height of its highest step.
+    # A period of N equal steps corresponds to N/(N-1) times the height of its highest step.
     period_waves = stroke_um / wave_height_um * count / max(count - 1, 1)
     return Stroke(
         printed_height_um=list(printed_height_um),

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-# Slices are a twentieth of a wave high, because halving them changes a blaze of 1.6 µm period by less than
-# 0.002.
+# Slices are a twentieth of a wavelength high. Halving them changes the efficiency of a blazed grating with a
+# period of 1.6 µm by less than 0.002.
 _SLICES_PER_WAVELENGTH = 20
 
 
@@ -17,17 +17,17 @@ def wave_through_relief(
 ) -> Tensor:
     """Return the wave behind a relief, given the wave at the foot of the relief.
 
-    In every slice, the angular spectrum propagates the wave once through resist and once through air, and
-    each pixel keeps the wave of its own medium (Brenner and Singer 1993, doi:10.1364/AO.32.004984). If the
-    surface crosses a pixel within the slice, the two waves are mixed in proportion to the shares of resist
-    and air, so that gradients flow. One reflection at normal incidence is included: a share (n - 1)^2 / (n +
-    1)^2 of the light is lost. The result is propagated back through air to the foot, where a thin element
-    would be. The field is periodic beyond the borders.
+    In every slice, the wave is propagated twice by its angular spectrum, once through resist and once through
+    air. Each pixel keeps the wave for the medium that it contains (Brenner and Singer 1993,
+    doi:10.1364/AO.32.004984). If the surface crosses a pixel within the slice, the two waves are mixed in
+    proportion to the shares of resist and air, so that gradients flow. One reflection at normal incidence is
+    included: a share (n - 1)^2 / (n + 1)^2 of the light is lost. The result is propagated back through air to
+    the foot, where a thin element would be. Beyond its borders, the field is continued periodically.
 
     Args:
-        field: complex (..., ny, nx) at the foot of the relief, inside the resist.
-        height_um: real heights (..., ny, nx) of 0 or more, µm.
-        index: refractive index of the resist; above the relief is air.
+        field: complex wave at the foot of the relief, inside the resist, shape (..., ny, nx).
+        height_um: heights of 0 or more, µm, shape (..., ny, nx).
+        index: refractive index of the resist. The medium above the relief is air.
     """
     highest_um = float(height_um.detach().max())
     count = max(1, math.ceil(highest_um * _SLICES_PER_WAVELENGTH / wavelength_um))

@@ -1,4 +1,4 @@
-"""Compute the wave behind a height map."""
+"""Compute the wave behind a printed height map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ ElementKind = Literal["thin", "thick"]
 
 # A wavelength outside this range was probably given in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
-# Width of the border around the element; light spreads no farther within the height of a relief.
+# Width of the dark border that is added around a thick element, µm. Within the height of a relief, light
+# spreads no farther than this.
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def element_field(
     *,
     pixels: int | None = None,
 ) -> Tensor:
-    """Return the wave just behind a phase element that a plane wave of unit power illuminates.
+    """Return the wave just behind a phase element that is illuminated by a plane wave of unit power.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
     If the optics have a Gaussian beam or a near point source, the wave also has the amplitude of the beam or
@@ -113,13 +114,14 @@ def element_field(
     ``wave_through_relief`` replaces the phase.
 
     Args:
-        height_um: real (..., ny, nx), µm.
-        grid: geometry of ``height_um``.
-        aperture: optional real mask (ny, nx) in [0, 1].
+        height_um: printed heights, µm, shape (..., ny, nx).
+        grid: grid of the pixels of ``height_um``.
+        aperture: amplitude transmission of the aperture in [0, 1], shape (ny, nx). By default, the whole grid
+            is open.
         pixels: number of pixels of the whole element, if ``grid`` is a part of it.
 
     Returns:
-        complex (..., ny, nx), 1/µm.
+        The complex wave, 1/µm, shape (..., ny, nx).
     """
     import torch  # imported late, because the command line reads `Optics` without it
 
@@ -147,8 +149,9 @@ def element_field(
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the wave behind a thick element in air, illuminated by ``field`` (..., ny, nx); the surroundings
-    are dark.
+    """Return the wave behind a thick element in air that is illuminated by ``field``, shape (..., ny, nx).
+
+    The surroundings of the element are dark.
     """
     import torch
 

@@ -1,1 +1,3 @@
-"""Search for a layout: parameters, starting layouts, polish, and losses over a process window or models."""
+"""Search for a layout: free parameters, starting layouts, polish, and losses over a process window or over
+several models.
+"""

@@ -25,8 +25,8 @@ class Budget(Record):
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """Return one line with the estimated time and memory for the iterations left after ``done``, the
-        scores and the report.
+        """Return one line that estimates the time and memory of the rest of a run: the iterations after the
+        first ``done``, the scores and the report.
         """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration
@@ -44,7 +44,7 @@ def measure_budget(
     search: SearchSettings,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Budget:
-    """Time one iteration with gradient and one without, at the current parameters."""
+    """Time one iteration with gradients and one without, at the current parameters, which stay unchanged."""
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
     started = clock()

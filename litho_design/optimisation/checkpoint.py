@@ -31,7 +31,7 @@ _DAMAGED = (
 
 @dataclass
 class SearchState:
-    """The state from which a search resumes, together with its settings and stateful parts."""
+    """The state of a search. A search resumes from this state, its settings and the states of its parts."""
 
     iteration: int = 0
     best_loss: float = math.inf
@@ -44,8 +44,10 @@ class SearchState:
 def save_checkpoint(
     path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Any], seconds: float
 ) -> None:
-    """Write the state of a search and of its parts; ``fingerprint`` identifies the task to which they
-    belong.
+    """Write a checkpoint: the state of a search and the states of its parts, such as the optimiser.
+
+    ``fingerprint`` identifies the task to which the checkpoint belongs. ``seconds`` is the time that the
+    search has taken so far.
     """
     found = vars(state) | {"earlier_seconds": seconds}
     states = {name: part.state_dict() for name, part in stateful.items()}
@@ -57,8 +59,8 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Any], device: torch.device
 ) -> SearchState:
-    """Load the parts of a search in place from a checkpoint, and return the state of the search on
-    ``device``.
+    """Load a checkpoint. The parts of the search are changed in place, and the state of the search is
+    returned, with its tensors on ``device``.
 
     Raises:
         InputError: the checkpoint belongs to another task, or the file is damaged.
@@ -82,7 +84,7 @@ def load_checkpoint(
 def checkpoint_path(folder: Path, part: str = "") -> Path:
     """Return the path of the file in which a search in ``folder`` stores its state.
 
-    If several processes share the search, ``part`` names the part of one process.
+    If several processes share the search, each has its own file, and ``part`` names the process.
     """
     return folder / f"checkpoint{part}.pt"
 

@@ -1,4 +1,4 @@
-"""Gradient descent on a few free parameters, for baselines that need no printer."""
+"""Gradient descent on free parameters, for baselines and other quantities outside the search."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ def descended(
     iterations: int,
     project: Callable[[], object] = lambda: None,
 ) -> tuple[T, float]:
-    """Minimise ``loss`` by Adam; return the result of the step with the lowest loss, and that loss.
+    """Minimise a loss by Adam. Return the result that belongs to the step with the lowest loss, and this
+    loss.
 
     Args:
-        free: the numbers to change, in place.
-        loss: function that returns the loss at the current numbers, and a result. Later steps must not change
+        free: the tensors whose values are changed, in place.
+        loss: function that returns the loss at the current values, and a result. Later steps must not change
             this result.
-        project: called after every step, to bring the numbers back into their range.
+        project: function that is called after every step, to bring the values back into their range.
     """
     optimiser = torch.optim.Adam(free, lr=rate)
     found: tuple[T, float] | None = None

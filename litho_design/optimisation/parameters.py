@@ -1,5 +1,5 @@
-"""The free parameters of a layout of cells or rings: Gumbel-Softmax distributions, or heights that are
-rounded.
+"""The free parameters of a layout of cells or rings: Gumbel-Softmax distributions over levels, or one real
+level per cell, which is rounded.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ from litho_design.optimisation.process_window import blurred
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
-# With 13 levels, a learning rate of 1 moves a height by one level; with more or fewer levels, it moves the
-# height by the same share of the range.
+# With 13 levels, a learning rate of 1 moves the level of a cell by one. With more or fewer levels, it moves
+# the level by the same share of the range.
 _RATE_STEPS = 12
-# This width, in levels, lets the first step reach the neighbours of the starting level.
+# Width of the distributions at the start, in levels. It lets the first step reach the neighbours of the
+# starting level.
 _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
     """Spread one value per free cell over the pixels of the layout, and average pixels back to cells.
 
-    With ``rows``, the map covers only these rows of pixels; ``own`` selects the cells of these rows from
-    those of the whole layout.
+    With ``rows``, the map covers only these rows of pixels, and ``own`` selects their cells from the cells of
+    the whole layout. In the docstrings below, *cells stands for the shape of one value per cell.
     """
 
     ring: Tensor
@@ -47,18 +48,20 @@ class CellMap(nn.Module):
             self.cells = (len(rows) // self.cell_px, self.cells[-1])
 
     def own(self, values: Tensor) -> Tensor:
-        """Select the cells of the map's own rows from one value per cell of the whole layout."""
+        """Select, from one value per cell of the whole layout, the values of those cells that the map
+        covers.
+        """
         return values[self._own]
 
     def forward(self, values: Tensor) -> Tensor:
-        """Spread values over the pixels, (..., *cells) to (..., size, size)."""
+        """Spread values of shape (..., *cells) over the pixels. The result has shape (..., size, size)."""
         if self.radial:
             return values[..., self.ring]
         return values.repeat_interleave(self.cell_px, -1).repeat_interleave(self.cell_px, -2)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean of real or complex ``pixels`` (size, size) over each cell; the mean of an empty
-        ring is 0.
+        """Return the mean over each cell of real or complex pixels, shape (size, size). The mean of a ring
+        without pixels is 0.
         """
         if not self.radial:
             blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
@@ -72,7 +75,8 @@ class CellMap(nn.Module):
 class GumbelLevels(nn.Module):
     """One categorical distribution over levels for each cell, sampled with Gumbel-Softmax.
 
-    A sample is the expected level under the sampled weights (Jang, Gu and Poole 2017, arXiv:1611.01144).
+    A sample is the mean level, weighted with the sampled weights of the levels (Jang, Gu and Poole 2017,
+    arXiv:1611.01144).
     """
 
     # Factor on the learning rate. It is 1, because logits have no range.
@@ -85,7 +89,9 @@ class GumbelLevels(nn.Module):
         self.logits = nn.Parameter(torch.zeros(layout.levels, *self.cells.cells))
 
     def sample(self, temperature: float, seed: int) -> Tensor:
-        """Sample levels on the pixels, float (1, 1, size, size); the same ``seed`` gives the same sample."""
+        """Return sampled levels on the pixels, float of shape (1, 1, size, size). The same seed gives the
+        same sample.
+        """
         devices = [self.logits.device] if self.logits.is_cuda else []
         with torch.random.fork_rng(devices=devices):
             torch.manual_seed(seed)
@@ -94,13 +100,13 @@ class GumbelLevels(nn.Module):
         return self.cells(torch.tensordot(ladder, weights, dims=1))[None, None]
 
     def best_levels(self) -> Tensor:
-        """Return the most probable level of each cell, int64 (*cells)."""
+        """Return the most probable level of each cell, int64 of shape (*cells)."""
         return self.logits.detach().argmax(0)
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Centre the distributions on ``levels`` (real, *cells) plus Gaussian noise of sd
-        ``jitter_levels``.
+        """Centre the distributions on real levels of shape (*cells), plus Gaussian noise with the standard
+        deviation ``jitter_levels``.
         """
         levels = _jittered(levels.to(self.logits), jitter_levels, seed, self.levels)
         ladder = torch.arange(self.levels, device=self.logits.device).view(-1, *[1] * levels.dim())
@@ -119,7 +125,7 @@ class GumbelLevels(nn.Module):
 class DirectLevels(nn.Module):
     """One real level per cell, filtered if the layout has a cell filter.
 
-    With ``hard``, levels are rounded, and the gradient passes straight through the rounding.
+    A sample with ``hard=True`` has rounded levels, and the gradient passes straight through the rounding.
     """
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -131,7 +137,7 @@ class DirectLevels(nn.Module):
         self.filter_cells = layout.cell_filter_um / layout.cell_um
 
     def sample(self, temperature: float = 1.0, seed: int = 0, *, hard: bool = False) -> Tensor:
-        """Return levels on the pixels, float (1, 1, size, size); this sample is not random."""
+        """Return the levels on the pixels, float of shape (1, 1, size, size). Nothing is drawn at random."""
         free, kept = self._filtered(), self._kept()
         level = free + ((kept.round() if hard else kept) - free).detach()
         return self.cells(level)[None, None]
@@ -142,12 +148,14 @@ class DirectLevels(nn.Module):
         self.height.clamp_(0, self.levels - 1)
 
     def best_levels(self) -> Tensor:
-        """Return the nearest level of each cell, int64 (*cells)."""
+        """Return the nearest integer level of each cell, int64 of shape (*cells)."""
         return self._kept().detach().round().long()
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
-        """Start at ``levels`` (real, *cells) plus Gaussian noise of sd ``jitter_levels``."""
+        """Start at real levels of shape (*cells), plus Gaussian noise with the standard deviation
+        ``jitter_levels``.
+        """
         self.height.copy_(_jittered(levels.to(self.height), jitter_levels, seed, self.levels))
 
     @torch.no_grad()
@@ -158,8 +166,8 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Clamp levels to the range, because an optimiser step that is not followed by ``project`` may leave
-        it.
+        """Return the levels clamped to their range, because an optimiser step that is not followed by
+        ``project`` may leave this range.
         """
         return self._filtered().clamp(0, self.levels - 1)
 
@@ -173,11 +181,11 @@ Parametrisation = GumbelLevels | DirectLevels
 def make_parametrisation(
     layout: LayoutSettings, search: SearchSettings, cells: CellMap | None = None
 ) -> Parametrisation:
-    """Make the free parameters that ``search.parametrisation`` names; ``cells`` may cover a part of the
-    layout.
+    """Make free parameters of the kind that ``search.parametrisation`` names. ``cells`` may cover only a part
+    of the layout.
 
     Raises:
-        InputError: a filter over cells is combined with distributions over levels.
+        InputError: a filter over cells is requested for distributions over levels.
     """
     if search.parametrisation == "direct":
         return DirectLevels(layout, cells)

@@ -14,11 +14,12 @@ from torch import Tensor
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import CellMap
 
-# A wave has no phase if its amplitude is below this, relative to that of the element.
+# Below this amplitude, relative to that behind the element, a wave is treated as having no phase.
 _DARK = 1e-12
-# If the search starts from phases that are random on the whole circle, one in six pairs of neighbouring cells
-# ends more than half a wave apart. Printing rounds off such a step, and the search does not repair it. A
-# nearly flat start ends with a third fewer of these steps, and different seeds still give different results.
+# Half of the range, in radians, from which the starting phases are drawn. If phases were drawn from the whole
+# circle, one in six pairs of neighbouring cells would end more than half a wave apart. Printing rounds off
+# such a step, and the search does not repair it. This narrower range leads to a third fewer of these steps,
+# and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -34,29 +35,34 @@ def gerchberg_saxton(
     counted: Tensor | None = None,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, list[float]]:
-    """Find a phase per cell whose propagated amplitude approaches sqrt(target).
+    """Find one phase per cell, such that the propagated amplitude approaches sqrt(target).
 
-    Each step replaces the propagated amplitude inside the output window and keeps the wave outside it. The
-    adjoint sends the correction back, and the result is projected on the phases of the element: u' = Pi(u +
-    P^H (a exp(j arg P u) - P u)). The norm of P is at most one, so this step majorises the squared amplitude
-    error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form (Di Leonardo et al.
-    2007, doi:10.1364/OE.15.001913) raises the target amplitude where light is missing. This form improves
-    uniformity but loses the guarantee that the error never rises. The initial phases are random within one
-    radian of pi, which is the middle of the range if the levels span a full wave.
+    Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
+    wave outside it. The adjoint sends this correction back, and the result is projected on the phases that
+    the element can have: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P
+    the propagator, a the target amplitude and Pi the projection. The norm of P is at most one, so this step
+    majorises the squared amplitude error, which therefore never rises (Gerchberg and Saxton 1972). The
+    weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude where light
+    is missing. This form improves uniformity but loses the guarantee that the error never rises. The initial
+    phases are drawn at random within one radian of pi. The phase pi is the middle of the range if the levels
+    span a full wave.
 
     Args:
-        propagator: RSPropagator or ASMPropagator on square grids with the pixel pitch of the element.
-        target: target intensity (size, size) in [0, 1].
-        cells: the element's free cells.
-        counted: pixels whose amplitude is prescribed, bool (size, size); elsewhere the wave is kept as it is.
-            The target amplitude is then scaled to the light on these pixels.
-        level_phase: printed phase of each level, radian (levels,); if given, the second half of the
-            iterations projects on these phases instead of on the whole circle.
-        total: function that sums over the pixels of the whole element, if cells and target cover only a part
-            of it; otherwise None.
+        propagator: propagator with an adjoint, such as ``RSPropagator``, on square grids with the pixel pitch
+            of the element.
+        target: target intensity in [0, 1], shape (size, size).
+        cells: map between the free cells of the element and its pixels.
+        counted: boolean mask, shape (size, size), of the pixels whose amplitude is prescribed. On other
+            pixels, the wave is kept as it is. The target amplitude is then scaled to the light on the pixels
+            of the mask.
+        level_phase: printed phase of each level, in radians, shape (levels,). If given, the second half of
+            the iterations projects on these phases instead of on the whole circle.
+        total: function that sums values over the pixels of the whole element. It is needed only if ``cells``
+            and ``target`` cover a part of the element.
 
     Returns:
-        Phase per cell, radian, and the amplitude error sqrt(sum (|P u| - a)^2) before each step.
+        The phase of each cell, in radians, and a list of the amplitude errors sqrt(sum (|P u| - a)^2) before
+        each step.
     """
     add = total or torch.sum
 
@@ -92,7 +98,8 @@ def gerchberg_saxton(
 
 
 def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the phase per cell of a perfect lens: phi = k (f - sqrt(f^2 + r^2)), radian.
+    """Return the phase of each cell of a perfect lens, in radians: phi = k (f - sqrt(f^2 + r^2)), where r is
+    the distance from the axis.
 
     ``optics.distance_um`` is the focal length f.
     """
@@ -105,12 +112,12 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels nearest to the ``phase`` of a lens, after adding the constant phase that loses the
-    least light.
+    """Return the levels nearest to the phase of a lens. The constant phase that loses the least light is
+    added first.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
-    phase decides which cells fall into this gap. The mean of exp(j error) over the cells is the amplitude at
-    the focus.
+    phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, which
+    is the mean of exp(j error) over the cells.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):
@@ -122,12 +129,12 @@ def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
 
 
 def printed_phase(level_heights_um: Sequence[float], optics: Optics) -> Tensor:
-    """Return the phase of each printed level, radian (levels,)."""
+    """Return the phase of each printed level, in radians, shape (levels,)."""
     return torch.tensor(level_heights_um) * (2 * math.pi / optics.wave_height_um)
 
 
 def nearest_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the level, int64, whose printed phase is closest on the circle to each ``phase`` (radian)."""
+    """Return, for each phase (radians), the level whose printed phase is closest on the circle, as int64."""
     distance = phase.new_full(phase.shape, math.inf)
     nearest = torch.zeros(phase.shape, dtype=torch.long, device=phase.device)
     for level, printed in enumerate(level_phase.tolist()):

@@ -1,4 +1,6 @@
-"""Polish a printable layout: change single levels, and keep the changes only if they lower the loss."""
+"""Polish a printable layout: change the levels of cells by one, and keep the changes only if they lower the
+loss.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,19 @@ _FIRST_SHARE = 0.02
 def polish_levels(
     levels: Tensor, cells: CellMap, objective: Objective, *, level_count: int, rounds: int
 ) -> tuple[Tensor, list[float]]:
-    """Improve an integer layout by one-level moves of cells; the loss never rises.
+    """Improve an integer layout by moving cells up or down by one level. The loss never rises.
 
     The gradient at the integer layout ranks the moves. In each round, a share of the cells makes the best
     moves at once. This share is halved whenever the true loss of the changed layout does not fall.
 
     Args:
-        levels: int64 (*cells).
-        rounds: number of evaluations with gradient.
+        levels: level of each cell, int64, in the shape of the cells.
+        level_count: number of printable levels.
+        rounds: number of rounds. Each round evaluates the loss and its gradient once.
 
     Returns:
-        Levels, int64 (*cells), and the loss at the start and after each accepted round.
+        The improved levels in the same form, and a list of the losses at the start and after each accepted
+        round.
     """
     best, share = levels.clone(), _FIRST_SHARE
     gain, move, loss = _rank_moves(best, cells, objective, level_count)
@@ -52,9 +56,9 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate, to first order, the gain of the best one-level move of each cell.
+    """Estimate, to first order, by how much the best move by one level of each cell lowers the loss.
 
-    Return gain, move (-1 or +1) and loss.
+    Return this gain and the move (-1 or +1) of each cell, and the loss of the unchanged layout.
     """
     values = levels.float().requires_grad_()
     loss, _ = objective(cells(values)[None, None])

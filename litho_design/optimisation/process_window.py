@@ -1,4 +1,6 @@
-"""The process window: random prints and optics that deviate from the model, and models that disagree."""
+"""The process window: random prints and optics that deviate from those of the model, and the disagreement of
+several models.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +26,20 @@ _NARROWEST_BLUR_PX = 0.2
 # divided by the second value.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
-# (1e-6 µm)^2 is far below any height and keeps the root differentiable where all models agree.
+# This is (1e-6 µm)^2. It is far below the variance of any height, and it keeps the square root differentiable
+# where all models agree.
 _SMALLEST_VARIANCE_UM2 = 1e-12
 _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um")
 
 
 class ProcessWindow(Record):
-    """The spread of prints and optics, and how a search uses it.
+    """The spread of prints and optics, and the way in which a search uses it.
 
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
-    iteration. It minimises the mean loss of the worst draws; their share of all draws is ``tail``. The
-    defaults are guesses; replace them with the spreads of your printer. In one measured data set, the gain
-    varies by 13 % between fields; this value includes the changing scale of the microscope.
+    iteration. It minimises the mean loss of the worst draws; ``tail`` is the share of these among all draws.
+    The defaults are guesses; replace them with the spreads of your printer. In one measured data set, the
+    gain varies by 13 % between fields; this value includes the changing scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -79,7 +82,7 @@ def spreads(window: ProcessWindow) -> list[str]:
 
 @dataclass(frozen=True)
 class Draw:
-    """One random print in one random set of optics."""
+    """One draw of the process window: random changes to a print, and random optics."""
 
     gain: float
     offset_um: float
@@ -87,8 +90,8 @@ class Draw:
     optics: Optics
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
-        """Apply this draw to a printed map (size, size), or to rings (n,) from the centre; return the height,
-        µm.
+        """Return the height, µm, of a print that is changed by this draw. The print is a map of shape
+        (size, size), or rings of shape (n,) that begin at the centre.
 
         A uniform offset changes the scores of heights, but no image. Rings are blurred only along the radius,
         which is exact for rings far from the centre or much wider than the blur.
@@ -99,11 +102,11 @@ class Draw:
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
-    """Return ``count`` draws with the seed ``window.seed``; a longer list begins with the draws of a shorter
-    one.
+    """Return ``count`` draws of the process window with the seed ``window.seed``. A longer list begins with
+    the draws of a shorter one.
 
-    ``unseen`` draws come from a separate random stream, because a yield must hold for prints that no search
-    has used.
+    With ``unseen``, the draws come from a separate random stream, because a yield must hold for prints that
+    no search has used.
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
@@ -124,11 +127,11 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads if any draw, of the search or of the yield, cannot be propagated.
+    """Check that the light of every draw, of the search and of the yield, can be propagated.
 
     Raises:
-        InputError: a draw is below the sampling limit of the propagator between ``source`` and ``target``, or
-            has no positive wavelength.
+        InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
+            and ``target``, or the wavelength in a draw is not positive.
     """
     drawn = draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
@@ -157,8 +160,8 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 class Yield(Record):
-    """The share of random prints that pass, its 95 % confidence interval (Wilson), and the figures that
-    decide whether a print passes.
+    """The share of random prints that pass, its 95 % confidence interval (by Wilson's method), and the names
+    of the figures that decide whether a print passes.
     """
 
     draws: int
@@ -178,7 +181,9 @@ def measure_yield(
     A print passes if its figures are close enough to those of the print as modelled.
 
     Args:
-        errors: figures that are better when lower.
+        drawn: for each drawn print, a mapping from the name of a figure to its value.
+        modelled: the same figures for the print as modelled.
+        errors: names of the figures that are better when lower.
     """
     from scipy.stats import binomtest
 
@@ -206,14 +211,15 @@ def risk(losses: Tensor, tail: float) -> Tensor:
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the standard deviation, µm, between the prints of several models, as the rms over the area.
+    """Return the standard deviation, µm, between the prints that several models predict, as its rms over the
+    area.
 
     The result is differentiable. A constant height is only a constant phase, so the mean of every print is
     subtracted first.
 
     Args:
-        heights_um: prints of one layout by k models, (k, ...).
-        area: for rings, the area (...) that each height covers, in any unit; None for pixels.
+        heights_um: prints of one layout by k models, shape (k, ...).
+        area: for rings, the area that each height covers, in any unit, shape (...); None for pixels.
     """
     flat = heights_um.flatten(1)
     share = flat[0].new_ones(flat[0].shape) if area is None else area.flatten()
@@ -223,7 +229,8 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
 
 
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """Return ``window`` with the spreads and the correlation of gain and offset of measured prints.
+    """Return a copy of ``window``, in which the spreads and the correlation of gain and offset are those of
+    measured prints.
 
     Each scan is fitted as height = gain * nominal + offset. The spread between scans is an upper bound on the
     spread between prints, because it also contains the changing scale of the microscope and the residual of
@@ -233,7 +240,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
         store: a ``litho_data`` store with at least three scans outside its lock box.
 
     Raises:
-        InputError: there are too few scans, or the layouts have no structure.
+        InputError: there are too few scans whose layouts have structure.
     """
     locked = store.locked_ids
     fits = []
@@ -260,7 +267,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
 
 def blurred(height: Tensor, sigma_px: float) -> Tensor:
-    """Blur a map or rings with a Gaussian.
+    """Blur the heights of a map or of rings with a Gaussian.
 
     A map is mirrored at its borders. Rings are mirrored at the centre, and the last ring is repeated outside.
     """

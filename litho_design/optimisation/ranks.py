@@ -1,4 +1,4 @@
-"""The processes that share an element: those started by torchrun, or only this one."""
+"""The processes that share one element: those that torchrun started, or only this process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Ranks:
-    """The rank of this process, and sums and exchanges among all processes, through which gradients flow."""
+    """The rank of this process among all processes. The methods sum and exchange values among the processes;
+    gradients flow through both.
+    """
 
     rank: int = 0
     count: int = 1
@@ -34,7 +36,9 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """Return the name of this process for files that each process writes; empty for a single process."""
+        """Return the text that names this process in files that each process writes. It is empty if there is
+        only one process.
+        """
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
     def device(self, device: str | torch.device) -> str | torch.device:
@@ -42,9 +46,7 @@ class Ranks:
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
-        """Return the range of items, out of ``count``, that belongs to a process; the default is this
-        process.
-        """
+        """Return which of ``count`` items belong to a process, by default to this process, as a range."""
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)
 
@@ -53,7 +55,9 @@ class Ranks:
         received entries as a flat tensor.
 
         Args:
-            parts: one tensor per process, real or complex, of one dtype.
+            parts: for each process, the tensor to send to it. All tensors have the same real or complex
+                dtype.
+            sizes: for each process, the number of entries to receive from it.
         """
         if self.count == 1:
             return parts[0].reshape(-1)
@@ -67,8 +71,8 @@ class Ranks:
         return torch.view_as_complex(got) if sent.is_complex() else got
 
     def total(self, values: Tensor) -> Tensor:
-        """Sum the values of all processes, () float64; the gradient adds the contributions of all
-        processes.
+        """Return the sum of the values in all processes, a float64 scalar. The gradient adds the
+        contributions of all processes.
         """
         own = values.sum(dtype=torch.float64)
         if self.count == 1:
@@ -88,5 +92,5 @@ class Ranks:
             dist.barrier()
 
 
-# This process is the only one that holds the element.
+# The case in which this process alone holds the element.
 ALONE = Ranks()

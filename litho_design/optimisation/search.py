@@ -1,4 +1,4 @@
-"""The search loop of every task, which turns free parameters into printable levels and resumes from
+"""The search loop of every task. It optimises free parameters, keeps the printable levels, and resumes from
 checkpoints.
 """
 
@@ -36,19 +36,23 @@ def search_layout(
     what: str = "designing",
     part: str = "",
 ) -> SearchState:
-    """Minimise ``objective`` over layouts; only the printable (argmax) layout is scored and kept.
+    """Minimise ``objective`` over layouts. Only printable (argmax) layouts are compared and kept.
 
     Args:
-        parameters: a parametrisation at its start, which is changed in place.
-        objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
-        folder: folder of ``checkpoint.pt``; None to run without a checkpoint.
-        fingerprint: text that identifies the task; a checkpoint of another task is refused.
-        part: name of this process's part of the search, if several processes share it; the name of the
-            checkpoint contains this text.
+        parameters: free parameters with their starting values; they are changed in place.
+        objective: function of levels on the pixels, shape (1, 1, size, size), that returns a scalar loss and
+            a dict of its named parts.
+        folder: folder in which the checkpoint is written, or None to run without a checkpoint.
+        fingerprint: text that identifies the task. A search does not resume from a checkpoint of another
+            task.
+        what: word for the work in the progress display.
+        part: text that names this process if several processes share the search. The name of the checkpoint
+            contains this text.
 
     Returns:
-        The state, which contains the kept argmax levels (``best_levels``, per cell) and the history. The
-        history has one record per evaluated iteration, with the loss of the sample and of the argmax layout.
+        The final state. It contains the levels that were kept (``best_levels``, one per cell) and the
+        history. The history has one record per evaluated iteration, with the loss of the sample and of the
+        argmax layout.
 
     Raises:
         InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.
@@ -118,8 +122,8 @@ def _evaluate(
 
 
 def rate_schedule(optimiser: torch.optim.Optimizer, settings: SearchSettings) -> StepLR | ReduceLROnPlateau:
-    """Make the scheduler that lowers the rate of ``optimiser`` as the settings say; the checkpoint stores its
-    state.
+    """Make the scheduler that lowers the learning rate of ``optimiser`` as the settings say. The checkpoint
+    stores the state of the scheduler.
     """
     factor, iterations = settings.rate_factor, settings.rate_iterations
     if settings.rate_schedule == "plateau":

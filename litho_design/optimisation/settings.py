@@ -40,7 +40,7 @@ class SearchSettings(Record):
     optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
     learning_rate: float = setting(
         1.0,
-        "Step of the optimiser, in twelfths of the range of levels (direct) or logits (gumbel)",
+        "Learning rate of the optimiser: in twelfths of the range of levels (direct), or in logits (gumbel)",
         option="--learning-rate",
         gt=0,
     )
@@ -74,7 +74,8 @@ class SearchSettings(Record):
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The search of the paper. Holograms and lenses each add their own learning rate.
+# The settings of the search in the paper, without the learning rate, which differs between holograms and
+# lenses.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -89,7 +90,8 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
-    The loss of a search is the worst loss over all models plus ``weight`` times their disagreement in waves.
+    The loss of a search is the worst loss over all models plus ``weight`` times the disagreement of the
+    models, in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
@@ -103,8 +105,8 @@ class EnsemblePenalty(Record):
 
 
 class Fabrication(Record):
-    """A penalty on layouts unlike the training layouts: ``inside_weight`` times ``outside`` is added to the
-    loss.
+    """A penalty on layouts that are unlike the model's training layouts. ``inside_weight`` times the result
+    of the function ``outside`` is added to the loss.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"weight", "max_step_levels", "min_feature_um"})
@@ -116,7 +118,7 @@ class Fabrication(Record):
 
 
 class DesignSettings(Record):
-    """The settings that every design has."""
+    """The settings that the designs of all tasks have."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"camera"})
 
@@ -143,8 +145,8 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
 
 
 def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[str, Any] | None = None) -> S:
-    """Return the settings of a preset, with changes by path; a ``variant`` among the changes overrides the
-    given one.
+    """Return the settings of a preset, changed by ``changes``. A ``variant`` among the changes overrides the
+    argument ``variant``.
 
     Raises:
         InputError: there is no such preset, or ``changed`` refuses a change.

@@ -1,4 +1,5 @@
-"""The virtual fab as a judge, which prints finished layouts but has no gradients to design with.
+"""The virtual fab as a judge. It can print finished layouts, but it has no gradients, so no layout can be
+designed through it.
 
 The fab shares no code with the models and includes the effects that were hidden in their training prints. The
 fab therefore prints what the machine would have printed.
@@ -20,14 +21,14 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# This random stream is separate, so that the roughness differs from that of every scan of the truth file's
-# run.
+# Number of a separate random stream for the roughness, so that it differs from the roughness of every scan
+# that was simulated with the truth file.
 _ROUGHNESS_STREAM = 2
 
 
 @dataclass(frozen=True)
 class ElementJob(Job):
-    """A layout that stands alone on the substrate."""
+    """A print job for a layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
         """Place the layout in a frame of level 0, in the middle of a write field as large as the frame."""
@@ -59,7 +60,7 @@ class FabSimulator(nn.Module):
 
     @torch.no_grad()
     def forward(self, layout_um: Tensor, pitch_um: float) -> Tensor:
-        """Return the printed height (b, 1, y, x), µm, of nominal heights of the same shape."""
+        """Return the printed height, µm, from nominal heights, µm; both have shape (b, 1, y, x)."""
         levels = (layout_um / self.printer.level_height_um).round().to(torch.uint8).cpu().numpy()
         prints = np.stack([self._print(level) for level in levels[:, 0]])[:, None]
         return torch.from_numpy(prints.astype(np.float32)).to(layout_um.device)

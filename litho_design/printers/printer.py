@@ -24,7 +24,7 @@ Precision = Literal["float32", "bfloat16"]
 
 
 class TilingCheck(Record):
-    """Difference between a print computed as a whole and the same print in tiles.
+    """Difference between a print that is predicted as a whole and the same print predicted in tiles.
 
     For models with a finite reach, the difference is only rounding. For others, such as a Fourier operator,
     the difference is an error of the model.
@@ -37,7 +37,9 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """The printer of a design or a score; ``dataset`` is the dataset on which the model was trained."""
+    """The printer of a design or a score; ``dataset_sha256`` identifies the dataset on which its model was
+    trained.
+    """
 
     name: str
     sha256: str
@@ -95,8 +97,8 @@ class Printer(nn.Module):
 
     @property
     def depends_on_position(self) -> bool:
-        """Return whether the print may depend on the position in the write field, which is unknown for a
-        patch.
+        """Return True if the print may depend on the position in the write field. This position is unknown if
+        only a patch of a layout is printed.
         """
         return bool(self.card.get("process_effects"))
 
@@ -106,23 +108,24 @@ class Printer(nn.Module):
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
-        """Print real ``level`` (b, 1, size, size); return the height (b, 1, size, size), µm."""
+        """Return the printed height, µm, of real-valued levels; both have shape (b, 1, size, size)."""
         height_um = level * self.layout.level_height_um
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
-        """Print a patch cut out of a layout (b, 1, y, x); return its height, µm, without the outer
-        ``halo_px`` pixels.
+        """Return the printed height, µm, of a patch cut out of a layout, without the outer ``halo_px`` pixels
+        of the patch. The levels of the patch have shape (b, 1, y, x).
 
-        By default, ``halo_px`` is the halo of the printer; ``strip_halo_px`` is enough for two rows of
-        pixels.
+        By default, ``halo_px`` is the halo of the printer. The narrower ``strip_halo_px`` is enough if the
+        inner part of the patch is only two rows high.
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
     def print_in_tiles(self, around: Tensor, tile_px: int) -> Tensor:
-        """Print levels that include the printer's halo on all sides, tile by tile; return the height, µm (b,
-        1, y, x).
+        """Print levels tile by tile, and return the height, µm, of shape (b, 1, y, x).
+
+        ``around`` contains the levels, extended on all sides by the printer's halo.
 
         The backward pass prints each tile again, so memory depends on ``tile_px`` and not on the element. If
         the model has a finite reach, the result equals that of ``forward`` up to rounding. Otherwise,
@@ -149,11 +152,11 @@ class Printer(nn.Module):
         """Compare the print of the whole element with separately printed tiles, each with a halo.
 
         Args:
-            level: layout (1, 1, size, size).
+            level: levels of the layout, shape (1, 1, size, size).
             tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
 
         Returns:
-            The differences. None if nothing can be compared, because heights are nominal, the element is not
+            The differences, or None if nothing can be compared: the heights are nominal, the element is not
             larger than one tile, or the print depends on the position.
         """
         size, halo = self.layout.size_px, self.halo_px
@@ -179,15 +182,15 @@ class Printer(nn.Module):
         )
 
     def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
-        """Run the networks of a frozen model in ``precision`` inside the block.
+        """Return a context manager, inside which the networks of a frozen model run in ``precision``.
 
-        Other models stay in float32, and so do heights, blurs and waves.
+        Models without this option stay in float32, and so do heights, blurs and waves.
         """
         at_precision = getattr(self.simulator, "at_precision", None)
         return nullcontext() if at_precision is None else at_precision(precision)
 
     def record(self) -> PrinterRecord:
-        """Return the name, the hashes and the guard ring of the printer, for results."""
+        """Return the record of the printer that results contain: its name, its hashes and its guard ring."""
         return PrinterRecord(
             name=self.name,
             sha256=self.weights_sha256(),
@@ -224,7 +227,7 @@ class Printer(nn.Module):
         return heights
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
-        """Print ``height_um``, and cut off the outer ``border_px``."""
+        """Print the nominal heights ``height_um``, and cut the outer ``border_px`` pixels off the print."""
         # A frozen model computes only as much of the border as the inner part needs.
         inside: Callable[..., Tensor] | None = getattr(self.simulator, "inside", None)
         if inside is not None:

@@ -14,8 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# These zoo models judge a design, one of each kind. Ridge regressions are left out, because they extrapolate
-# badly from smooth layouts.
+# The models of the zoo that judge designs, one of each kind of model. Ridge regressions are left out, because
+# they extrapolate badly from smooth layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 
@@ -31,12 +31,12 @@ def load_printer(
     heights.
 
     The folder ``truth`` of a virtual fab is loaded as a printer that can judge layouts but not take part in a
-    search. ``name`` is the printer's name in results, by default the model's own. A loaded printer is
-    returned unchanged.
+    search. ``name`` is the name of the printer in results; by default, it is the name of the model. A loaded
+    printer is returned unchanged.
 
     Raises:
-        InputError: there is no frozen model, its pitch differs, it was not calibrated for the levels, or this
-            machine does not have the device.
+        InputError: ``source`` is no frozen model, the pitch of the model differs from that of the layout, the
+            model was not calibrated for the heights of the levels, or this machine does not have the device.
     """
     if isinstance(source, Printer):
         return source
@@ -61,8 +61,10 @@ def load_printers(
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> dict[str, Printer]:
-    """Load printers by name, from a mapping or from a list of NAME=MODEL, MODEL, ``none`` and loaded
-    printers.
+    """Load several printers, and return a dict from name to printer.
+
+    ``sources`` is a mapping from names to models, or a list whose items are NAME=MODEL, MODEL, ``none`` or
+    loaded printers.
 
     Raises:
         InputError: a printer has no name, two have the same name, or ``load_printer`` refuses one.
@@ -93,7 +95,8 @@ def load_printers(
 def models_at_hand(
     known: Sequence[PrinterRecord], layout: LayoutSettings, *, device: Device = "cpu"
 ) -> list[Printer]:
-    """Return the judges of the zoo that were trained on the same prints as the first of the ``known`` models.
+    """Load those models of the zoo in ``JUDGES`` that were trained on the same prints as the first of the
+    ``known`` models.
 
     Models that are already known, and models that were not calibrated for the layout, are left out.
     """
@@ -139,10 +142,10 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
 
 
 def check_device(device: Device) -> None:
-    """Refuse a device that this machine does not have.
+    """Check that this machine has a device.
 
     Raises:
-        InputError: there is no such device.
+        InputError: the machine does not have the device.
     """
     try:
         wanted = torch.device(device)

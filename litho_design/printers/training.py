@@ -1,4 +1,6 @@
-"""Compare a layout with a model's training layouts: distance, penalty, and the model's own error."""
+"""Compare a layout with the training layouts of a model: their distance, a penalty on it for the search, and
+the expected error of the model.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ class OutOfDistribution(Record):
 
     The distance consists of two total-variation distances: between histograms of levels, and between
     histograms of the steps of neighbouring pixels. ``unusual`` lists the levels and steps that are much more
-    frequent in the layout than in the training layouts. The distance of steps is absent if the model's card
-    has no steps.
+    frequent in the layout than in the training layouts. ``step_distance`` is None if the model's card has no
+    histogram of steps.
     """
 
     # Older records also contain scores of a layout that is closer to the training layouts.
@@ -48,7 +50,10 @@ class OutOfDistribution(Record):
 def out_of_distribution(
     levels: np.ndarray, layout: LayoutSettings, card: Mapping[str, Any]
 ) -> OutOfDistribution | None:
-    """Compare a layout (ny, nx) with the histograms in a model's card; None if the card has none."""
+    """Compare a layout with the histograms in a model's card. ``levels`` has shape (ny, nx).
+
+    Return None if the card has no histogram of levels.
+    """
     trained = training_share(card, "training_level_share", layout.levels)
     if trained is None:
         return None
@@ -111,13 +116,13 @@ def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarra
 
 
 def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
-    """Return the expected rms error of a model, µm, on the print of a relief with this standard deviation,
-    µm.
+    """Return the rms error, µm, that a model is expected to make on the print of a relief. ``relief_um`` is
+    the standard deviation of the heights of this relief, µm.
 
-    The result combines the error on the prints in the model's card and the scatter of the gains of these
-    prints. If the relief is higher than these prints, the error on them is scaled up. Errors are assumed to
-    be normal, so the mean absolute error is sqrt(2 / pi) of the rms error. If the card has no prints, the
-    result is 0.
+    The result is the root of the sum of two squares: the error on the prints in the model's card, and the
+    scatter of the gains of these prints times ``relief_um``. If the relief is higher than these prints, the
+    error on them is scaled up. Errors are assumed to be normal, so the mean absolute error is sqrt(2 / pi) of
+    the rms error. If the card has no prints, the result is 0.
     """
     prints = card.get("baseline") or []
     if not prints:

@@ -18,7 +18,7 @@ _PERIODS, _STEPS = 4, 6
 def load_relief(
     source: str | Path | np.ndarray, layout: LayoutSettings, height_um: float
 ) -> tuple[np.ndarray, TargetRecord]:
-    """Load a target height map, float32 (size, size), µm, and its record.
+    """Return a target height map and its record. The map is a float32 array of shape (size, size), in µm.
 
     Args:
         source: a drawing, a greyscale image, or heights in µm (a float TIFF or an array). The drawings are
@@ -48,9 +48,9 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return the deviation of a print from the expected print, blurred and without its mean.
+    """Return the deviation of a print from the expected print, blurred and with its mean removed.
 
-    The deviation is a float32 array (size, size), µm.
+    The deviation is a float32 array of shape (size, size), in µm.
 
     The roughness of a second print differs from that of the first, so the blur removes the roughness.
     """
@@ -61,7 +61,9 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
 
 
 def _float_tiff(path: Path) -> np.ndarray | None:
-    """Read heights in µm from a TIFF of floating-point numbers; return None for any other file."""
+    """Return the heights, in µm, that a TIFF of floating-point numbers contains. Return None for any other
+    file.
+    """
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None
     import tifffile
@@ -71,7 +73,7 @@ def _float_tiff(path: Path) -> np.ndarray | None:
 
 
 def _draw(name: str, size_px: int) -> np.ndarray:
-    """Draw a relief (size, size) with values in [0, 1]."""
+    """Draw a relief of shape (size, size) with values in [0, 1]."""
     x = (np.arange(size_px) + 0.5) / size_px
     if name == "blaze":
         return np.tile(_PERIODS * x % 1, (size_px, 1))

@@ -25,14 +25,14 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# Gains of the affine layouts that are tried, relative to the inverse of the printer's gain, and their
-# positions between the lowest and the highest level.
+# Affine layouts (level = gain * height + zero) that are tried first: their gains relative to the inverse of
+# the printer's gain, and their positions between the lowest and the highest level.
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
-    """Errors of a print's height after its mean is removed, because the zero of a print depends on its
+    """Errors of the heights of a print. The mean error is removed, because the zero of a print depends on its
     base.
     """
 
@@ -55,14 +55,16 @@ class _Bare(nn.Module):
 
 @register_task
 class ReliefTask(Task):
-    """The task of printing a height map (size, size), µm; ``load_relief`` returns the map and its record.
+    """The task of printing a target height map in µm, shape (size, size). ``load_relief`` returns such a map
+    and its record.
 
     The input ``off_um`` is the deviation of a first print from the expected print, without its mean. The
     search expects the same deviation in the next print. Figures compare the predicted print with the target
     itself, as a measurement would.
 
     Raises:
-        InputError: the start is for tasks with light, or the spreads exceed the range of any propagator.
+        InputError: the start in the settings works only for holograms or lenses, or the spreads of the
+            process window exceed the range of every propagator.
     """
 
     name = "relief"
@@ -106,8 +108,8 @@ class ReliefTask(Task):
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the expected rms error, µm, from the error of the model's print and the model's own
-        error.
+        """Return the expected rms error, µm, which combines the error of the print that the model predicts
+        with the model's own error.
         """
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, float(self.asked.std()))
@@ -144,19 +146,23 @@ class ReliefTask(Task):
         return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return the layout whose nominal heights are the target heights, and the best affine layout."""
+        """Return two uncorrected layouts: the one whose nominal heights are the target heights, and the best
+        affine layout, whose levels are gain * height + zero.
+        """
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two uncorrected layouts and of levels that are not rounded."""
+        """Return the errors of the two uncorrected layouts, and those of the best levels that are not
+        rounded.
+        """
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
 
     @property
     def _nominal(self) -> Tensor:
-        """Return the levels (size, size) of the target heights; a relief with heights below 0 is lifted to
-        0.
+        """Return the levels, shape (size, size), whose nominal heights are the target heights. A relief with
+        heights below 0 is lifted, so that its lowest point is at 0.
         """
         return self._affine(
             1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
@@ -164,8 +170,8 @@ class ReliefTask(Task):
 
     @cached_property
     def _best_affine(self) -> Tensor:
-        """Return the levels (size, size) of gain * height + zero; gain and zero minimise the loss over the
-        printers.
+        """Return the levels gain * height + zero, shape (size, size), with the gain and the zero that
+        minimise the loss over the printers.
         """
         layout, heights = self.settings.layout, self.printer.level_heights_um()
         top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
@@ -181,8 +187,8 @@ class ReliefTask(Task):
         return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
 
     def _affine(self, gain: float, zero: float) -> Tensor:
-        """Return the integer levels (size, size) of gain * (height above the lowest point) + zero, limited to
-        the printable levels.
+        """Return the levels gain * (height above the lowest point) + zero, rounded and limited to the
+        printable levels. The result has shape (size, size).
         """
         layout = self.settings.layout
         level = gain * (self.target - self.target.amin()) / layout.level_height_um + zero
@@ -190,7 +196,9 @@ class ReliefTask(Task):
 
     @torch.no_grad()
     def _expected(self, levels: Tensor) -> float:
-        """Round real levels (*cells), and return their loss over the printers of the search."""
+        """Return the loss of rounded levels over the printers of the search. ``levels`` contains one real
+        level per cell.
+        """
         whole = self.cells(levels.round())[None, None].float()
         losses = torch.stack([self.loss_by(one, one(whole)[0, 0])[0] for one in self.printers])
         return float(self.over_models(losses))
@@ -200,8 +208,8 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the task's arrays, and the error that remains with unrounded levels, which no layout can
-        remove.
+        """Return the arrays that every task saves, and the error that remains even with unrounded levels. No
+        layout can remove this error.
         """
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
@@ -223,8 +231,8 @@ class ReliefTask(Task):
     def _levels_printing(
         self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
     ) -> Tensor:
-        """Return real levels (*cells) that print a relief's heights, if level k is ``level_heights_um[k]``
-        high.
+        """Return one real level per cell, such that the heights of a relief are printed if level k has the
+        height ``level_heights_um[k]``.
 
         ``zero`` moves the relief within the range of the levels: at 0, the relief begins at the lowest level;
         at 1, it ends at the highest.

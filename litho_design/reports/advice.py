@@ -9,7 +9,8 @@ from typing import Any
 from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
-# Names of figures whose keys are unclear; the scores' field descriptions explain them.
+# Readable names of those figures whose keys are unclear. The field descriptions of the scores explain the
+# figures.
 WORDS: Words = {
     key: (name, "")
     for key, name in {
@@ -25,7 +26,7 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures that summarise a score if it contains them, with their text, decimals and factor.
+# Figures that summarise a score if it contains them: the key, the text, the number of decimals and a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -46,7 +47,7 @@ _SEEN_SHARE = 0.02
 
 
 def named(figure: str) -> str:
-    """Return the readable name of a score's figure."""
+    """Return the readable name of a figure of a score."""
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
@@ -56,7 +57,8 @@ def called(printer: str) -> str:
 
 
 def distribution_warning(design: Design) -> str:
-    """Return a warning if a layout is far from the training layouts, or if its distance is unknown.
+    """Return a warning if the layout of a design is far from the model's training layouts, or if this
+    distance is unknown.
 
     Otherwise, return an empty text.
     """
@@ -103,14 +105,14 @@ def width_sentence(design: Design) -> str:
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """Return a sentence about one figure: the value of the first model, the median over models, and the worst
-    value.
+    """Return a sentence about one figure: its value according to the first model, its median over all models,
+    and its worst value.
 
     The sentence also states whether the models differ too much.
 
     Args:
-        less: whether the figure is better when lower; ``gain``: gain of the design over the best uncorrected
-            layout.
+        less: True if the figure is better when lower.
+        gain: gain of the design over the best uncorrected layout, or None if it is unknown.
     """
     name, unit = _parted(figure)
     stated, *_ = by_model
@@ -152,11 +154,13 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """State the stroke of the printed levels and the height of a full wave."""
+    """Return sentences about the stroke of the printed levels, and about the levels or heights that a full
+    wave needs.
+    """
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
-        f"The print of the highest level lies {stroke.stroke_waves:.2f} waves above that of the lowest (gain "
-        f"{stroke.print_gain:.2f}). A blazed grating with these levels would send "
+        f"The print of the highest level lies {stroke.stroke_waves:.2f} waves above that of the lowest "
+        f"({stroke.print_gain:.2f} times the nominal height). A blazed grating with these levels would send "
         f"{100 * stroke.blaze_order_1:.1f} % of the light into the first order and "
         f"{100 * stroke.blaze_order_0:.1f} % straight through."
     )
@@ -176,8 +180,8 @@ def stroke_advice(design: Design) -> str:
 
 
 def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
-    """Return the summary of a score that a command prints when it ends, with the uncertainty of a
-    measurement.
+    """Return the summary of a score that a command prints when it ends. For a measurement, the summary
+    includes the uncertainties.
     """
     sd = uncertainty or {}
 
@@ -190,5 +194,5 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
 
 
 def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
-    """State the headline figures of the baselines in one line."""
+    """Return one line with the headline figures of the baselines."""
     return f"for comparison: {'; '.join(f'{name} {headline(one)}' for name, one in baselines.items())}"

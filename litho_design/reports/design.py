@@ -45,7 +45,9 @@ _PSF = " The PSF is in decibels below its peak."
 
 
 def write_design_report(folder: Path, design: Design, task: Task, history: list[dict[str, float]]) -> Path:
-    """Write ``report.html`` and its CSV tables from the arrays in ``folder``."""
+    """Write ``report.html`` and its CSV tables into ``folder``, which already contains the arrays of the
+    design.
+    """
     height_um, seen = (np.load(folder / name) for name in (HEIGHT_FILE, IMAGE_FILE))
     lens = isinstance(task, LensTask)
     facts = {
@@ -97,8 +99,9 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.paragraph(
         f"Loss of the printable layout: {design.start_loss:.4f} at the start, {design.argmax_loss:.4f} after "
         f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish. The last "
-        f"sampled layout had a loss of {design.sample_loss:.4f} (soft-to-hard gap "
-        f"{design.argmax_loss - design.sample_loss:+.2g})."
+        f"sampled layout, whose levels are not rounded, had a loss of {design.sample_loss:.4f}; that of the "
+        f"printable layout before the polish differs from it by "
+        f"{design.argmax_loss - design.sample_loss:+.2g}."
     )
     _add_yield(page, design, task, torch.from_numpy(height_um).to(task.printer.device))
     page.heading("Printed height of the levels", folded=True)
@@ -169,7 +172,7 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
 
 
 def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
-    """Add the yield of random prints and the figures of these prints."""
+    """Add the yield, which is the share of random prints that pass, and the figures of these prints."""
     window, errors = task.settings.window, task.errors
     draws = task.window_scores(print_um, window.yield_draws)
     passed = measure_yield(draws, design.predicted, errors)
@@ -195,4 +198,4 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
     page.figure(
         yield_figure(draws, figures, errors), "Yield curves; the dashed line is the print as modelled."
     )
-    page.table(draws, "Single draws", "window.csv", digits=3)
+    page.table(draws, "Figures of each random print", "window.csv", digits=3)

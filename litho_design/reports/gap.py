@@ -1,5 +1,5 @@
-"""Write the report of a comparison: tables with confidence intervals, and images as designed and as
-printed.
+"""Write the report of a comparison: tables with confidence intervals, and the images behind the prints that
+the judges predict.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
         panels_figure(pictures),
         f"Seed {result.seeds[0]}. Each title names the arm that designed the layout and the judge "
         "that printed it. "
-        + ("Each image shows sqrt(PSF / peak)." if lens else "Images are at matched scale."),
+        + ("Each image shows sqrt(PSF / peak)." if lens else "Each image is scaled to match the target."),
     )
     page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
@@ -89,7 +89,7 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
         ]
         page.table(pairs, "Paired differences", "paired.csv", digits=3)
     means = [one.model_dump(exclude={"judged_ci95"}) for one in result.summary]
-    page.table(means, "All means", "summary.csv", digits=4)
+    page.table(means, "Mean of every figure, for every arm and judge", "summary.csv", digits=4)
     return page.write(folder)
 
 
@@ -140,7 +140,9 @@ def _caption(task: str, figure: str) -> str:
 
 
 def _label(figure: str) -> str:
-    """Return the meaning of a figure; a figure of your own task has only a name."""
+    """Return the meaning of a figure. For a figure of your own task, whose meaning is unknown, return its
+    name.
+    """
     return _LABELS.get(figure) or named(figure)
 
 

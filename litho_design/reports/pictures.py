@@ -18,12 +18,14 @@ if TYPE_CHECKING:
 # Brightest intensity shown, relative to the target's white; brighter speckle is clipped.
 BRIGHTEST = 1.5
 _GREY, _BLUE, _GREEN = "#9aa7b5", "#2f7fd0", "#3a9142"
-# Side of a map with axes and a colour bar, and of a map without them, inches.
+# Side, in inches, of a map with axes and a colour bar, and of a map without them.
 _LARGE, _SMALL = 4.3, 2.4
 
 
 class Panel(NamedTuple):
-    """A map (m, m), ``side_um`` wide, and its matplotlib colour map. A map with a unit gets a colour bar."""
+    """A map of shape (m, m) to draw. It is ``side_um`` wide, ``colours`` names its matplotlib colour map, and
+    it gets a colour bar if it has a unit.
+    """
 
     title: str
     values: np.ndarray
@@ -53,7 +55,7 @@ def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
 
 
 def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> Figure:
-    """Draw the loss over the iterations."""
+    """Draw the loss of the sampled and of the printable layout over the iterations of the search."""
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     for name, label, colour in (
@@ -109,8 +111,8 @@ def yield_figure(
     """Draw the share of drawn prints that are at least as good as the value on the axis.
 
     Args:
-        draws: figures of each print.
-        figures: for each figure to draw, the value for the print as modelled, and a label.
+        draws: for each print, a mapping from the name of a figure to its value.
+        figures: for each figure to draw, its value for the print as modelled and its label.
         falling: figures that are better when lower.
     """
     figure = new_figure(8, 3)

@@ -101,7 +101,9 @@ def _spread(result: ScoreResult) -> str:
 
 
 def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
-    """Return a text with the difference of the SI-PSNR from the expected value; empty without SI-PSNR."""
+    """Return a text that states the difference between the judged and the expected SI-PSNR. The text is empty
+    if the task has no SI-PSNR.
+    """
     name = "si_psnr_db"
     if name not in judged or name not in expected:
         return ""

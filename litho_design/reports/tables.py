@@ -12,14 +12,16 @@ from litho_design.tasks.design import Design
 
 
 def meanings(score: type[Record]) -> dict[str, str]:
-    """Return the meaning of each number of a score."""
+    """Return a dict from the name of each figure of a score to its meaning."""
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return one row per figure, with its meaning and its value for each print and baseline."""
+    """Return one row per figure of a score, with the meaning of the figure and its value for each print and
+    baseline.
+    """
     # Your own task need not describe its figures.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels

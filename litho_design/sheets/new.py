@@ -25,9 +25,11 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# Cut-offs of the random layouts, cycles per µm, used in turn; the measured prints have the same ones.
+# Cut-off frequencies of the random layouts, in cycles per µm, used in turn. The layouts of the measured
+# prints have the same cut-off frequencies.
 _CUTOFFS_PER_UM = (0.25, 0.5)
-# The stair has few, wide steps, because it covers three fifths of a side and the printer rounds the edges.
+# The staircase has few, wide steps, because it covers three fifths of a side and the printer rounds the edges
+# of the steps.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate without a print, which shows the zero, tilt and bow of the microscope",
@@ -52,16 +54,19 @@ def new_sheet(
     device: Device = "cpu",
     announce: bool = True,
 ) -> Sheet:
-    """Write a sheet into ``out``: files for the printer, a dataset card, and a page that says what to do.
+    """Write a sheet into ``out``: files for the printer, a dataset card, and a page that tells the lab what
+    to do.
 
     Args:
         out: folder of the sheet; an interrupted run in it resumes.
         model: model through which one version of the hologram is designed; the other is designed without a
             model.
         format: format of the printer's files, as for ``export``.
-        target: target of the hologram; ``settings``: settings of both designs, by default those of a small
-            hologram. All fields have the size, pitch and levels of the hologram.
-        layouts: number of random layouts from which the printer model is learned; ``seed``: their seed.
+        target: target image of the hologram.
+        settings: settings of both versions of the hologram, by default those of ``small_hologram``. All
+            fields have the size, pitch and levels of the hologram.
+        layouts: number of random layouts from which the printer model is learned.
+        seed: seed of these random layouts.
         device, announce: as for ``design_hologram``.
 
     Raises:
@@ -119,8 +124,8 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Return the fields from which a model of the printer is learned, by id: first the witnesses, then random
-    layouts.
+    """Return the levels of the fields from which a model of the printer is learned, as a dict from field id
+    to levels: first the witness patterns, then the random layouts.
     """
     shape = geometry.size_px, geometry.size_px
 
@@ -146,7 +151,9 @@ def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.nd
 def _exported(
     source: np.ndarray | Path, format: Format, folder: Path, name: str, geometry: LayoutSettings
 ) -> str:
-    """Write the file of a field for the printer; return its path within the sheet."""
+    """Write the printer's file for one field, and return the path of this file relative to the folder of the
+    sheet.
+    """
     size = geometry.pitch_um, geometry.level_height_um
     file = export(source, format, folder / TO_PRINTER / name, pitch_um=size[0], level_height_um=size[1])
     return file.relative_to(folder).as_posix()

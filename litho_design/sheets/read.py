@@ -1,5 +1,5 @@
-"""Evaluate the scans of a sheet: build a dataset, freeze a model with its card, close the loop, and compare
-holograms.
+"""Evaluate the scans of a sheet: build a dataset, fit and correct a printer model, freeze it with its card,
+and compare the two holograms.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, 
 from litho_design.workflows.score import score
 from litho_models import close_loop, evaluate, freeze
 
-# A sheet has too few scans for a model with more parameters.
+# The loop fits this base model. A sheet has too few scans for a model with more parameters.
 _BASE = "physics"
 
 
 def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") -> ReadSheet:
-    """Fit a printer model to the scans of a sheet, find what the model lacks, and compare the two holograms.
+    """Fit a printer model to the scans of a sheet, find the effects that the model lacks, and compare the two
+    printed holograms.
 
     Args:
-        sheet: folder of ``new_sheet``, with the scans in it.
+        sheet: folder written by ``new_sheet``, to which the lab has added its scans.
         out: folder of the result: ``prints.zarr``, ``printer`` (the model and its card), ``loop``,
             ``evaluation``, a score of each hologram, and ``report.html``. An interrupted run resumes.
         device: where prints and waves are computed.
 
     Raises:
-        InputError: there is no sheet, the scan of a hologram is missing, or a step refuses its input.
+        InputError: ``sheet`` is not the folder of a sheet, the scan of a hologram is missing, or one of the
+            steps rejects its input.
     """
     source = Path(sheet)
     given = Sheet.read(source)
@@ -79,7 +81,7 @@ def read_sheet(sheet: str | Path, out: str | Path, *, device: Device = "cpu") ->
 
 
 def sheet_text(result: ReadSheet) -> str:
-    """Return the result in words."""
+    """Return the main results as a few sentences."""
     gain = {kind: db["with"] - db["without"] for kind, db in _by_kind(result).items()}
     better = "better" if gain["measured"] >= 0 else "worse"
     return (

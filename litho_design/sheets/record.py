@@ -1,4 +1,4 @@
-"""The records ``sheet.json`` of a sheet, and ``read.json`` of its evaluation."""
+"""The records of a sheet: ``sheet.json`` describes the sheet, and ``read.json`` its evaluation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from litho_data.foundation.run_facts import RunFacts
 from litho_data.store.schema import DatasetId
 
 Arm = Literal["without", "with"]
-# The same hologram, designed for a perfect printer and through the model.
+# The two designs of the hologram: without a model (for a perfect printer) and with the model.
 ARMS: tuple[Arm, ...] = ("without", "with")
 HOLOGRAM, SCANS_OF_HOLOGRAMS = "hologram", "hologram-scans"
 
@@ -24,7 +24,7 @@ class Field(Record):
 
 
 class Sheet(RunFacts, Result):
-    """The sheet for a lab.
+    """A sheet of fields that a lab prints and scans.
 
     ``expected_db`` is the SI-PSNR that the model predicts for the image of each hologram.
     """
@@ -45,10 +45,12 @@ class ReadSheet(RunFacts, Result):
 
     Attributes:
         model_nm: mean absolute error, on the new prints, of the model used for the design.
-        own_nm: cross-validated mean absolute error of a model that the loop fitted to the new prints;
-            ``corrected_nm``: the error of this model with the effects that the loop found.
-        found: effects that the loop added; ``verdict``: verdict of the loop.
-        measured_db: SI-PSNR of the image of each measured hologram; ``expected_db``: the predicted SI-PSNR.
+        own_nm: cross-validated mean absolute error of the base model that the loop fitted to the new prints.
+        corrected_nm: the same error of the base model together with the effects that the loop found.
+        found: names of the effects that the loop added.
+        verdict: verdict of the loop.
+        measured_db: SI-PSNR of the image of each hologram, computed from its measured print.
+        expected_db: SI-PSNR of the image of each hologram as predicted when it was designed.
     """
 
     SCHEMA: ClassVar[str] = "litho-design/sheet-read/1"

@@ -1,5 +1,5 @@
-"""Propagate light through a printed element onto a window of the same size, for one or several sets of
-optics.
+"""Propagate light through a printed element onto a window of the same size in the image plane, for one or
+several sets of optics.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ class ElementBench(nn.Module):
         return self.carried[_key(self.optics.wavelength_um)]
 
     def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
-        """Yield plane waves of the source in the image plane (..., size, size), each with its share of the
-        light.
+        """Yield one pair for each plane wave of the source: its share of the light, and the wave in the image
+        plane, an array of shape (..., size, size).
         """
         for share, part in self.parts:
             wave = element_field(height_um, self.grid, part)
             yield share, self.carried[_key(part.wavelength_um)](wave)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the share of the incident power on each pixel of the window, for heights (..., size, size)
-        in µm.
+        """Return the share of the incident power on each pixel of the window, shape (..., size, size), from
+        printed heights in µm of the same shape.
         """
         found = [share * intensity_share(wave, self.grid) for share, wave in self.waves(height_um)]
         return sum(found[1:], found[0])
@@ -60,7 +60,7 @@ def _key(wavelength_um: float) -> str:
 
 
 class ViewsBench(nn.Module):
-    """Form the images behind one element for several colours, planes or angles of incidence."""
+    """Compute the images behind one element for several wavelengths, image planes or angles of incidence."""
 
     def __init__(self, layout: LayoutSettings, views: Sequence[Optics]):
         super().__init__()
@@ -68,5 +68,7 @@ class ViewsBench(nn.Module):
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return shares of the incident power (views, size, size) for a height map (size, size), µm."""
+        """Return the share of the incident power on each pixel of each image, shape (views, size, size), for
+        a height map in µm of shape (size, size).
+        """
         return torch.stack([bench(height_um) for bench in self.benches])

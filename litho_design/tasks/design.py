@@ -27,10 +27,11 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
-# A lens of rings has one value per pixel of the radius, instead of levels and heights of a plane.
+# A lens in rings has one level and one height per pixel along a radius, instead of levels and heights on a
+# plane.
 RINGS_FILE = "ring_level.npy"
 RING_HEIGHT_FILE = "ring_height_um.npy"
-# Folder of the designs, if a result contains several.
+# Name of the folder that holds the designs, if a result contains several designs.
 DESIGNS = "designs"
 
 
@@ -57,8 +58,9 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """Findings of a task about its levels and their print; ``thick`` contains the figures of the print as a
-    thick element.
+    """What a task reports about the levels that it found and their predicted print.
+
+    ``thick`` contains the figures of the print computed as a thick element.
     """
 
     tiling: TilingCheck | None = None
@@ -97,18 +99,18 @@ class Design(Findings, Result):
 
     @property
     def in_rings(self) -> bool:
-        """Return whether the levels and heights of the design are given along a radius, not on a plane."""
+        """Return True if the levels and heights of the design lie along a radius instead of on a plane."""
         return RINGS_FILE in self.files
 
     @property
     def layout_sha256(self) -> str:
-        """Return the hash of the file of levels."""
+        """Return the SHA-256 of the file that contains the levels."""
         return self.files[RINGS_FILE if self.in_rings else LEVELS_FILE]
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
-    """Save arrays by file name, and also the levels as a 16-bit greyscale PNG; return the SHA-256 of all
-    files.
+    """Save each array under its file name, and save the levels also as a 16-bit greyscale PNG. Return a dict
+    from file name to SHA-256.
     """
     hashes = {}
     for name, array in arrays.items():

@@ -1,4 +1,4 @@
-"""Run any task: start, search, polish, score and write; interrupted runs resume."""
+"""Run any task: search for a layout, polish it, score it and write the result. Interrupted runs resume."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# Number of layouts that every model prints (the searched and the uncorrected one), and seconds to write a
-# page.
+# For the estimate of time: the number of layouts whose prints every model predicts (the searched and the
+# uncorrected layout), and the seconds that writing a report takes.
 _CANDIDATES, _PAGE_S = 2, 7.0
-# A function that writes the report into the folder of a design, from the record and the history of the
-# search.
+# A function that writes the report into the folder of a design. It takes the folder, the record, the task and
+# the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 
 
 def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = True) -> Design:
-    """Optimise, polish and score one layout, and write the folder ``out``.
+    """Optimise, polish and score the layout of one task, and write the result into the folder ``out``.
 
     If the folder holds an interrupted run of the same task, the run resumes, and its result equals that of an
-    uninterrupted run. A finished design of the same task is returned. The weights of every model are hashed
-    before and after the run; if they changed, no design is written.
+    uninterrupted run. A finished design of the same task is returned. The weights of every model in the
+    search are hashed before and after the run. If they changed, no design is written.
 
     Args:
-        report: function that is called when the arrays are in the folder; the record is written afterwards.
+        report: function that writes the report. It is called when the arrays are in the folder, before the
+            record is written.
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, a printer can only judge, or the weights
-            of a model changed during the run.
+        InputError: ``out`` holds another design or result, a printer of the search has no gradients (it can
+            only judge), or the weights of a model changed during the run.
     """
     settings, folder = task.settings, Path(out)
     for printer in task.printers:
@@ -59,7 +60,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         "target": task.target_record.model_dump(mode="json") if task.target_record else None,
         "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
     }
-    # The first of the processes that share a design writes the folder.
+    # If several processes share a design, the first of them creates the folder.
     with growing_folder(folder, Design.FILE_NAME, facts) if task.ranks.rank == 0 else nullcontext() as begun:
         if not task.ranks.any(begun is not None and begun.finished):
             _make(task, folder, facts, before, report, announce and task.ranks.rank == 0)
@@ -76,7 +77,9 @@ def _make(
     report: Report,
     announce: bool,
 ) -> None:
-    """Search, choose a layout, print, score and write."""
+    """Search for a layout, choose between it and the uncorrected ones, predict its print, score it and write
+    the result.
+    """
     settings = task.settings
     layout, wave_um = settings.layout, settings.optics.wave_height_um
     heights = task.printer.level_heights_um()
@@ -89,7 +92,7 @@ def _make(
         level, width = best_layout(task, level)
     if width is not None and width.returned != SEARCHED:
         what = f"the available models print the layout “{width.returned}” better than the layout found by"
-        task.notes.append(f"{what} the search, so it was chosen")
+        task.notes.append(f"{what} the search, so “{width.returned}” was chosen")
         with torch.no_grad():
             loss = float(task.objective(level[None, None].float())[0])
     height = task.printed_um(level)
@@ -128,13 +131,15 @@ def _make(
 
 @torch.no_grad()
 def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
-    """Choose the candidate with the smallest loss over all available models.
+    """Choose, from the searched and the uncorrected layouts, the one with the smallest loss over all
+    available models.
 
     Args:
-        searched: levels of the search on the pixels (size, size).
+        searched: levels that the search found, on the pixels of the layout, shape (size, size).
 
     Returns:
-        Its levels, and the width of the design, which is None if there is only one model and one candidate.
+        The levels of the chosen layout, and the width of the design. The width is None if there is only one
+        model and only one layout to choose from.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
     models = {printer.name: printer for printer in (*task.printers, *task.judges)}
@@ -166,7 +171,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
 
 
 class _Searched(NamedTuple):
-    """The result of search and polish: levels per cell with their loss, the state of the search, and its
+    """The result of search and polish: the level of each cell, the loss, the state of the search, and its
     duration.
     """
 
@@ -207,8 +212,10 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate the time for choosing a layout, for scores and for the yield, from one print by each model and
-    one draw.
+    """Estimate the seconds that the run takes after the search, to choose a layout and compute scores and
+    yield.
+
+    The estimate is based on one print by each model and one draw of the process window, which are timed.
     """
     models = (*task.printers, *task.judges)
     started = time.perf_counter()

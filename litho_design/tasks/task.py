@@ -1,4 +1,4 @@
-"""The interface of a task, which states what the light behind a printed element should do."""
+"""The interface of a task. A task states what the light behind a printed element should do."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from litho_design.tasks.design import (
 
 
 class Figures(Record):
-    """The figures of your own task, by name."""
+    """The scores of your own task; each field is one figure."""
 
     model_config = ConfigDict(extra="allow")
 
 
 class Task:
-    """A goal for the light behind an element, which can be optimised and scored through printers.
+    """A goal for the light behind a printed element. Layouts can be optimised for it and scored against it.
 
     For your own task, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``. Then
     pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report and
@@ -50,26 +50,33 @@ class Task:
 
     Attributes:
         name: unique name of the task in results.
-        starts: possible starts of the search; ``start_jitter_levels``: noise added to them.
-        headline: figures that reports and commands show first; all figures if empty.
-        errors: figures that are better when lower; ``loss_unit``: see ``Width``.
-        in_one_piece: whether the element is designed as a whole. If so, single-level changes follow the
-            search, and the run writes a report.
+        starts: names of the starts from which the search can begin.
+        start_jitter_levels: standard deviation, in levels, of the noise added to a start that is not random.
+        headline: names of the figures that reports and commands show first; all figures if empty.
+        errors: names of the figures that are better when lower.
+        loss_unit: see ``Width``.
+        in_one_piece: True if the element is designed as a whole, not in parts. Single-level changes (the
+            polish) then follow the search, and the run writes a report.
         ranks: the processes that share the task.
-        score_type: record of the scores, whose field descriptions explain the figures in reports.
-        settings, printer, printers, inputs: as given; ``notes``: notes for the record.
-        bench: module that turns a height map into ``seen``, the input of ``loss`` and ``figures``.
+        score_type: class of the record of scores. The descriptions of its fields explain the figures in
+            reports.
+        settings, printer, inputs: the arguments of these names.
+        printers: the printer, followed by the models of ``ensemble``.
+        notes: sentences for the record and the report.
+        bench: module that turns a height map into ``seen``, which is the input of ``loss`` and ``figures``.
 
     Args:
-        settings: geometry, optics, search, process window.
-        printer: frozen model, or nominal heights.
-        inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
-        ensemble: further models; the loss is then the worst loss over all models plus a penalty on their
-            disagreement.
-        record: source of the inputs.
+        settings: geometry, optics, search and process window.
+        printer: printer of a frozen model or of nominal heights.
+        inputs: mapping from names to the arrays that the task needs, such as targets. Each array is saved as
+            NAME.npy with the design.
+        ensemble: further models of the printer. By default, the loss is then the worst loss over all models
+            plus a penalty on the disagreement of the models.
+        record: record that states where the target comes from.
 
     Raises:
-        InputError: the task does not support this start, or the spreads exceed the range of the propagator.
+        InputError: the task does not support the start in the settings, or the spreads of the process window
+            lead outside the range in which the propagator is valid.
     """
 
     name: ClassVar[str]
@@ -112,45 +119,52 @@ class Task:
     # Methods that your own task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """Return the optics of every image; they may differ in colour (``optics.at_wavelength``), plane or
-        angle.
+        """Return the optics of every image that the task needs.
+
+        They may differ in wavelength (``optics.at_wavelength``), image plane or angle of incidence.
         """
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
         """Return the loss of the light behind the print.
 
-        By default, ``seen`` contains the shares of the incident power (views, size, size).
+        By default, ``seen`` is the share of the incident power on each pixel of each image, shape
+        (views, size, size).
 
         Returns:
-            A scalar, or a scalar and its named parts.
+            The loss as a scalar, or a pair of this scalar and a dict of its named parts.
         """
         raise NotImplementedError
 
     def figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Return the scores of ``seen`` (see ``loss``), by name."""
+        """Return a dict from the name of each score to its value for ``seen`` (see ``loss``)."""
         raise NotImplementedError
 
     # Methods that holograms and lenses override.
 
     def make_cells(self) -> CellMap:
-        """Return the map from one value per free cell to the pixels of the search."""
+        """Return the map that spreads one value per free cell over the pixels on which the search works."""
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return the module that turns heights (size, size), µm, into ``seen``, the input of ``loss``."""
+        """Return the module that turns a height map in µm, shape (size, size), into ``seen``, the input of
+        ``loss``.
+        """
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels (*cells) from which a search starts if it does not start at random.
+        """Return the level of each cell from which a search starts, if the start is not random.
 
         Args:
-            level_phase: phase that each level prints, radian (levels,).
+            level_phase: phase delay of the print of each level, in radians, shape (levels,).
         """
         raise NotImplementedError
 
     def untouched(self) -> dict[str, Tensor]:
-        """Return uncorrected layouts (size, size) by name; by default, only the start for nominal heights."""
+        """Return a dict from names to uncorrected layouts of shape (size, size).
+
+        By default, this is only the start of the search for a printer that prints nominal heights.
+        """
         if set(self.starts) == {"random"}:
             return {}
         layout = self.settings.layout
@@ -159,32 +173,40 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses of several models (models,) into one loss, by default their maximum."""
+        """Combine the losses of several models, shape (models,), into one loss. By default, return the
+        maximum.
+        """
         return losses.max()
 
     def check_printer(self, printer: Printer) -> None:
-        """Refuse a printer that cannot print this task's layouts."""
+        """Raise InputError if a printer cannot print the layouts of this task."""
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the bench of the search, which turns ``search_print`` into what the loss sees."""
+        """Return the bench of the search, which turns the heights from ``search_print`` into the input of
+        ``loss``.
+        """
         return self.make_bench(optics)
 
     def search_print(self, level: Tensor, printer: Printer) -> Tensor:
-        """Print levels (1, 1, size, size) for the search; return the height, µm."""
+        """Return the printed height, µm, that the search uses, from levels of shape (1, 1, size, size)."""
         return self.printed(level, printer)
 
     def search_area(self) -> Tensor | None:
-        """Return the area that each height of ``search_print`` covers; None for pixels."""
+        """Return the area that each height from ``search_print`` covers, or None if the heights belong to
+        pixels.
+        """
         return None
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
-        """Print real levels (1, 1, size, size); return the height (size, size), µm, with gradients to the
-        levels.
+        """Return the printed height, µm, of shape (size, size) for real-valued levels of shape
+        (1, 1, size, size).
+
+        Gradients flow from the height to the levels.
         """
         return printer(level)[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
-        """Score a print (size, size), µm.
+        """Score a print, given as heights in µm of shape (size, size).
 
         ``expected_um`` is the print that the design expected; by default, it is the scored print.
         """
@@ -192,7 +214,7 @@ class Task:
             return self.score_type(**self.figures(self.bench(height_um)))
 
     def thick_score(self, height_um: Tensor) -> Record | None:
-        """Score a print as a thick element.
+        """Score a print that is treated as a thick element.
 
         Return None if the settings already specify a thick element, or if the task has no light.
         """
@@ -204,15 +226,15 @@ class Task:
         return type(self)(settings, nominal, inputs=self.inputs).score(height_um)
 
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Return the figures of one draw of the process window."""
+        """Return the figures of ``seen`` for one draw of the process window."""
         return self.figures(seen)
 
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write levels, print and what is seen; return their SHA-256 by file name."""
+        """Write the levels, the print and the light behind it. Return a dict from file name to SHA-256."""
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Return findings about levels and their print, for the record; ``folder`` contains the arrays."""
+        """Return what the record states about the levels and their print; ``folder`` contains the arrays."""
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(
@@ -225,7 +247,9 @@ class Task:
         )
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the arrays of a design by file name: levels, heights, what is seen, and the inputs."""
+        """Return a dict from file name to array: the levels, the heights, the light behind the print, and the
+        inputs.
+        """
         with torch.no_grad():
             seen = self.bench(height_um).cpu().numpy()
         levels = level.cpu().numpy().astype(np.uint8)
@@ -233,20 +257,22 @@ class Task:
         return made | {f"{name}.npy": array for name, array in self.inputs.items()}
 
     def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Return the efficiency of an ideal element; None if it is undefined.
+        """Return the efficiency of an ideal element, or None if the task has no such efficiency.
 
-        The search for the ideal element starts from a print (size, size), µm.
+        The search for the ideal element starts from the print, given as heights in µm of shape (size, size).
         """
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return baseline scores on the same grid, by default those of a flat plate."""
+        """Return a dict from the name of each baseline to its scores on the same grid. By default, the only
+        baseline is a flat plate.
+        """
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
-        """Draw what is seen, for reports: images side by side in a square, each divided by its brightest
-        value.
+        """Return a picture of ``seen`` for reports: the images tiled in a square, each divided by its
+        brightest value.
         """
         images = seen.reshape(-1, *seen.shape[-2:])
         side = int(np.ceil(np.sqrt(len(images))))
@@ -261,10 +287,10 @@ class Task:
 
     @cached_property
     def scenes(self) -> list[tuple[Draw | None, Any]]:
-        """Return the draws of the process window that enter the loss, each with its bench.
+        """Return one pair for each draw of the process window that enters the loss: the draw and its bench.
 
-        If there are no such draws, the only entry is None, which stands for the print as modelled, with its
-        bench.
+        If there are no such draws, the only pair has None instead of a draw, which stands for the print as
+        modelled.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
@@ -273,7 +299,7 @@ class Task:
         ]
 
     def free_parameters(self) -> Parametrisation:
-        """Return the free parameters of the search, at its start."""
+        """Return the free parameters of the search, set to the values from which the search starts."""
         search, optics = self.settings.search, self.settings.optics
         parameters = make_parametrisation(self.settings.layout, search, self.cells).to(self.printer.device)
         if search.start == "random":
@@ -285,11 +311,12 @@ class Task:
         return parameters
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of levels on the pixels (1, 1, size, size), and its parts.
+        """Return the loss of levels on the pixels, shape (1, 1, size, size), and a dict of the parts of this
+        loss.
 
-        For each sample of the process window, ``over_models`` combines the losses of the models; ``risk``
-        then combines the samples. Penalties on the disagreement of the models and on rare levels and steps
-        are added.
+        For each draw of the process window, ``over_models`` combines the losses of all models. ``risk`` then
+        combines the losses of all draws. Two penalties are added: on the disagreement of the models, and on
+        levels and steps that are rare in the training layouts.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
@@ -314,12 +341,16 @@ class Task:
 
     @torch.no_grad()
     def printed_um(self, level: Tensor, printer: Printer | None = None) -> Tensor:
-        """Print integer levels (size, size), by default with the first printer; return the height, µm."""
+        """Return the printed height, µm, of integer levels of shape (size, size), by default from the first
+        printer.
+        """
         return self.printed(level[None, None].float(), printer or self.printer)
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Score a print (size, size) over ``count`` unseen draws of the process window."""
+        """Score a print of shape (size, size) in ``count`` draws of the process window that no search has
+        used.
+        """
         settings, scores = self.settings, []
         for draw in draws(settings.window, settings.optics, count, unseen=True):
             changed = draw.apply(height_um, settings.layout.pitch_um)
@@ -327,7 +358,9 @@ class Task:
         return scores
 
     def inputs_sha256(self) -> str:
-        """Return the hash of the inputs and, for a task from outside this package, of its code."""
+        """Return the SHA-256 of the inputs. For a task defined outside this package, its source code is
+        hashed too.
+        """
         digest = hashlib.sha256()
         for name, array in sorted(self.inputs.items()):
             digest.update(
@@ -338,7 +371,8 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of ``seen``, the light behind the print of ``printer``, and its named parts.
+        """Return the loss of ``seen``, which is the light behind the print of ``printer``, and the parts of
+        this loss.
 
         By default, the result is that of ``loss``.
         """
@@ -350,7 +384,8 @@ _TASKS: dict[str, type[Task]] = {}
 
 
 def register_task(task: type[Task]) -> type[Task]:
-    """Register your own task, so that its designs can be opened; also works as a class decorator.
+    """Register your own task, so that its designs can be opened. The function can also be used as a
+    decorator.
 
     Raises:
         InputError: the task has no name, or another task has this name.
@@ -364,7 +399,7 @@ def register_task(task: type[Task]) -> type[Task]:
 
 
 def registered_task(name: str) -> type[Task]:
-    """Return the task of that name.
+    """Return the class of the task that is registered under this name.
 
     Raises:
         InputError: no such task is registered.
@@ -383,5 +418,5 @@ def _source(task: type) -> str:
     try:
         return inspect.getsource(task)
     except (OSError, TypeError):
-        # If the class was typed into an interpreter, there is no source to compare.
+        # If the class was typed into an interpreter, its source code is not available and is not hashed.
         return ""

@@ -1,4 +1,6 @@
-"""The width of a design: figures of its layout and of uncorrected layouts according to all models."""
+"""The width of a design: how much the predictions of all models differ, for its layout and for uncorrected
+layouts.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +9,25 @@ import numpy as np
 from litho_data.foundation.results import Record
 
 SEARCHED = "searched"
-# 95 % of normal errors lie within twice the standard deviation.
+# 95 % of normally distributed errors lie within this multiple of the standard deviation.
 _SURE = 2.0
 
 
 class Width(Record):
-    """Figures of a design by model: first the models of the search, then the judges, which the search did not
-    use.
+    """Figures of a design according to each model. The models of the search come first, followed by the
+    judges, which the search did not use.
 
     Attributes:
-        searched_with: how many of the models the search used.
-        figures: figures by candidate and model, including ``loss``; candidates are the layout found by the
-            search and the uncorrected ones.
-        returned: the candidate with the smallest loss over all models (``Task.over_models``).
-        figure: the first figure of the task; ``less``: whether it is better when lower.
+        searched_with: number of models that the search used.
+        figures: for each candidate and each model, a dict from the name of a figure to its value; one of the
+            figures is ``loss``. The candidates are the layout found by the search and the uncorrected
+            layouts.
+        returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
+        figure: name of the first headline figure of the task.
+        less: True if this figure is better when lower.
         loss_unit: factor that converts the loss to the unit of the figure, if the loss is an error that
             includes the model's own error; otherwise None.
-        level_heights_um: printed height of a wide field of each level, by model.
+        level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 
     searched_with: int
@@ -35,14 +39,14 @@ class Width(Record):
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
-        """Return the figure of a candidate by every model; the default is the returned candidate."""
+        """Return the figure of a candidate, by default of the returned one, according to every model."""
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
 
     @property
     def between(self) -> tuple[float, float]:
-        """Return the expected range of a print's figure: the range over models, widened by twice their own
-        errors.
+        """Return the range in which the figure of a real print is expected: the range over the models,
+        widened by twice each model's own error (added in quadrature) if that error is known.
         """
         values = self.values()
         if self.loss_unit is None:
@@ -54,20 +58,22 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Return the gain of the figure over the best uncorrected layout, as the median over models."""
+        """Return by how much the design's figure is better than that of the best uncorrected layout, as the
+        median over the models. Return None if no uncorrected layout was compared.
+        """
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
         return float(np.median(sign * self.values() - np.max(idle, axis=0))) if idle else None
 
     @property
     def disagreement(self) -> float:
-        """Return the range of the figure over the models."""
+        """Return the difference between the largest and the smallest value of the figure over the models."""
         return float(np.ptp(self.values()))
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """Return the level on whose height the models disagree most, with its lowest and highest height,
-        µm.
+        """Return the level on whose height the models disagree most, and its lowest and highest predicted
+        height, µm.
         """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]

@@ -1,4 +1,6 @@
-"""Measure the design-to-manufacturing gap: design with every arm and print with every judge."""
+"""Measure the design-to-manufacturing gap: make a design with every arm, and predict its print with every
+judge.
+"""
 
 from __future__ import annotations
 
@@ -61,24 +63,28 @@ def compare(
     workers: int = 1,
     dask: str | None = None,
 ) -> GapResult:
-    """Design once per arm and seed with equal budgets, and print each layout with every judge.
+    """Make one design per arm and seed with equal search settings, and predict the print of each layout with
+    every judge.
 
-    All arms share every setting except the printer. Finished designs in ``out`` are reused, and interrupted
-    designs resume. The arms' printers also judge, so the matrix of arms and judges is complete.
+    An arm is the printer model, or none, with which a design is made. A judge is a model that predicts the
+    print of a finished layout. All arms share every setting except the printer. Finished designs in ``out``
+    are reused, and interrupted designs resume. The printers of all arms are also judges.
 
     Args:
-        settings: settings of a hologram or of a lens, whose type decides what is designed, or settings of
-            ``task``. ``seeds`` replace the seed of the search.
-        arms: printers to design with, as a mapping of models by name, or as a list of NAME=MODEL, MODEL,
-            ``none`` and loaded printers.
+        settings: settings of a hologram or of a lens; their type decides which of the two is designed. If
+            ``task`` is given, these are the settings of this task. Each of ``seeds`` replaces the seed of the
+            search.
+        arms: printers to design with, given as a mapping from names to models, or as a list whose items are
+            NAME=MODEL, MODEL, ``none`` or loaded printers.
         out: folder of the comparison.
-        judges: further printers that only judge.
+        judges: further printers, which only judge; given like ``arms``.
         target: target image, for holograms.
-        task, inputs: a task of your own and its arrays, as for ``design``.
+        task, inputs: a task of your own and the arrays that it needs, as for ``design``.
         objects, held_out_objects: as for ``design_lens``.
-        seeds: one design per arm and seed.
+        seeds: seeds of the search. One design is made for each arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
-        workers: number of local processes that design; ``dask``: address of a Dask scheduler to use instead.
+        workers: number of local processes that make the designs.
+        dask: address of a Dask scheduler, whose workers then make the designs instead.
 
     Returns:
         The record written to ``out/gap.json``.
@@ -155,8 +161,10 @@ def _design(job: _Job) -> Design:
 def _judged(
     place: Path, arm: str, seed: int, printers: Mapping[str, Printer]
 ) -> tuple[list[GapEntry], list[Panel]]:
-    """Print a finished design with every printer; return entries and pictures, beginning with the target
-    image.
+    """Predict the print of a finished design with every printer. Return one entry and one picture per
+    printer.
+
+    The pictures begin with the target image, if the design has one.
     """
     loaded = load_design(place, device=printers[arm].device)
     expected = loaded.printed_um(printers[arm])
@@ -183,7 +191,7 @@ def _judged(
 def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Sequence[int]) -> None:
     if not arms or not seeds:
         raise InputError(
-            "comparison", got=f"{len(arms)} arms, {len(seeds)} seeds", wanted="at least one of each"
+            "comparison", got=f"{len(arms)} arms, {len(seeds)} seeds", wanted="at least one arm and one seed"
         )
     both = sorted(set(arms) & set(judges))
     if both:

@@ -41,12 +41,14 @@ class How(TypedDict, total=False):
     """Arguments that all design functions share.
 
     Attributes:
-        judges: models (MODEL or NAME=MODEL) that print the finished layout to show the width of the design;
-            by default, the zoo's models that were trained on the same prints.
-        robust: let the search also use the judges that have gradients. The loss is then combined over all
-            models (``Task.over_models``), and a penalty on the models' disagreement is added.
-        device: device of the models.
-        extrapolate: accept heights beyond a model's calibration; recorded in the result.
+        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of their
+            scores is the width of the design. By default, the judges are the zoo's models that were trained
+            on the same prints as the model of the design.
+        robust: let the search also use those judges that have gradients. ``Task.over_models`` then combines
+            the losses of all models, and a penalty on the disagreement of the models is added.
+        device: torch device on which prints and waves are computed.
+        extrapolate: accept heights beyond the range for which a model was calibrated; the result records this
+            choice.
         announce: print the expected time and memory to stderr before starting (the default).
     """
 
@@ -69,21 +71,22 @@ def design_hologram(
     """Optimise the layout of a hologram so that its print shows the target image.
 
     Args:
-        target: a drawing by name, an image file, or an array (size_px, size_px) in [0, 1].
+        target: name of a drawing, path of an image file, or an array of shape (size_px, size_px) with values
+            in [0, 1] (see ``load_target``).
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
-        band_px: design an element that is too large for the memory of one process, in bands of at most this
-            many rows. Processes started by torchrun share the bands; with ``cuda``, each process uses its own
-            GPU. The model must have a finite reach, and there are no judges.
+        band_px: if given, the element is designed in bands of at most this many rows, because it is too large
+            for the memory of one process. Processes started by torchrun share the bands; with ``cuda``, each
+            process uses its own GPU. The model must have a finite reach, and there are no judges.
         how: judges, robust, device, extrapolate, announce (see ``How``).
 
     Returns:
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: the target has another size or lacks dark or bright pixels, the model does not fit the
-            layout, or the folder holds another result.
+        InputError: the target does not have the size of the layout or lacks dark or bright pixels, the model
+            does not fit the layout, or the folder holds another result.
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
     if band_px is not None:
@@ -118,10 +121,13 @@ def design_lens(
         model: as for ``design_hologram``.
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
-        objects: pictures, or folders of them, that a computational lens images instead of the drawings.
-        held_out_objects: pictures or folders that are only scored (see ``with_objects``).
-        tile_px: design the rings of a lens that focuses light along a radius, in tiles of this length. The
-            plane is not computed, so the lens may be 10 mm wide or more. The model must have a finite reach.
+        objects: pictures, or folders of pictures, that a computational lens images instead of the built-in
+            drawings.
+        held_out_objects: pictures, or folders of pictures, that are used only for the scores and not in the
+            search (see ``with_objects``).
+        tile_px: if given, only the rings of a focusing lens are designed: a strip along one radius is printed
+            in tiles of this many pixels. The whole plane is not computed, so the lens may be 10 mm wide or
+            more. The model must have a finite reach.
         how: see ``How``.
 
     Returns:
@@ -158,13 +164,14 @@ def correct(
     """Find the layout whose print comes closest to a target height map.
 
     Args:
-        relief: ``lens``, ``blaze`` or ``staircase``, a greyscale image, a float TIFF of heights in µm, or an
-            array (size_px, size_px) of heights in µm (see ``load_relief``).
+        relief: a drawing (``lens``, ``blaze`` or ``staircase``), a greyscale image, a float TIFF of heights
+            in µm, or an array of heights in µm of shape (size_px, size_px) (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
-        after: folder of a first correction whose print was measured; ``scan``: that measurement. The next
-            print is expected to deviate from its prediction in the same way.
-        how: see ``How``; robust by default.
+        after: folder of a first correction that was printed and measured.
+        scan: measurement of this first print. The next print is expected to deviate from its prediction as
+            the first print did.
+        how: see ``How``; ``robust`` is True by default.
 
     Returns:
         The record written to ``out/design.json``; the part of the relief
@@ -172,8 +179,8 @@ def correct(
 
     Raises:
         InputError: ``load_relief`` refuses the relief; the model or the folder is refused as in
-            ``design_hologram``; ``after`` and ``scan`` are not given together; the first element has another
-            layout; or the scan shows another element.
+            ``design_hologram``; only one of ``after`` and ``scan`` is given; the size, pitch or levels of the
+            first element differ from those in ``settings``; or the scan shows another element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -189,10 +196,10 @@ def correct(
 def _print_off(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """Return how the measured print of a first element deviates from its prediction, as an input of the
-    second.
+    """Return the deviation of the measured print of a first element from its predicted print, as an input for
+    the design of the second element.
 
-    Return no inputs if there is no first element.
+    The result is empty if there is no first element.
     """
     if after is None and scan is None:
         return {}
@@ -224,8 +231,8 @@ def design(
         task: a class registered by ``register_task``.
         model: as for ``design_hologram``.
         out: folder of the design; an interrupted run in it resumes.
-        settings: geometry, optics, search, process window; ``design_settings()`` by default.
-        inputs: arrays that the task needs, by name.
+        settings: geometry, optics, search and process window; ``design_settings()`` by default.
+        inputs: mapping from names to the arrays that the task needs.
         how: see ``How``.
 
     Returns:
@@ -259,7 +266,7 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """Make the design of a task. Printers are checked before a target is read."""
+    """Run the design of the task that ``make`` returns. The printers are checked before a target is read."""
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
     if judges is None:
@@ -273,8 +280,8 @@ def _designed(
 
 
 def _alone(how: How, *objects: Any) -> How:
-    """Refuse objects, judges and ``robust`` for a large element; return the other arguments, without
-    judges.
+    """Check that neither objects, judges nor a robust search are requested for a large element. Return the
+    arguments with an empty list of judges.
     """
     if how.get("robust") or objects or how.get("judges"):
         got = "objects, judges or a robust search"

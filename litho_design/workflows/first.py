@@ -1,5 +1,5 @@
-"""A first result: a small hologram is designed without and with a printer model, and this model prints both
-designs.
+"""A first result: a small hologram is designed once without and once with a printer model, and this model
+predicts the prints of both designs.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from litho_design.judging.gap import GapResult
 from litho_design.printers.source import Device
 from litho_design.workflows.compare import compare
 
-# Names of the nominal heights for the first design, the model for the second, and a further judge.
+# Names of three printers: nominal heights for the first design, the model of the second design, and a model
+# that only judges.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
 def small_hologram() -> HologramSettings:
     """Return the settings of a hologram that takes a minute to design on two cores.
 
-    At this distance, the hologram can resolve the letters of the target.
+    The image plane is so close that the hologram can resolve the letters of the target.
     """
     small = {
         "layout.size_px": 256,
@@ -40,17 +41,19 @@ def first(
     device: Device = "cpu",
     announce: bool = True,
 ) -> GapResult:
-    """Design the same hologram for a perfect printer and through PBL, and print both with PBL.
+    """Design the same hologram for a perfect printer and through the model PBL, and predict both prints with
+    PBL.
 
     Args:
-        out: folder of the result; its ``report.html`` shows target, prints and images side by side.
+        out: folder of the result. The page ``report.html`` in it shows the target and the images behind both
+            prints side by side.
         target: as for ``design_hologram``.
         settings: settings of both designs; by default, those of ``small_hologram``.
         device, announce: as for ``design_hologram``.
 
     Returns:
-        The record written to ``out/gap.json``, as from ``compare``. Physics, which neither design used,
-        judges both too.
+        The record written to ``out/gap.json``, as returned by ``compare``. The model Physics, which neither
+        design used, also judges both designs.
 
     Raises:
         InputError: ``compare`` refuses an argument.

@@ -30,7 +30,7 @@ def score(
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> ScoreResult:
-    """Score the layout of a design by every judge, and write ``score.json`` and a report.
+    """Score the layout of a design with every judge, and write ``score.json`` and a report.
 
     A lens of rings (``lens --large``) is printed and scored along its radius.
 
@@ -42,17 +42,19 @@ def score(
             independent. If there is no judge, scan or photograph, the judges are the zoo's models that were
             trained on the same prints.
         scan: a measured height map of the printed part.
-        camera: a photograph of the printed hologram's image, or of an object through the printed lens; with
-            ``scan``, it is also deconvolved with the PSF of the measured print.
-        element: with ``thick``, the light behind every print is computed by the wave propagation method;
-            ignored if ``design`` is already loaded.
+        camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
+            ``scan`` is also given, the photograph of an object is deconvolved with the PSF of the measured
+            print too.
+        element: ``thin``, or ``thick`` to compute the light behind every print by the wave propagation
+            method. By default, the kind that the design states. Ignored if ``design`` is already loaded.
         band_px: print and score a large hologram in bands of at most this many rows.
         device: where prints and waves are computed; ignored if ``design`` is already loaded.
-        extrapolate: accept heights beyond a judge's calibration; recorded in the result.
+        extrapolate: accept heights beyond the range for which a judge was calibrated; the result records this
+            choice.
 
     Raises:
-        InputError: there is no judge, the design folder is incomplete or was altered, a measurement
-            does not match it, or ``out`` holds another kind of result.
+        InputError: there is no judge, the design folder is incomplete or was altered, a measurement does not
+            match the design, or ``out`` holds another kind of result.
     """
     in_memory = isinstance(design, LoadedDesign)
     record = design.record if isinstance(design, LoadedDesign) else Design.read(design)
@@ -62,7 +64,9 @@ def score(
             raise InputError("score of a large element", got=given, wanted="only models as judges")
         if record.in_rings and band_px is not None:
             raise InputError(
-                "score of a lens in rings", got="bands", wanted="no bands, because rings have no plane"
+                "score of a lens in rings",
+                got="bands",
+                wanted="no bands, because the lens is scored along its radius",
             )
         judges = judges or ()
     loaded = (

@@ -99,6 +99,6 @@ def test_what_a_full_wave_needs_is_told_where_something_reaches_it(known):
     layout = SimpleNamespace(level_height_um=0.1, levels=13)
     design: Any = SimpleNamespace(stroke=stroke, out_of_distribution=None, layout=layout)
     said = stroke_advice(design)
-    assert "0.60 waves above that of the lowest (gain 0.70)" in said
+    assert "0.60 waves above that of the lowest (0.70 times the nominal height)" in said
     assert "50.0 % of the light into the first order and 25.0 % straight through" in said
     assert ("A full wave needs 21 levels of 0.1 µm, or 13 levels of 0.166 µm." in said) is known
