@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=DesignSettings)
 
-# A variant or task among the changes overrides the one given here.
+# If the changes contain a variant or a task, it overrides the one given here.
 _hologram = partial(hologram_settings, "default")
 _lens = partial(lens_settings, "direct", "default")
 
@@ -277,8 +277,8 @@ def _settings(
     task: str,
     spread_of: Path | None = None,
 ) -> S:
-    """Merge the preset, the settings file, the measured spreads and the command line. Each source overrides
-    those before it.
+    """Merge the preset, the settings file, the measured spreads and the command line. Each of these sources
+    overrides the sources before it.
     """
     made = make(given.over(make({}), task))
     if spread_of is None:

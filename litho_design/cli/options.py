@@ -110,8 +110,8 @@ def takes_settings(
     The command receives the values of these options as a ``Given`` object in its argument ``given``.
 
     Args:
-        presets: settings, one record per task; the help shows their values as defaults.
-        leave_out: paths of settings that get no option.
+        presets: one record of settings for each task of the command. The help shows their values as defaults.
+        leave_out: paths of settings that the command sets itself, and which therefore get no option.
     """
     found: dict[str, list[Leaf]] = {}
     for leaf in (leaf for preset in presets for leaf in leaves(preset)):

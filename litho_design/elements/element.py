@@ -28,8 +28,8 @@ Index = Callable[[float], float]
 
 
 class Element(nn.Module):
-    """A printed element for your own program: ``element(field, wavelength_um)`` returns the wave behind the
-    element.
+    """A printed element for your own program. The call ``element(field, wavelength_um)`` returns the wave
+    behind the element.
 
     The only trainable parameters are the free levels, one per cell or ring. The levels are rounded and
     clipped to the range of the layout; a straight-through estimator gives the gradient of this step. A frozen
@@ -46,16 +46,16 @@ class Element(nn.Module):
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
         kind: ``thin`` or ``thick``. For ``thick``, the wave is propagated through the relief by the wave
             propagation method; the relief must be in air.
-        tile_px: side of the overlapping tiles in which larger elements are printed. The backward pass
-            recomputes the tiles, so the memory needed depends on the tile and not on the element. None prints
-            the element in one piece.
+        tile_px: side of the overlapping tiles in which an element is printed if it is larger than a tile. The
+            backward pass recomputes the tiles, so the memory needed depends on the tile and not on the
+            element. None prints the element in one piece.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
     Raises:
         InputError: ``load_printer`` refuses the model, the printer has no gradients, or the refractive index
             of the resin does not exceed that of the surroundings. The error is also raised if tiles are
-            requested for a model that depends on the position, or a thick element is not in air.
+            requested for a model whose print depends on the position, or if a thick element is not in air.
     """
 
     def __init__(
@@ -164,8 +164,9 @@ class Element(nn.Module):
         extra ``torchoptics``.
 
         Args:
-            z, offset: position of the element, in the unit of length that your program uses.
-            unit_um: that unit of length in µm, for example 1e6 if your program uses metres.
+            z, offset: position of the element along and across the axis, in the unit of length that your
+                program uses.
+            unit_um: size of this unit of length in µm, for example 1e6 if your program uses metres.
 
         Raises:
             InputError: torchoptics is not installed, or the element is thick and therefore not described by a

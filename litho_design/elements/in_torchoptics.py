@@ -10,8 +10,8 @@ from torchoptics.utils import wavelength_or_default
 
 
 class PrintedElement(PolychromaticModulationElement):
-    """An ``Element`` on a plane of torchoptics. A field that it modulates must have the same shape and
-    spacing as the element.
+    """An ``Element`` that can be placed on a plane in torchoptics. The fields that it modulates must have the
+    same shape and spacing as the element.
 
     Args:
         element: the printed element, whose parameters become those of this module.

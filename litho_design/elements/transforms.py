@@ -25,7 +25,7 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
     try:
         return run(level)
     except RuntimeError:
-        # The model defines a gradient of its own or inspects values, which torch.func does not allow.
+        # The model defines its own gradient or reads the values of tensors; torch.func allows neither.
         printed: Tensor = _Printed.apply(level, run)
         return printed
 

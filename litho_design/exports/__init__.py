@@ -1,1 +1,1 @@
-"""Write files for the printer, each with its sidecar, and read them back."""
+"""Write files for the printer, each with a sidecar file that describes it, and read these files back."""

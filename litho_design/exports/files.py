@@ -1,4 +1,4 @@
-"""Export a layout in one of several formats, and import exported files without loss."""
+"""Export a layout in one of several formats, and import the levels from exported files without loss."""
 
 from __future__ import annotations
 
@@ -91,9 +91,9 @@ def export(
         out: folder of the export; it may already hold exports of the same layout in other formats.
         pitch_um, level_height_um: side of a pixel and height of a level, used only for arrays. Designs and
             elements state these values themselves.
-        dose_curve: CSV with the columns ``grey,height_um``, which gives the printed height of each grey
-            value, for the greyscale formats bmp, png16 and dxf. Without it, the grey value is linear in
-            height.
+        dose_curve: for the formats with grey values (bmp, png16 and dxf), a CSV file with the columns
+            ``grey,height_um`` that gives the printed height of each grey value. Without it, the grey value is
+            linear in height.
         marks: add an orientation mark and a flat witness area beside the element (see ``with_marks``).
         job: changes to ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
 

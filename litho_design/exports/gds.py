@@ -18,7 +18,7 @@ from litho_design.exports.rows import LevelRows
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9
 
-# Side of the blocks into which a part is cut.
+# Side of the square blocks into which a part of the map is divided.
 _BLOCK_PX = 128
 Box = tuple[int, int, int, int]
 

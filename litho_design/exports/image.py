@@ -43,7 +43,7 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
 
     Raises:
         InputError: the file is not such a table, the height of a level is outside the measured range, or two
-            levels have the same grey value.
+            levels would have the same grey value.
     """
     try:
         table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))

@@ -22,7 +22,7 @@ class LevelRows(Protocol):
         """Return the shape (ny, nx) of the map."""
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Return all columns of these rows."""
+        """Return the levels in all columns of the given rows."""
 
 
 @dataclass(frozen=True)

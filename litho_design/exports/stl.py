@@ -1,5 +1,5 @@
-"""Write a layout as a closed solid (binary STL, µm). The top of each cell consists of two triangles, and
-walls meet at the corners of cells.
+"""Write a layout as a closed solid (binary STL, µm). The top of each cell consists of two triangles, and the
+vertical walls between cells meet at the corners of cells.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def _tops(around: np.ndarray, aside: np.ndarray) -> np.ndarray:
 
 
 def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarray:
-    """Return the triangles of the walls between rows of cells."""
+    """Return the triangles of the vertical walls between neighbouring rows of cells."""
     row, column = np.nonzero(cells[:-1, 1:-1] != cells[1:, 1:-1])
     south, north = cells[row, column + 1], cells[row + 1, column + 1]
     low, high = np.minimum(south, north), np.maximum(south, north)
@@ -127,7 +127,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     ):
         at = (point[:, 0], point[:, 1])
         moved, levels = aside[*at, place], around[at].copy()
-        # The edge of a moved column passes beside the column from which it was moved away.
+        # If a column was moved away from another one, its edge no longer touches that column.
         opposite = np.arange(len(row)), 3 - place
         levels[opposite] = np.where(moved, low, levels[opposite])
         chain = np.sort(levels.clip(low[:, None], high[:, None]), axis=1)
@@ -145,7 +145,7 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
 
 
 def _underside(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the underside as a fan of triangles from the middle to all points of the rim."""
+    """Return the triangles of the underside, which form a fan from the middle to all points on the rim."""
     ny, nx = shape
     south, east = [(0, x) for x in range(nx)], [(y, nx) for y in range(ny)]
     north, west = [(ny, x) for x in range(nx, 0, -1)], [(y, 0) for y in range(ny, 0, -1)]

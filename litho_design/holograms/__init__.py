@@ -1,1 +1,1 @@
-"""Holograms: settings, loss, optics and the task of designing one."""
+"""Holograms: their settings, loss and optics, and the task of designing a hologram."""

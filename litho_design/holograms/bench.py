@@ -71,8 +71,8 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """The score with a signal window. The loss ignores light outside the window, but the other figures count
-    such light as an error.
+    """The score of a hologram with a signal window. The loss and the figure of the window ignore light
+    outside the window, but the other figures count such light as an error.
     """
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
@@ -83,8 +83,9 @@ def hologram_score(
 ) -> HologramScore:
     """Score the summed intensity of the waves in the image plane against the target image.
 
-    The signal is S = {T > 0.5}. Before the comparison, the image is scaled by c = sum(I T) / sum(I^2). SSIM
-    is computed on c I, clipped to [0, 1], with an 11 px Gaussian window, sigma 1.5 and a data range of 1.
+    The signal consists of the pixels whose target T exceeds 0.5. Before the comparison, the image I is scaled
+    by c = sum(I T) / sum(I^2). SSIM is computed on the scaled image, clipped to [0, 1], with a Gaussian
+    window of 11 px and sigma 1.5, and a data range of 1.
 
     Args:
         waves: one pair for each wave: the share of the light in this wave, and its complex field in the image
@@ -122,15 +123,15 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
         aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
-        # Row i contains the weights of all pixels in pixel i, so two matrix products replace long
-        # convolutions.
+        # Row i of a matrix contains the weights with which all pixels enter pixel i, so two matrix products
+        # replace long convolutions.
         blurs.append((focus / focus.sum()).unfold(0, count, 1).flip(1))
     return blurs[0] @ target @ blurs[1].T
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Return the share of the power behind the element that is in the undiffracted plane wave (the mean of
-    the field).
+    """Return the share of the power behind the element that is in the undiffracted plane wave. The amplitude
+    of this wave is the mean of the field.
     """
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)

@@ -1,6 +1,7 @@
 """The loss of a hologram.
 
-To add a term, give it a weight in ``HologramLoss`` and a line in ``hologram_loss``.
+To add a term to the loss, add a field for its weight to ``HologramLoss`` and a line for its value to
+``hologram_loss``.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def hologram_loss(
     counted: Tensor | None = None,
     total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Return the loss of an image, and the named parts of this loss.
+    """Return the loss of an image, and a dict of the named parts of this loss.
 
     Args:
         share: share of the incident power on each pixel of the image, shape (size, size).

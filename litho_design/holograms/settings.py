@@ -19,7 +19,8 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class HologramLoss(Record):
-    """The loss of a hologram, RMSE(target, image) + efficiency_weight * (1 - efficiency).
+    """Settings of the loss of a hologram, which is RMSE(target, image) + efficiency_weight * (1 -
+    efficiency).
 
     With ``signal_window_um``, only pixels within this distance of the target's light count in the error. The
     error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
@@ -56,13 +57,13 @@ def hologram_settings(
     start, 1000 Adam iterations at a rate of 0.1, and expected levels. ``authors`` has the settings of the
     published code: 12 levels, temperature 1, wavelength 0.633 and index step 0.545. After more than ten
     iterations without progress, the rate is reduced to a tenth. The efficiency term in the code is constant,
-    so it is omitted here. docs/from_the_authors_code.md lists what is not reproduced of that code.
+    so it is omitted here. docs/from_the_authors_code.md lists the parts of that code that are not reproduced.
     ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes the
     printable layout.
 
     Args:
-        variant: the preset; a ``variant`` among the changes overrides it.
-        changes: values by dotted path, or nested mappings as in a settings file.
+        variant: name of the preset. A ``variant`` among the changes overrides it.
+        changes: mapping from dotted paths to values, or nested mappings as in a settings file.
 
     Raises:
         InputError: a change names an unknown setting, or gives a value that the setting does not accept.

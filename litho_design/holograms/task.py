@@ -31,14 +31,15 @@ class HologramTask(Task):
 
     Args:
         settings: geometry, optics, search and loss (see ``hologram_settings``).
-        printer: a frozen model, or the printer of nominal heights.
+        printer: printer of a frozen model or of nominal heights.
         inputs: contains ``target``, the target image at the size of the element. ``load_target`` returns this
             image and its record.
         ensemble: further models in the loss, as for ``Task``.
 
     Raises:
         InputError: the target does not have the size of the element or lacks dark or bright pixels, the
-            requested start works only for lenses, or the spreads exceed the range of the propagator.
+            requested start works only for other tasks, or the spreads of the process window exceed the range
+            of the propagator.
     """
 
     name = "hoe"
@@ -81,7 +82,7 @@ class HologramTask(Task):
         return hologram_loss(seen, self.target, self.settings.loss, self.counted, self.total)
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the loss, SI-PSNR and signal efficiency."""
+        """Return the loss, the SI-PSNR and the signal efficiency of an image."""
         figures = {
             "loss": float(self.loss(seen)[0]),
             "si_psnr_db": si_psnr_db(seen.double(), self.target.double()),
@@ -166,7 +167,7 @@ def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
         raise InputError(
             "target", got="values outside [0, 1] or no light", wanted="an image in [0, 1] with light"
         )
-    # The scores compare the signal {T > 0.5} with its surroundings.
+    # The scores compare the signal, which is brighter than 0.5 in the target, with its surroundings.
     share = float((target > 0.5).mean())
     if share in (0.0, 1.0):
         raise InputError(

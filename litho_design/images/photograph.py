@@ -25,7 +25,8 @@ _SMALLEST_CORRELATION = 0.45
 # Largest allowed share of pixels clipped at the bright or dark end. A larger share would change the
 # similarity.
 _LARGEST_SATURATED = 0.01
-# For prints close to the expected one, the counts seem to grow as the light to a power of 0.9 to 1.1.
+# Deviations of log(gamma) from 0 above which a photograph is rejected, and above which a remark is made. For
+# prints close to the expected one, the counts seem to grow as the light to a power of 0.9 to 1.1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
 # Standard deviation of the loss of light in the corners, which depends on the objective.
@@ -188,11 +189,11 @@ def photographed_image(
     """Register a photograph to the image that the design expects.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
-    neighbours. Then a model of the camera is fitted to the expected image by least squares. The model may be
-    shifted and rotated and, if needed, tilted; its gain and background are free. The scale is free only if
-    the pitch has an uncertainty. If the scale were always free, a print that makes the image too large would
-    be mistaken for a camera with a different scale. All eight orientations are tried. A photograph that fits
-    another orientation better than ``orientation`` is refused.
+    neighbours. Then a model of the camera is fitted to the expected image by least squares. The model camera
+    may be shifted, rotated and, if needed, tilted, and its gain and background are free. The scale is free
+    only if the pitch has an uncertainty. If the scale were always free, a print that makes the image too
+    large would be mistaken for a camera with a different scale. All eight orientations are tried. A
+    photograph that fits another orientation better than ``orientation`` is refused.
 
     Args:
         wanted: expected image in any unit, shape (m, m).

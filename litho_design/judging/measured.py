@@ -24,7 +24,8 @@ _SMALLEST_COVERAGE = 0.8
 # Levelled prints of the measured layouts have a correlation of 0.9 or more with a model's expectation.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
-# The deviation by dust is larger than random errors of a print, and wider than that of a displaced step.
+# Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
+# step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # This share of the change that the tip causes remains uncertain.
 _TIP_SD = 0.3

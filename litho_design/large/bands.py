@@ -27,7 +27,7 @@ class Bands:
 
     Args:
         size_px: side of the element.
-        most_px: largest number of rows of a band. All bands have the same number of rows, except the last,
+        most_px: largest number of rows in a band. All bands have the same number of rows, except the last,
             which may have fewer.
         ranks: the processes that share the element.
         cell_px: side of a free cell. No cell is divided between two bands.
@@ -69,7 +69,9 @@ class Bands:
         return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
 
     def own(self) -> list[slice]:
-        """Return the bands of this process as slices of the rows that it holds."""
+        """Return the bands of this process as slices. Each slice selects rows from those that the process
+        holds.
+        """
         rows = len(self.rows())
         return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
 

@@ -65,7 +65,7 @@ class BandedHologram(HologramTask):
         bands: bands of the element.
         inputs: contains ``target``, the target image with values in [0, 1], shape (size, size), in memory or
             on disk.
-        record: source of the target.
+        record: record that states where the target comes from.
 
     Raises:
         InputError: the settings of the light or the printer are not supported for a large element.
@@ -110,7 +110,9 @@ class BandedHologram(HologramTask):
         return CellMap(self.settings.layout, self.bands.rows())
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return the bench from the element to the rows of the image plane that this process holds."""
+        """Return the bench, which propagates from the element to the rows of the image plane that this
+        process holds.
+        """
         return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
@@ -124,7 +126,7 @@ class BandedHologram(HologramTask):
         the rows of this process, shape (1, 1, rows, size).
         """
         loss, parts = super().objective(level)
-        # Every process returns the whole loss, but the gradient must count it once.
+        # Every process returns the loss of the whole element, but the gradient must count this loss once.
         return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
@@ -138,8 +140,8 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays to which all processes contribute. The hashes are returned only to the first
-        process.
+        """Write the arrays, to which all processes contribute. Only the first process returns the hashes; the
+        others return an empty dict.
         """
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
@@ -165,7 +167,7 @@ class BandedHologram(HologramTask):
 
 
 class BandedBench(nn.Module):
-    """Propagate one plane wave through the rows of this process onto its rows of the image plane."""
+    """Propagate a plane wave through the element onto the rows of the image plane that this process holds."""
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: torch.device):
         super().__init__()

@@ -91,8 +91,8 @@ class RingLens(DirectLensTask):
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
-        """Return the existing bench, because its matrix takes long to compute. The search therefore considers
-        only the lens as modelled.
+        """Return the existing bench for every draw of the process window, because the matrix of a new bench
+        takes long to compute. The search therefore considers only the lens as modelled.
         """
         return self.bench
 

@@ -75,7 +75,7 @@ class BandedPropagator:
         for block in self._blocks:
             wave = torch.fft.fft(columns[:, block].T.contiguous(), n=self.length)
             half, rest = self._transfer[block], self.length - self.length // 2 - 1
-            # Above the middle frequency, the values of the even kernel repeat in reverse order.
+            # The kernel is even, so its transform repeats in reverse order above the middle frequency.
             mirrored = half[:, 1 : rest + 1].flip(1)
             wave[:, : half.shape[1]] *= half.conj() if conjugate else half
             wave[:, half.shape[1] :] *= mirrored.conj() if conjugate else mirrored

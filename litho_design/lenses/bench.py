@@ -1,4 +1,4 @@
-"""The optics of a lens, which turn a printed height map into a point spread function and images."""
+"""The optics of a lens, which turn a printed height map into a point spread function (PSF) and images."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class LensOptics(nn.Module):
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
 
     def radius_um(self) -> Tensor:
-        """Return the distance of each height from the axis, float64, µm."""
+        """Return the distance from the axis of every point at which the lens has a height, float64, µm."""
         raise NotImplementedError
 
     def ideal_height_um(self) -> Tensor:
-        """Return the heights of a perfect lens, wrapped to one wave, µm."""
+        """Return the heights of a perfect lens, µm, wrapped to the height of one wave."""
         focal_um = self.optics.distance_um
         path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt()
         # This height delays the wave by the path difference; wrapping does not change the wave.
@@ -146,7 +146,7 @@ def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor
 
 
 def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
-    """Return the PSF on sensor pixels, cropped to an odd number of pixels around the axis."""
+    """Return the PSF summed over sensor pixels, and cropped to an odd number of pixels around the axis."""
     pixels = psf.shape[-1] // pixel_px
     pixels -= 1 - pixels % 2
     first = (psf.shape[-1] - pixels * pixel_px) // 2

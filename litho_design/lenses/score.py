@@ -87,7 +87,8 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
 
 
 def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
-    """Return the diameter, µm, of the circle whose area equals that of the region above half the maximum.
+    """Return the full width at half maximum of a PSF, µm. It is the diameter of the circle whose area equals
+    that of the region above half the maximum.
 
     The PSF is interpolated to four times as many pixels per side by zero-padding its spectrum, so that the
     size of its pixels does not limit the result.

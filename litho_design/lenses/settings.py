@@ -47,8 +47,8 @@ class LensView(Record):
 
 
 class ImagingSettings(Record):
-    """Settings of computational imaging: sensor, noise, reconstruction, and objects for the design and the
-    test.
+    """Settings of computational imaging: the sensor, its noise, the reconstruction, the objects imaged in the
+    search, and the objects imaged only for the scores.
 
     An object is given by the name of a drawing or by the record of a picture (see ``with_objects``).
     ``read_noise`` is the standard deviation of the read noise, relative to the brightness of a white object
@@ -118,24 +118,27 @@ class LensSettings(DesignSettings):
 def lens_settings(
     task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> LensSettings:
-    """Return a preset for a lens, with ``changes`` by path.
+    """Return a preset for a lens, changed by ``changes``, such as ``{"layout.size_px": 600}``.
 
     All presets have layouts of rings, a width of 120 µm and a focal length of 400 µm.
 
-    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at a learning rate of 3,
+    ``paper`` has 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at a learning rate of 3,
     and a square aperture. The rings come from the published code, as the text does not mention them. The
     display of the paper is 36 mm wide at a distance of 140 mm, so its image on the sensor is 102.9 µm wide:
     103 pixels of 1 µm. The PSF window has the same width. We chose pixels of 1 µm, because they sample the
-    cut-off frequency at NA 0.15 (a period of 2.1 µm) without aliasing. ``authors``: the published code has 12
-    levels, rings as wide as the diagonal of a pixel, temperature 1 and smooth L1. Its 2000 iterations begin
-    with a learning rate of 1, which is halved every 25 iterations. The code includes read and photon noise,
-    and it has its own wavelength and index step. Its objects are as wide as the lens.
-    docs/from_the_authors_code.md lists the parts of that code that are not reproduced. ``default``: a
-    circular aperture, the Fresnel phase as start, and the ring path in the search.
+    cut-off frequency at NA 0.15 (a period of 2.1 µm) without aliasing.
+
+    ``authors`` has the settings of the published code: 12 levels, rings as wide as the diagonal of a pixel,
+    temperature 1 and smooth L1. The 2000 iterations begin with a learning rate of 1, which is halved every 25
+    iterations. The images have read noise and photon noise, and the wavelength and the index step are those
+    of the code. The objects are as wide as the lens. docs/from_the_authors_code.md lists the parts of that
+    code that are not reproduced.
+
+    ``default`` has a circular aperture, starts from the phase of a Fresnel lens, and searches along a radius.
 
     Args:
-        task: ``direct`` focuses light, and ``computational`` images objects and deconvolves the images; a
-            ``task`` among the changes takes precedence.
+        task: ``direct`` for a lens that focuses light, or ``computational`` for a lens that images objects
+            and whose images are deconvolved. A ``task`` among the changes overrides it.
         variant, changes: as for ``hologram_settings``.
 
     Raises:

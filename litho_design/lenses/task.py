@@ -38,8 +38,8 @@ from litho_design.tasks.task import Task, register_task
 
 # Figures that are defined even if the lens does not focus.
 _OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
-# The noise is the same in every iteration, so that the search compares layouts and not noise. Scores draw
-# other noise.
+# The sensor noise is the same in every iteration, so that the search compares layouts and not noise. Scores
+# use other seeds.
 _DESIGN_NOISE_SEED = 0
 _PLANE_NOTE = (
     "the search ran on the whole plane, not along a radius, because the printer's effects depend on the "
@@ -58,14 +58,14 @@ class LensTask(Task):
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
-        printer: frozen model, or nominal heights.
+        printer: printer of a frozen model or of nominal heights.
         ensemble: further models in the loss, as for ``Task``.
         inputs: pixels of those objects that are pictures, as returned by ``with_objects``.
 
     Raises:
         InputError: a radial search is combined with a layout without rings or with a square aperture; the
-            start is only for holograms; an object has no pixels; or the spreads exceed the range of the
-            propagator.
+            start in the settings works only for other tasks; the pixels of an object are missing; or the
+            spreads of the process window exceed the range of the propagator.
     """
 
     starts = ("random", "fresnel")
@@ -109,8 +109,8 @@ class LensTask(Task):
         return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        """Return a bench along a radius if layout and printers allow one; otherwise, return a bench of the
-        whole plane.
+        """Return a bench that computes along a radius, if the layout and the printers allow this. Otherwise,
+        return a bench of the whole plane.
         """
         if not self.radial:
             return self.make_bench(optics)
@@ -144,7 +144,7 @@ class LensTask(Task):
         return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
-        """Return the figures of the PSF of a print."""
+        """Return the figures of the PSF of a print, given as heights in µm of shape (size, size)."""
         return lens_score(self.bench, height_um)
 
     def baselines(self) -> dict[str, dict[str, float]]:
@@ -185,7 +185,7 @@ class DirectLensTask(LensTask):
     score_type = LensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss, -log(centre-to-background ratio), and its parts."""
+        """Return the loss of a PSF, -log(centre-to-background ratio), and a dict of its parts."""
         return self.bench.focusing_loss(seen)
 
 
@@ -222,7 +222,7 @@ class ComputationalLensTask(LensTask):
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the baselines of every lens, and the imaging scores of black images."""
+        """Return the baselines that every lens has, and the imaging scores of black images."""
         return super().baselines() | {"black image": black_images(self.tested)}
 
 

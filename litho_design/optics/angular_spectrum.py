@@ -82,14 +82,14 @@ class SpectrumAxis:
     start_um: float
 
     def part(self, which: slice) -> SpectrumAxis:
-        """Restrict the axis to some of its frequencies."""
+        """Return the axis restricted to the frequencies that a slice selects."""
         return replace(self, frequency=self.frequency[which], inside=self.inside[which])
 
 
 def spectrum_axes(
     source: PixelGrid, target: PixelGrid, distance_um: float, wavelength_um: float
 ) -> tuple[SpectrumAxis, SpectrumAxis]:
-    """Return both axes of the spectrum between two grids, y first."""
+    """Return the y axis and the x axis of the spectrum of a wave between two grids."""
     y, x = (_axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1))
     return y, x
 
@@ -124,5 +124,5 @@ def _axis_band(
     # A ray wraps around if it travels one period beyond the far edge of the target.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
-    # At zero distance, nothing changes, not even evanescent waves.
+    # At zero distance, all frequencies are kept, because propagation changes nothing.
     return SpectrumAxis(frequency, inside | (distance_um == 0), index % length, start)

@@ -57,7 +57,9 @@ class KernelPropagator(nn.Module):
 
 
 def fine_shape(shape: tuple[int, ...], finer: tuple[int, int]) -> tuple[int, int]:
-    """Return the shape of the grid that spans the same pixel centres with pixels ``finer`` times as fine."""
+    """Return the shape of a finer grid that begins and ends at the same pixel centres. ``finer`` states how
+    many of its pixels fit into one pixel along y and x.
+    """
     rows, columns = ((count - 1) * times + 1 for count, times in zip(shape, finer, strict=True))
     return rows, columns
 
@@ -74,7 +76,8 @@ def wrapped_order(here: int, there: int) -> Tensor:
 
 
 def convolve(field: Tensor, transfer: Tensor, out_shape: tuple[int, int]) -> Tensor:
-    """Convolve with a kernel given by its transform, and keep the first ``out_shape`` samples.
+    """Convolve a field with a kernel that is given by its transform. Return the first ``out_shape`` samples
+    of the result.
 
     Args:
         field: complex tensor of shape (..., ny, nx).

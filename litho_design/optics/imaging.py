@@ -16,7 +16,7 @@ _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """Convolve an object with a PSF; the object and its image lie on the same frame.
+    """Convolve an object with a PSF. The object and its image have the same frame of pixels.
 
     The object is dark outside the frame. The operation is linear and does not wrap around.
 

@@ -17,15 +17,16 @@ Propagator = RSPropagator | ASMPropagator | FarFieldPropagator
 def make_propagator(
     source: PixelGrid, target: PixelGrid, optics: Optics, *, dtype: torch.dtype = torch.complex64
 ) -> Propagator:
-    """Make the propagator of waves from ``source`` to ``target`` in ``optics``.
+    """Make the propagator that carries waves from the grid ``source`` to the grid ``target``, as ``optics``
+    specifies.
 
     The propagation ``auto`` uses the Rayleigh-Sommerfeld sum if its sampled kernel is not aliased. At shorter
     distances, it uses the angular spectrum, whose period is then long enough without further padding.
     ``far-field`` uses the distance as the focal length of an ideal lens.
 
     Raises:
-        InputError: the distance is below the sampling limit and ``rayleigh-sommerfeld`` is requested, or the
-            pitches are unequal and the angular spectrum is used.
+        InputError: ``rayleigh-sommerfeld`` is requested at a distance below the sampling limit, or the
+            angular spectrum is used between grids of unequal pitch.
     """
     kind: type[Propagator] = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
     if optics.propagation == "far-field":

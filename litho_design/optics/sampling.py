@@ -27,8 +27,9 @@ def centred_grid(
 def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float) -> float:
     """Return the smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
 
-    Far from the axis, the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below the
-    Nyquist frequency of the source. Close to the axis, the evanescent replicas must have decayed.
+    At a distance x from the axis, the kernel oscillates with x / (wavelength r) cycles/µm. This must stay
+    below the Nyquist frequency of the source grid. Close to the axis, the evanescent waves in the copies of
+    the spectrum that sampling causes must have decayed.
     """
     limit = 0.0
     for axis in range(2):

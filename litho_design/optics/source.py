@@ -43,7 +43,7 @@ def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]
 def _colours(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
     if not optics.bandwidth_um:
         return [(1.0, optics)]
-    # A detail at the edge of the image moves by D / 2 times the relative change of the wavelength.
+    # If the wavelength changes, a detail at the edge of the image moves by D / 2 times the relative change.
     widths = optics.bandwidth_um * size_um**2 / (2 * optics.wavelength_um**2 * optics.distance_um)
     nodes, weights = np.polynomial.hermite_e.hermegauss(_checked(3 + 2 * math.ceil(2 * widths), "bandwidth"))
     return [
@@ -59,7 +59,7 @@ def _directions(optics: Optics, size_um: float) -> list[tuple[float, float]]:
     area = math.pi * (optics.source_sine * size_um / optics.wavelength_um) ** 2
     count = _checked(max(_FEWEST, math.ceil(_POINTS_PER_AREA * area)), "width")
     number = np.arange(count)
-    # The points lie on a sunflower spiral, so that all cover the same area.
+    # The directions lie on a sunflower spiral, so that each of them stands for the same area.
     disc = optics.source_sine * np.sqrt((number + 0.5) / count) * np.exp(1j * _GOLDEN_ANGLE * number)
     disc += complex(*middle) - disc.mean()
     return [(one.real, one.imag) for one in disc.tolist()]

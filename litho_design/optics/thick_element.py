@@ -38,7 +38,8 @@ def wave_through_relief(
 
     def carried(n: float, distance_um: float) -> Tensor:
         axial = torch.complex((n / wavelength_um) ** 2 - squared, torch.zeros_like(squared)).sqrt()
-        # Evanescent waves decay on the way forward, and are dropped on the way back.
+        # Evanescent waves decay when they propagate forward, and are dropped when the wave is propagated
+        # back.
         kept = torch.ones_like(squared) if distance_um > 0 else (axial.imag == 0).double()
         return (torch.exp(2j * math.pi * distance_um * axial) * kept).to(field.dtype)
 

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 
 class Optics(Record):
-    """Wavelength, refractive index step and distance to the output plane."""
+    """Settings of the light: its wavelength and source, the refractive index step of the element, and the
+    distance to the image plane.
+    """
 
     wavelength_um: float = setting(
         0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=SHORTEST_UM, lt=LONGEST_UM
@@ -107,18 +109,18 @@ def element_field(
 ) -> Tensor:
     """Return the wave just behind a phase element that is illuminated by a plane wave of unit power.
 
-    u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0 elsewhere.
-    If the optics have a Gaussian beam or a near point source, the wave also has the amplitude of the beam or
-    the phase of the source. The wave is scaled so that sum |u|^2 dy dx = 1. Intensities summed over any
-    window, times the pixel area, are therefore shares of the incident power. For a thick element in air,
-    ``wave_through_relief`` replaces the phase.
+    The wave is u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
+    elsewhere. If the optics have a Gaussian beam or a near point source, the wave also has the amplitude of
+    the beam or the phase of the source. The wave is scaled so that sum |u|^2 dy dx = 1. Intensities summed
+    over any window, times the pixel area, are therefore shares of the incident power. For a thick element in
+    air, ``wave_through_relief`` replaces the phase.
 
     Args:
         height_um: printed heights, µm, shape (..., ny, nx).
         grid: grid of the pixels of ``height_um``.
         aperture: amplitude transmission of the aperture in [0, 1], shape (ny, nx). By default, the whole grid
             is open.
-        pixels: number of pixels of the whole element, if ``grid`` is a part of it.
+        pixels: number of pixels of the whole element, if ``grid`` covers only a part of it.
 
     Returns:
         The complex wave, 1/µm, shape (..., ny, nx).

@@ -18,7 +18,7 @@ _KIB_PER_GIB = 1 << 20
 
 
 class Budget(Record):
-    """Cost of one iteration, measured on a trial iteration that changes nothing."""
+    """Time and memory of one iteration of the search, measured on a trial iteration that changes nothing."""
 
     seconds_per_iteration: float
     seconds_per_evaluation: float
@@ -65,7 +65,9 @@ def measure_budget(
 
 
 def peak_memory_gib(device: torch.device | None = None) -> float:
-    """Return the peak memory use so far: that of the device for CUDA, otherwise that of the process."""
+    """Return the peak memory use so far: on a CUDA device, that of the device; otherwise, that of the
+    process.
+    """
     if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB

@@ -79,7 +79,7 @@ class GumbelLevels(nn.Module):
     arXiv:1611.01144).
     """
 
-    # Factor on the learning rate. It is 1, because logits have no range.
+    # The learning rate is multiplied by this factor. It is 1, because logits have no range.
     rate_unit = 1.0
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -123,7 +123,7 @@ class GumbelLevels(nn.Module):
 
 
 class DirectLevels(nn.Module):
-    """One real level per cell, filtered if the layout has a cell filter.
+    """One real level per cell. The levels are filtered if the layout has a cell filter.
 
     A sample with ``hard=True`` has rounded levels, and the gradient passes straight through the rounding.
     """

@@ -93,8 +93,8 @@ class Draw:
         """Return the height, µm, of a print that is changed by this draw. The print is a map of shape
         (size, size), or rings of shape (n,) that begin at the centre.
 
-        A uniform offset changes the scores of heights, but no image. Rings are blurred only along the radius,
-        which is exact for rings far from the centre or much wider than the blur.
+        A uniform offset changes the scores of heights, but no image. Rings are blurred only along the radius.
+        This is accurate for rings that are far from the centre or much wider than the blur.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
@@ -142,7 +142,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    # The angular spectrum has no such limit, but an image plane behind the element must stay behind it.
+    # The angular spectrum has no sampling limit, but the image plane must stay behind the element.
     limit_um = min(lengths_um)
     if optics.propagation == "rayleigh-sommerfeld":
         limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
@@ -205,7 +205,7 @@ def measure_yield(
 
 
 def risk(losses: Tensor, tail: float) -> Tensor:
-    """Return the mean of the worst losses; ``tail`` is their share of all losses."""
+    """Return the mean of the worst losses. ``tail`` is the share of the losses that count as the worst."""
     worst = max(1, round(tail * losses.numel()))
     return losses.topk(worst).values.mean()
 
@@ -214,8 +214,8 @@ def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
     """Return the standard deviation, µm, between the prints that several models predict, as its rms over the
     area.
 
-    The result is differentiable. A constant height is only a constant phase, so the mean of every print is
-    subtracted first.
+    The result is differentiable. The mean of every print is subtracted first, because a constant height
+    causes only a constant phase.
 
     Args:
         heights_um: prints of one layout by k models, shape (k, ...).

@@ -51,8 +51,8 @@ class Ranks:
         return range(count * place // self.count, count * (place + 1) // self.count)
 
     def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
-        """Send ``parts[r]`` to process r and receive ``sizes[r]`` entries from it, for all r; return all
-        received entries as a flat tensor.
+        """Send ``parts[r]`` to each process r, and receive ``sizes[r]`` entries from it. Return all received
+        entries as a flat tensor.
 
         Args:
             parts: for each process, the tensor to send to it. All tensors have the same real or complex
@@ -83,7 +83,7 @@ class Ranks:
         return total
 
     def any(self, value: bool) -> bool:
-        """Return whether ``value`` is true in any process, after waiting for all of them."""
+        """Wait for all processes, and return True if ``value`` is true in any of them."""
         return bool(self.total(torch.tensor([float(value)])) > 0)
 
     def wait(self) -> None:

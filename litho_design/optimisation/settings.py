@@ -136,7 +136,7 @@ class DesignSettings(Record):
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
-    """Return settings for your own task, with changes by path, such as ``{"layout.size_px": 256}``.
+    """Return the settings for your own task, changed by ``changes``, such as ``{"layout.size_px": 256}``.
 
     Raises:
         InputError: a change names an unknown setting, or gives a setting a value that it does not accept.
@@ -149,7 +149,8 @@ def preset(presets: Callable[[Variant], S], variant: Variant, changes: Mapping[s
     argument ``variant``.
 
     Raises:
-        InputError: there is no such preset, or ``changed`` refuses a change.
+        InputError: there is no preset of this name, or a change names an unknown setting or a value that the
+            setting does not accept.
     """
     given = dict(changes or {})
     variant = given.pop("variant", variant)

@@ -1,1 +1,1 @@
-"""Layouts and what prints them: a frozen model, nominal heights, or the virtual fab."""
+"""Layouts and the printers that print them: frozen models, nominal heights, and the virtual fab."""

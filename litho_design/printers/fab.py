@@ -1,8 +1,8 @@
 """The virtual fab as a judge. It can print finished layouts, but it has no gradients, so no layout can be
 designed through it.
 
-The fab shares no code with the models and includes the effects that were hidden in their training prints. The
-fab therefore prints what the machine would have printed.
+The fab shares no code with the models. It includes the hidden effects with which their training prints were
+simulated, so it prints what the simulated machine would have printed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class FabSimulator(nn.Module):
     """
 
     name = "fab"
-    # The frame of level 0 is part of the print job.
+    # The reach is 0, because the print job itself adds the frame of level 0.
     reach_um = 0.0
 
     def __init__(self, truth: Truth):
@@ -73,13 +73,15 @@ class FabSimulator(nn.Module):
 
 
 def is_fab(source: str | Path) -> bool:
-    """Return whether ``source`` is a truth file of ``litho-data simulate``, or a folder with one."""
+    """Return True if ``source`` is a truth file written by ``litho-data simulate``, or a folder that contains
+    one.
+    """
     path = Path(source)
     return path.name == Truth.FILE_NAME or (path / Truth.FILE_NAME).is_file()
 
 
 def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
-    """Load the fab of a truth file.
+    """Load the virtual fab that a truth file describes.
 
     Raises:
         InputError: there is no truth file, the layout differs from the fab in pitch or level height, or the

@@ -1,4 +1,4 @@
-"""A printer for one element, which turns layout levels into printed heights."""
+"""A printer for one element, which turns the levels of a layout into printed heights."""
 
 from __future__ import annotations
 
@@ -87,12 +87,12 @@ class Printer(nn.Module):
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """Return the card of the model; without a model, it is empty."""
+        """Return the card of the model, or an empty mapping if the heights are nominal."""
         return getattr(self.simulator, "card", {})
 
     @property
     def only_judges(self) -> bool:
-        """Return whether the printer has no gradients, so that no layout can be searched through it."""
+        """Return True if the printer has no gradients, so that no layout can be searched through it."""
         return isinstance(self.simulator, FabSimulator)
 
     @property
@@ -104,7 +104,7 @@ class Printer(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Return the device of the model or, without a model, the device of the waves."""
+        """Return the device of the model. If the heights are nominal, this is the device of the waves."""
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
@@ -228,7 +228,7 @@ class Printer(nn.Module):
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
         """Print the nominal heights ``height_um``, and cut the outer ``border_px`` pixels off the print."""
-        # A frozen model computes only as much of the border as the inner part needs.
+        # A frozen model has a method that computes only as much of the border as the inner part needs.
         inside: Callable[..., Tensor] | None = getattr(self.simulator, "inside", None)
         if inside is not None:
             return inside(height_um, border_px, pitch_um=self.layout.pitch_um)

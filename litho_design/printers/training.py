@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 _FLAG_DISTANCE = 0.5
 # This limit is a tenth of all pairs of neighbours, because a few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
-# A level or step may be this many times as frequent as in the training layouts, or more frequent by this
-# share.
+# A level or step is unusual if its share exceeds its share in the training layouts both by this factor and by
+# this difference.
 ALLOWED_TIMES = 2.0
 _ALLOWED_SHARE = 0.005
 
@@ -78,8 +78,8 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """Return, in levels, by how much the tails of a layout's histograms exceed twice those of training
-    layouts.
+    """Return by how much the tails of a layout's histograms of levels and steps exceed twice those of the
+    training layouts. The result is in levels.
 
     For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
     neighbours with steps of k or more. A share may be up to twice the corresponding share of the training
@@ -106,8 +106,8 @@ def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
 
 
 def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
-    """Return a histogram from a model's card, with at least ``levels`` values and sum 1; None if the card has
-    none.
+    """Return a histogram from a model's card, scaled to a sum of 1 and extended to at least ``levels``
+    values. Return None if the card does not contain it.
     """
     trained = np.asarray(card.get(name) or [], dtype=float)
     if trained.size == 0:

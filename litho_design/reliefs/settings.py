@@ -11,14 +11,17 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ReliefSettings(DesignSettings):
-    """All settings of one relief; wavelength and distance affect only the stroke in the report."""
+    """All settings of one relief. The wavelength and the distance affect only the stroke that the report
+    states.
+    """
 
     layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
     search: SearchSettings = setting(
         SearchSettings(start="inverse", iterations=60, learning_rate=0.3, polish_rounds=150),
         "Search",
     )
-    # The expected error already contains the disagreement of the models.
+    # The weight is 0, because the loss of a relief, an expected error, already contains the disagreement of
+    # the models.
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(weight=0), "Several models")
     height_um: float = setting(
         0.6,
@@ -36,7 +39,7 @@ class ReliefSettings(DesignSettings):
 
 
 def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:
-    """Return the settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
+    """Return the settings of a relief, changed by ``changes``, such as ``{"layout.size_px": 512}``.
 
     Raises:
         InputError: a change names an unknown setting, or gives a setting a value that it does not accept.

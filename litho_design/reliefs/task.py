@@ -43,7 +43,7 @@ class ReliefScore(Record):
 
 
 class _Bare(nn.Module):
-    """The bench of a relief, which returns the relief itself."""
+    """The bench of a relief. It returns the heights of a print unchanged, because a relief has no light."""
 
     def __init__(self, layout: LayoutSettings):
         super().__init__()
@@ -87,7 +87,7 @@ class ReliefTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # If the model prints this height, the printer is expected to print the target.
+        # The height map that the model has to print. The real print is then expected to match the target.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
@@ -104,7 +104,7 @@ class ReliefTask(Task):
         return _Bare(self.settings.layout).to(self.printer.device)
 
     def loss(self, seen: Tensor) -> Tensor:
-        """Return the rms error after the mean is removed, µm."""
+        """Return the rms error of a print after the mean error is removed, µm."""
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
@@ -120,7 +120,7 @@ class ReliefTask(Task):
         return losses.square().mean().sqrt()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors of the print, nm."""
+        """Return the errors of a print in nm, compared with the target."""
         error = 1000 * (seen - self.target).double()
         free = (error - error.mean()).abs()
         return {
@@ -131,13 +131,14 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors without the offset, because the zero is free and must not decide whether a print
-        passes.
+        """Return the errors of a print without the offset. The zero of a print is free, so it must not decide
+        whether the print passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the starting levels with the lowest expected loss.
+        """Return the level of each cell for the start of the search, namely the candidate with the lowest
+        expected loss.
 
         The candidates are levels whose uniform fields print the target heights, and the best affine levels.
         """

@@ -40,7 +40,8 @@ _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("mae_calibrated", "MAE {} with the print's own PSF", 4),
 )
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
-# Reflection alone causes a loss of 4.6 %.
+# A warning is given if the thick element loses more than this share of the efficiency. Reflection alone
+# causes a loss of 4.6 %.
 _THICK_SHARE = 0.1
 # Below this share of the training pixels, a model has hardly been trained on the lowest and highest level.
 _SEEN_SHARE = 0.02

@@ -94,7 +94,7 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
 
 
 def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
-    """Return the mean and confidence interval of a figure under a judge, by arm."""
+    """Return a dict from each arm to the mean and the confidence interval of a figure under one judge."""
     return {one.arm: one for one in result.summary if (one.judge, one.figure) == (judge, figure)}
 
 

@@ -113,7 +113,7 @@ def yield_figure(
     Args:
         draws: for each print, a mapping from the name of a figure to its value.
         figures: for each figure to draw, its value for the print as modelled and its label.
-        falling: figures that are better when lower.
+        falling: names of the figures that are better when lower.
     """
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)

@@ -28,7 +28,8 @@ class ElementBench(nn.Module):
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.parts = coherent_parts(optics, layout.size_um)
         colours = {optics.wavelength_um: optics} | {part.wavelength_um: part for _, part in self.parts}
-        # Neither the direction of light nor the resin changes the propagation behind the element.
+        # One propagator per wavelength is enough, because neither the direction of the light nor the resin
+        # changes the propagation behind the element.
         self.carried = nn.ModuleDict(
             {_key(um): make_propagator(self.grid, self.grid, one, dtype=dtype) for um, one in colours.items()}
         )

@@ -36,7 +36,9 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device and duration of a run, including earlier, interrupted runs."""
+    """Command, software, device and duration of a run. The duration includes earlier runs that were
+    interrupted.
+    """
 
     device: str
     threads: int

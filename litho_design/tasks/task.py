@@ -107,7 +107,7 @@ class Task:
         self.inputs = dict(inputs or {})
         self.target_record = record
         self.notes: list[str] = []
-        # Models of the printer that the search does not use.
+        # Further models of the printer, which judge the design but are not used by the search.
         self.judges: Sequence[Printer] = ()
         for one in self.printers:
             self.check_printer(one)
@@ -126,7 +126,7 @@ class Task:
         return [optics]
 
     def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
-        """Return the loss of the light behind the print.
+        """Return the loss of ``seen``, which is the light behind a print.
 
         By default, ``seen`` is the share of the incident power on each pixel of each image, shape
         (views, size, size).
@@ -374,7 +374,7 @@ class Task:
         """Return the loss of ``seen``, which is the light behind the print of ``printer``, and the parts of
         this loss.
 
-        By default, the result is that of ``loss``.
+        By default, the result is that of ``loss`` and does not depend on ``printer``.
         """
         found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})

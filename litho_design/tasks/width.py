@@ -25,8 +25,8 @@ class Width(Record):
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
         figure: name of the first headline figure of the task.
         less: True if this figure is better when lower.
-        loss_unit: factor that converts the loss to the unit of the figure, if the loss is an error that
-            includes the model's own error; otherwise None.
+        loss_unit: factor that converts the loss to the unit of the figure. It is None, unless the loss is an
+            error that includes the model's own error.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 

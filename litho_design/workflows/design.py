@@ -1,4 +1,4 @@
-"""Design an element through a frozen model of the printer, and write the folder of the design."""
+"""Design an element through a frozen model of the printer, and write the result into a folder."""
 
 from __future__ import annotations
 
@@ -115,7 +115,8 @@ def design_lens(
     tile_px: int | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout of a lens so that its print focuses light, or images objects after reconstruction.
+    """Optimise the layout of a lens so that its print focuses light (direct task), or so that images of
+    objects can be reconstructed behind it (computational task).
 
     Args:
         model: as for ``design_hologram``.
@@ -134,8 +135,9 @@ def design_lens(
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: as for ``design_hologram``; or the search is radial but the layout has no rings or the
-            aperture is square; or the objects are not pictures.
+        InputError: the model or the folder is rejected for the reasons that ``design_hologram`` lists; the
+            search is radial, but the layout has no rings or the aperture is square; or the objects are not
+            pictures.
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
     if tile_px is not None:
@@ -174,13 +176,13 @@ def correct(
         how: see ``How``; ``robust`` is True by default.
 
     Returns:
-        The record written to ``out/design.json``; the part of the relief
-        that no layout can print is in ``unprintable_um.npy``.
+        The record written to ``out/design.json``. The file ``unprintable_um.npy`` contains the part of the
+        relief that no layout can print.
 
     Raises:
-        InputError: ``load_relief`` refuses the relief; the model or the folder is refused as in
-            ``design_hologram``; only one of ``after`` and ``scan`` is given; the size, pitch or levels of the
-            first element differ from those in ``settings``; or the scan shows another element.
+        InputError: ``load_relief`` rejects the relief; the model or the folder is rejected for the reasons
+            that ``design_hologram`` lists; only one of ``after`` and ``scan`` is given; the size, pitch or
+            levels of the first element differ from those in ``settings``; or the scan shows another element.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
@@ -239,8 +241,8 @@ def design(
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: the task is not registered, or the model or the folder is refused as in
-            ``design_hologram``.
+        InputError: the task is not registered, or the model or the folder is rejected for the reasons that
+            ``design_hologram`` lists.
     """
     if isinstance(task, str):
         hint = "for holograms, lenses and reliefs, use design_hologram, design_lens and correct"

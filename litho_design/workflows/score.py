@@ -32,22 +32,22 @@ def score(
 ) -> ScoreResult:
     """Score the layout of a design with every judge, and write ``score.json`` and a report.
 
-    A lens of rings (``lens --large``) is printed and scored along its radius.
+    For a lens in rings (``lens --large``), print and score are computed along its radius.
 
     Args:
         design: the folder of a design, or a design from ``load_design``.
         out: folder of the score.
         judges: loaded printers, or texts of the form NAME=MODEL, MODEL or ``none``; MODEL may be the folder
-            ``truth`` of a virtual fab. Judges with the weights of the design's own model are marked as not
-            independent. If there is no judge, scan or photograph, the judges are the zoo's models that were
-            trained on the same prints.
+            ``truth`` of a virtual fab. Judges with the same weights as the model of the design are marked as
+            not independent. If there is no judge, scan or photograph, the judges are the zoo's models that
+            were trained on the same prints.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
             ``scan`` is also given, the photograph of an object is deconvolved with the PSF of the measured
             print too.
         element: ``thin``, or ``thick`` to compute the light behind every print by the wave propagation
             method. By default, the kind that the design states. Ignored if ``design`` is already loaded.
-        band_px: print and score a large hologram in bands of at most this many rows.
+        band_px: if given, a large hologram is printed and scored in bands of at most this many rows.
         device: where prints and waves are computed; ignored if ``design`` is already loaded.
         extrapolate: accept heights beyond the range for which a judge was calibrated; the result records this
             choice.
