@@ -13,9 +13,9 @@ card = litho_data.simulate("campaign", count=6, size_px=160, seed=3)
 print(card)
 
 # %% [markdown]
-# `card.toml` says which files are scans, which layout belongs to each, and what the files do not state:
-# pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, and with an unknown zero.
-# Read one:
+# `card.toml` states which files are scans and which layout belongs to each. It also states what the files
+# do not: pitch, level height, units. The scans are raw: tilted, bowed, slightly rotated, and with an
+# unknown zero. Read one:
 
 # %%
 scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
@@ -32,8 +32,8 @@ print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
 
 # %% [markdown]
 # The quality table shows how well each scan fits its layout. `ncc_after` is the correlation of height and
-# layout after registration. `tre_median_nm` is the median distance between matching details that the fit did
-# not use ([good values](../registration.md)).
+# layout after registration. `tre_median_nm` is the median distance between matching details of scan and
+# layout that the fit did not use ([good values](../registration.md)).
 
 # %%
 store = litho_data.open_store("prints.zarr")

@@ -2,8 +2,8 @@
 # # Twelve pictures, ten lines each
 #
 # The code above each picture draws it. Run all the code once, from top to bottom. The first cell simulates
-# four prints and defines a function that shows maps, all about 16 µm wide. For real prints, see [your own
-# scans](../own_data.md).
+# four prints and defines a function that shows maps. All maps are about 16 µm wide. For real prints, see
+# [your own scans](../own_data.md).
 
 # %%
 import litho_data
@@ -110,14 +110,14 @@ prints = {name: model(layout_um)[0, 0].numpy() for name, model in models.items()
 show(prints, vmin=0, vmax=1.2)
 
 # %% [markdown]
-# ## 8. What a model misses: [residuals](../evaluation.md) of models of another printer, in nm
+# ## 8. What a model misses: [residuals](../evaluation.md) of models trained on another printer, in nm
 
 # %%
 missed = {name: first.height_um - own for name, own in prints.items()}
 show({name: 1e3 * (one - np.nanmedian(one)) for name, one in missed.items()}, "RdBu_r", vmin=-150, vmax=150)
 
 # %% [markdown]
-# ## 9. What could be the cause: [knobs of the virtual fab](../virtual_fab.md), each alone, in nm
+# ## 9. What could be the cause: changes by single [knobs of the virtual fab](../virtual_fab.md), in nm
 
 # %%
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
@@ -146,7 +146,7 @@ printed_um = design.printed_um(litho_design.load_printer("zoo:physics", settings
 show({"levels": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
 
 # %% [markdown]
-# ## 11. A lens [in a program of your own](../element.md): a focus at 20 µm, from the wave behind its print
+# ## 11. A lens [in a program of your own](../element.md): its focus at 20 µm, computed from the wave behind its print
 
 # %%
 element = litho_design.Element("zoo:physics", {"size_px": 160, "cell_um": 0.1})

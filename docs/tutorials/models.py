@@ -24,7 +24,8 @@ for scores in result.scores:
     print(f"{scores.model:8} {scores.mae_datum_free_nm:6.2f} nm   95 % over scans {low:.2f} … {high:.2f}")
 
 # %% [markdown]
-# Models may differ even if their intervals overlap, because the test compares them scan by scan.
+# Two models may differ significantly even if the intervals of their errors overlap, because the test
+# compares the models scan by scan.
 
 # %%
 for pair in result.paired:

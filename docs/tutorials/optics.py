@@ -47,9 +47,9 @@ for axes, (title, image) in zip(figure.subplots(1, 3), images.items(), strict=Tr
 figure
 
 # %% [markdown]
-# Both images are predictions. What counts is a measurement: `litho_design.score` accepts a photograph of the
-# image or an AFM scan of the print in place of the model. To print the element, export the layout as an image
-# of levels. A sidecar states heights and size, so that the image can be read back.
+# Both images are predictions. What counts is a measurement: `litho_design.score` accepts a photograph of
+# the image or an AFM scan of the print in place of the model. To print the element, export the layout as an
+# image of levels. A second file, the sidecar, states heights and size, so that the image can be read back.
 
 # %%
 print(litho_design.export("with", "png16", "to-printer").name)
