@@ -146,7 +146,7 @@ printed_um = design.printed_um(litho_design.load_printer("zoo:physics", settings
 show({"levels": design.level, "print, µm": printed_um, "image": design.display(design.image(printed_um))})
 
 # %% [markdown]
-# ## 11. A lens [in a program of your own](../element.md): its focus at 20 µm, computed from the wave behind its print
+# ## 11. A lens [in a program of your own](../element.md): its focus at 20 µm, from the wave behind its print
 
 # %%
 element = litho_design.Element("zoo:physics", {"size_px": 160, "cell_um": 0.1})
