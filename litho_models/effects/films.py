@@ -9,17 +9,25 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
+from litho_data.foundation import Array
 from litho_models.effects.effect import FieldContext, Parameter, Values, entry
-from litho_models.effects.filters import add_blur, add_warp, gradient
-from litho_models.models.parts import FLATTEST, etch
+from litho_models.effects.filters import add_blur, add_warp
+from litho_models.models.parts import etch
 
 # Standard deviations of the blur that defines the normals of a film's edges and of the blur that locates a
 # sharp rim, and the range of a diffusion.
-_NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 3.0, 1.6, 50.0
+_NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 1.0, 1.6, 50.0
+# Along a straight edge, no place is farther than this from the next crossing with the grid of pixels.
+_BESIDE_PX = 0.75
+# A film is flat farther than this from its edges.
+_FLAT_PX = 1.7
 
 _of_films = partial(entry, role="process", of_films=True)
 
@@ -110,11 +118,60 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
-    """Move edges along their normals: each pixel takes the value that the film has ``outwards_px`` further
-    inwards.
+    """Move edges along their normals. Films or gaps that are narrower than twice the shift vanish."""
+    share = height[0, 0].detach() / context.full_height_um
+    reach_px = float(outwards_px.detach().abs().max()) + _FLAT_PX + 1
+    distance, normal = map(torch.from_numpy, _from_edge(share.double().numpy(), reach_px))
+    distance, normal = distance.to(height), normal.to(height)
+    wanted = distance + outwards_px
+    # Beyond its rim a film is flat. The value of a pixel there is taken from no farther than needed, because
+    # there may be another edge.
+    most = torch.where(wanted * distance > 0, distance.abs().clamp(min=_FLAT_PX), _FLAT_PX)
+    flat, farthest = (wanted.abs() - _FLAT_PX).clamp(0, 1), torch.sign(wanted) * most
+    # Without a shift both limits are met. The derivative there is that of a shift outwards.
+    nearer = wanted.clamp(min=-most)
+    nearer = torch.where(nearer < most, nearer, most)
+    inwards = torch.where(distance.isfinite(), nearer + flat * (farthest - nearer) - distance, 0.0)
+    return add_warp(height, inwards * normal[0], inwards * normal[1], 1.0)
+
+
+def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
+    """Return the distance of each pixel from the nearest edge of a film, of shape (ny, nx), in px, positive
+    on the film, and the unit vector along which it grows, of shape (2, ny, nx). Farther than ``reach_px``,
+    the distance is infinite and the vector is zero.
+
+    Args:
+        share: fraction of each pixel that the film covers, of shape (ny, nx). Edges are where it is one half.
     """
-    normal = add_blur(height, height.new_tensor(_NORMAL_PX**2), 1.0, 5 * _NORMAL_PX)
-    along_y, along_x = (slope[0, 0] for slope in gradient(normal, 1.0))
-    steepness = torch.sqrt(along_y**2 + along_x**2 + (FLATTEST * context.full_height_um) ** 2)
-    share = outwards_px / steepness
-    return add_warp(height, share * along_y, share * along_x, 1.0)
+    points, normals = _crossings(share)
+    distance, normal = np.full(share.shape, np.inf), np.zeros((2, *share.shape))
+    if not len(points):
+        return distance, normal
+    pixels = np.moveaxis(np.indices(share.shape, float), 0, -1)
+    away_px, nearest = cKDTree(points).query(pixels, distance_upper_bound=reach_px)
+    near = nearest < len(points)
+    away, along = (pixels - points[nearest * near])[near], normals[nearest[near]]
+    inwards = (away * along).sum(-1)
+    # At a corner, the nearest point of the edge does not lie on the normal through the pixel.
+    corner = np.linalg.norm(away - inwards[:, None] * along, axis=-1) > _BESIDE_PX
+    signed = np.where(share[near] > 0.5, 1, -1) * away_px[near].clip(1e-9)
+    distance[near] = np.where(corner, signed, inwards)
+    normal[:, near] = np.where(corner, away.T / signed, along.T)
+    return distance, normal
+
+
+def _crossings(share: Array) -> tuple[Array, Array]:
+    """Return the points, of shape (n, 2), in px, at which the edges of a film cross the lines of the grid of
+    pixels, and the unit normals there, which point to the film.
+    """
+    slopes = np.stack(np.gradient(gaussian_filter(share, _NORMAL_PX)), -1)
+    points, normals = [], []
+    for axis in (0, 1):
+        lower, upper = (np.take(share, range(i, share.shape[axis] - 1 + i), axis) for i in (0, 1))
+        at = np.argwhere((lower > 0.5) != (upper > 0.5))
+        next_to = at + np.eye(2, dtype=int)[axis]
+        first, second = share[tuple(at.T)], share[tuple(next_to.T)]
+        points.append(at + ((0.5 - first) / (second - first))[:, None] * (next_to - at))
+        slope = slopes[tuple(at.T)] + slopes[tuple(next_to.T)]
+        normals.append(slope / np.linalg.norm(slope, axis=-1, keepdims=True).clip(1e-12))
+    return np.concatenate(points), np.concatenate(normals)
