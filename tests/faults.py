@@ -126,7 +126,7 @@ FAULTS = [
           "learn_background(fold.training, own)",
           "learn_background([*fold.training, *fold.held_out], [*own, *held_out])",
           "tests/litho_models/test_benchmark.py -k moves_what"),
-    Fault("shared terms learned from the scan itself", "litho_models/loop/measured.py",
+    Fault("shared terms learned from the scan itself", "litho_models/loop/closing.py",
           "for own, held_out in study.folds:", "for own, held_out in [(list(range(len(scans))),) * 2]:",
           f"{RUN} -k others_say"),
     Fault("a choice made with the print that is judged", "litho_models/loop/run.py",

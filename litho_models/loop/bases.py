@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import nn
 
+from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
+from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 from litho_models.fitting import TrainingConfig, fit_in_cache
 from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
 from litho_models.loop.fits import Study
-from litho_models.loop.folded_base import train_folds
+from litho_models.loop.model import FoldedBase
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
+# A function that trains a model; it is sent to other processes.
+Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 # Base models that compete by default. The first has the same form as the paper's Physics model.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
@@ -84,3 +89,21 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
         wanted = f"{pitch_um:g} µm, the pitch of the scans"
         raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=wanted)
     return {card.name: load_simulator(folder, card)}
+
+
+def train_folds(
+    scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
+) -> FoldedBase:
+    """Train one model per fold on the scans outside the fold, and one model on all scans."""
+    fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
+    # The last model is trained on all scans.
+    last = max(fold.values()) + 1
+    jobs = [(out, trainer, [one for one in scans if fold[one.id] != out]) for out in range(last + 1)]
+    done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")
+    trained = {out: model for (out, *_), model in progress(done, "training the base model", len(jobs))}
+    return FoldedBase([trained[out] for out in range(last)], fold, trained[last])
+
+
+def _train(job: tuple[int, Trainer, Sequence[PrintedScan]]) -> nn.Module:
+    _, trainer, scans = job
+    return trainer(scans)

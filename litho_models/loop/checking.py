@@ -18,9 +18,8 @@ from litho_models.effects import Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state, without_terms
 from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.screening import WORTH_FITTING, Screened, Screening
+from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Secants
 from litho_models.loop.search import Cause, describe, with_table
-from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
 # A name is refused if variants of the cause's change would add more than this share to its gain. In trials on
@@ -72,10 +71,10 @@ class Check:
             reason = f"it may merely correct an error in the formula of {larger}"
         elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
             reason = f"with {', '.join(self.laws_in)} in the model, its gain falls to less than half"
-        elif outgrown := self.state.twin.outgrows(cause.name):
-            reason = f"its best-fitting length is outside the range of this effect: {', '.join(outgrown)}"
-        elif share > FORM_SHARE and (exhausted := self.state.twin.exhausts(cause.name)):
-            reason = f"its best-fitting strength exceeds the largest possible value: {', '.join(exhausted)}"
+        elif outgrown := self.state.twin.at_limits(cause.name, "shape"):
+            reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
+        elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
+            reason = f"its best-fitting strength exceeds the largest possible value: {exhausted}"
         # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
         # that is small relative to the unexplained error therefore proves nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:

@@ -17,6 +17,7 @@ from functools import cache
 from torch import nn
 
 from litho_data.commands.progress import estimate
+from litho_data.store import PrintedScan
 from litho_models.effects import get_effect, screened_effects
 from litho_models.effects.films import FILM_LAWS
 from litho_models.effects.laws import LAWS, TABLES
@@ -24,12 +25,12 @@ from litho_models.loop.checking import Check
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import SMALLEST_SHARE, judge_states
 from litho_models.loop.learner import Learner, Rest
-from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
-from litho_models.loop.trials import Secants
 from litho_models.scan_terms.grouped import ALL
+from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # Duration of a loop divided by that of its first fits. In four datasets this ratio was between 11 and 33.
 _OVER_FIRST_FITS = 20
@@ -151,6 +152,26 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         rests={name: rest(state) for state, name in stages.items()},
         untestable=excluded,
     )
+
+
+def freed_scans(state: State) -> list[PrintedScan]:
+    """Subtract from each scan the measurement errors that the scans of its group share.
+
+    An error that all scans share is not subtracted, because a cause may explain it. The subtracted part is
+    learned from scans outside the scan's fold.
+    """
+    study = state.study
+    maps = state.maps_um(study.scans)
+    scans = [scan.stored for scan in study.scans]
+    freed = list(scans)
+    for own, held_out in study.folds:
+        if len(own) < 2:
+            continue
+        learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
+        differences = learned.between_groups()
+        for i in held_out:
+            freed[i] = differences.freed(scans[i], maps[i])
+    return freed
 
 
 def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:

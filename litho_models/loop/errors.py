@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
+from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import State
-from litho_models.loop.measured import Fit, fit_with_measurement
+from litho_models.loop.fits import RULES, State, TwinProblem
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
 from litho_models.scan_terms import Blocks, Policy
 from litho_models.scan_terms.background import learn_background
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.measurement_fit import learn_measurement
 from litho_models.scoring.noise_floor import freed_by_policy
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.shapes import edges_of_scan
@@ -26,6 +28,43 @@ from litho_models.scoring.statistics import interval
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 Maps = list[np.ndarray]
+
+
+class Fit(NamedTuple):
+    """A printer and a measurement model fitted to the same scans."""
+
+    twin: Twin
+    measurement: MeasurementModel
+
+    @property
+    def numbers(self) -> tuple[int, int]:
+        """Return the numbers of fitted parameters of the printer and of the measurement."""
+        return len(self.twin.vector), self.measurement.numbers
+
+    def expected_um(self, scan: PreparedScan) -> np.ndarray:
+        """Return the map (y, x) that a scan is expected to show."""
+        return self.measurement.expected_um(scan.stored, self.twin.height(scan))
+
+
+def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
+    """Fit the measurement model, then the printer, and then the strengths of the measurement model again, all
+    to the same scans.
+
+    Args:
+        twin: starting model for the fit of the printer.
+        scans: original scans.
+        refit: whether to fit the printer again once the measurement model is known.
+    """
+    stored = [scan.stored for scan in scans]
+    maps = [twin.height(scan) for scan in scans]
+    measurement = learn_measurement(stored, maps, seed=seed)
+    if refit and len(twin.vector):
+        freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
+        windows = [scan.window for scan in prepared_among(freed, scans)]
+        twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        maps = [twin.height(scan) for scan in scans]
+        measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
+    return Fit(twin, measurement)
 
 
 def error_rows(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,9 +14,9 @@ from torch.nn.utils import vector_to_parameters
 
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Fields, Frame
+from litho_models.effects.effect import Kind
 from litho_models.effects.registry import in_forward_order
 from litho_models.fitting.small_models import parameter_room
-from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
@@ -24,6 +24,31 @@ from litho_models.simulator import Simulator, is_small
 Values = Mapping[str, Mapping[str, float]]
 # Relative distance from a bound below which a fitted value counts as on the bound.
 _AT_BOUND = 1e-6
+
+
+class FoldedBase(nn.Module):
+    """One trained model per fold; each scan is predicted by the model that was trained without it.
+
+    Args:
+        models: one per fold; ``fold_of``: fold of each scan id; ``common``: model for scans in no fold.
+    """
+
+    def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
+        super().__init__()
+        self.models = nn.ModuleList(models)
+        self.common = common
+        self.fold_of = dict(fold_of)
+        # Weights stay as trained, because freezing would change their rounding.
+        self.eval()
+
+    def of_fold(self, fold: int) -> nn.Module:
+        """Return the model trained without this fold."""
+        return self.models[fold]
+
+    def of_scan(self, scan_id: str) -> nn.Module:
+        """Return the model trained without this scan."""
+        fold = self.fold_of.get(scan_id)
+        return self.common if fold is None else self.models[fold]
 
 
 @dataclass(frozen=True)
@@ -77,9 +102,6 @@ class Twin:
     numbers: np.ndarray
     effects: Mapping[str, Added] = field(default_factory=dict)
     frames: Mapping[str, Frame] = field(default_factory=dict)
-    _chains: dict[tuple[str, ...], EffectChain] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
 
     @classmethod
     def bare(cls, base: nn.Module) -> Twin:
@@ -119,9 +141,9 @@ class Twin:
         """Return the same twin with other parameters."""
         values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
         for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
-            for label, own in values[slot.effect].items():
-                if slot.label in (None, label):
-                    own[slot.parameter] = number
+            own = values[slot.effect]
+            for label in own if slot.label is None else [slot.label]:
+                own[label][slot.parameter] = number
         effects = {name: replace(one, values=values[name]) for name, one in self.effects.items()}
         return replace(self, numbers=vector[: self.own], effects=effects)
 
@@ -134,23 +156,15 @@ class Twin:
         """Add an effect with starting values by label (``""`` for all scans)."""
         return replace(self, effects={**self.effects, name: Added(by, values)})
 
-    def only(self, names: Collection[str]) -> Twin:
-        """Keep only these effects."""
-        return replace(self, effects={name: one for name, one in self.effects.items() if name in names})
-
     def without(self, name: str) -> Twin:
         """Remove one effect."""
-        return self.only({*self.effects} - {name})
-
-    def alone(self) -> Twin:
-        """Remove all effects."""
-        return self.only(())
+        return replace(self, effects={other: one for other, one in self.effects.items() if other != name})
 
     def ungrouped(self) -> Twin:
         """Replace the strengths of groups by their mean, and sort parameters in the order in which effects
         act.
         """
-        effects = {name: Added(ALL, {"": values}) for name, values in self.values({}).items()}
+        effects = {name: Added(ALL, {"": values}) for name, values in self.values().items()}
         return replace(self, effects=effects)
 
     def with_base_unfitted(self) -> Twin:
@@ -159,15 +173,11 @@ class Twin:
             return self
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
-    def values(self, label_in: Mapping[str, str]) -> dict[str, dict[str, float]]:
+    def values(self, label_in: Mapping[str, str] = {}) -> dict[str, dict[str, float]]:
         """Return the parameter values of all effects, in the order in which they act, for scans with these
-        labels.
+        labels; without labels, return mean strengths.
         """
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
-
-    def labels(self, scan: PreparedScan) -> dict[str, str]:
-        """Return the scan's label in every grouping that is used."""
-        return {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
         """Return whether a parameter applies to this scan: it belongs to the scan's group or to all scans."""
@@ -201,15 +211,8 @@ class Twin:
         """Return the chain of effects for one scan or, without a scan, with mean strengths; ``extra`` is a
         further effect to try.
         """
-        labels = {} if scan is None else self.labels(scan)
-        key = tuple(labels.values())
-        if extra or key not in self._chains:
-            values = {**self.values(labels), **(extra or {})}
-            chain = EffectChain(self.fitted_base, values, frames=self.frames)
-            if extra:
-                return chain
-            self._chains[key] = chain
-        return self._chains[key]
+        labels = {one.by: label_of(scan.stored, one.by) for one in self.effects.values()} if scan else {}
+        return EffectChain(self.fitted_base, {**self.values(labels), **(extra or {})}, self.frames)
 
     @torch.no_grad()
     def height(
@@ -251,12 +254,10 @@ class Twin:
 
     def _ranges(self) -> np.ndarray:
         """Return the lower bound, upper bound and usual size of each effect parameter, (3, slots)."""
-        facts = [slot.facts for slot in self.slots]
-        nulls = [one.null if one.kind == "amplitude" else 0.0 for one in facts]
         known = [
             # A parameter that is usually zero, such as an angle, gets a tenth of its range as its usual size.
-            (one.lower, one.upper, abs(one.typical - null) or 0.1 * (one.upper - one.lower))
-            for one, null in zip(facts, nulls, strict=True)
+            (one.lower, one.upper, abs(one.typical - one.null) or 0.1 * (one.upper - one.lower))
+            for one in (slot.facts for slot in self.slots)
         ]
         return np.array(known).reshape(-1, 3).T
 
@@ -271,19 +272,17 @@ class Twin:
         found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
-    def exhausts(self, name: str) -> list[str]:
-        """Return the amplitudes of an effect that lie on a limit of their range in some group. The null does
-        not count as a limit.
+    def at_limits(self, name: str, kind: Kind) -> str:
+        """Return the amplitudes of an effect that lie on a limit of their range in some group, or its fitted
+        lengths (``shape``), such as ranges and depths. The null of an amplitude does not count as a limit.
         """
-        return self._at_limits(name, lambda one, at: one.kind == "amplitude" and at != one.null)
-
-    def outgrows(self, name: str) -> list[str]:
-        """Return the fitted lengths of an effect, such as ranges and depths, that reach a limit."""
-        return self._at_limits(name, lambda one, at: one.kind == "shape" and one.is_length)
-
-    def _at_limits(self, name: str, counts: Callable[[Parameter, float], bool]) -> list[str]:
-        own = [(slot, bound) for slot, bound in self._on_bounds() if slot.effect == name]
-        return [*dict.fromkeys(slot.parameter for slot, bound in own if counts(slot.facts, bound))]
+        own = ((one.parameter, one.facts, bound) for one, bound in self._on_bounds() if one.effect == name)
+        counted = (
+            parameter
+            for parameter, facts, bound in own
+            if facts.kind == kind and (bound != facts.null if kind == "amplitude" else facts.is_length)
+        )
+        return ", ".join(dict.fromkeys(counted))
 
     def _on_bounds(self) -> list[tuple[Slot, float]]:
         return [

@@ -60,7 +60,7 @@ def plant(
     again = close_again(changed)
     cause = next((one for one in again.named.causes if effect.name in (one.name, *one.alike)), None)
     named = [] if cause is None else [cause.name, *cause.alike]
-    found = again.final.twin.values({}).get(effect.name, {}).get(amplitude)
+    found = again.final.twin.values().get(effect.name, {}).get(amplitude)
     return Planted(
         name=effect.name,
         amount=amount,

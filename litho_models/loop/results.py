@@ -154,7 +154,7 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
     fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), reach[twin.own :].tolist(), strict=True)
     numbers = [(one.parameter, one.label or "", *own) for one, *own in fitted if one.effect == name]
-    facts, values = get_effect(name).parameters, twin.values({})[name]
+    facts, values = get_effect(name).parameters, twin.values()[name]
     numbers += [(key, "", value, 0.0) for key, value in values.items() if facts[key].kind == "choice"]
     found = dict[str, list[Strength]]()
     for key, label, value, half in numbers:

@@ -14,23 +14,27 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
+from litho_data.reports.page import filled
 from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.effects import get_effect
+from litho_models.fitting.runs import level_share, step_share
+from litho_models.frozen.files import save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, errors_of_others
 from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
-from litho_models.loop.model import is_refitted
+from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, ErrorRow, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
-from litho_models.loop.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
 from litho_models.loop.single_scans import SingleScans
+from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
-QUESTIONS_FILE = "open_questions.json"
+MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
 Nested = Literal["folds", "prints"]
 # A function that maps a closed loop and its record to the record to write, and to further records.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
@@ -201,3 +205,55 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
         return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
     except InputError:
         return None
+
+
+def save_laws(result: CloseLoop, folder: Path) -> None:
+    """Write a module that registers the laws as effects, if there are any."""
+    laws = [one for one in result.effects if one.knowledge == "law"]
+    if not laws:
+        return
+    text = filled(Path(__file__).with_name(f"{LAWS_FILE}.jinja"), result=result, laws=laws)
+    (folder / LAWS_FILE).write_text(text, encoding="utf-8")
+
+
+def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
+    """Save the corrected model of the printer, with the strengths of the latest scan."""
+    twin = closed.final.twin
+    base = twin.fitted_base
+    if isinstance(base, FoldedBase):
+        base = base.common
+    assert isinstance(base, Simulator)
+    latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
+    values = twin.chain(latest).values
+    sides = {"process": "printer", "measurement": "microscope"}
+
+    def on(*roles: str) -> dict[str, dict[str, float]]:
+        return {one.name: values[one.name] for one in result.effects if one.role in roles}
+
+    error = result.error("all")
+    assert error is not None
+    save_frozen(
+        base,
+        folder,
+        name=f"{result.base_model}, loop findings",
+        process_effects=on("process"),
+        measurement_effects=on("measurement"),
+        undetermined_effects=on("nuisance", "undetermined"),
+        dataset=result.dataset.model_dump(mode="json"),
+        attributed={
+            one.name: sides[one.role]
+            for one in result.effects
+            if one.role in sides and get_effect(one.name).role != one.role
+        },
+        command=result.run.command,
+        split={
+            **result.split.model_dump(mode="json"),
+            "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
+        },
+        training_level_share=level_share([scan.stored for scan in closed.given.scans]),
+        training_step_share=step_share([scan.stored for scan in closed.given.scans]),
+        confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
+        metrics=[
+            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},
+        ],
+    )

@@ -18,8 +18,7 @@ from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import EXCHANGED_P, GROUPED_P, Judgement, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
-from litho_models.loop.screening import Screened, Screening, best_grouping
-from litho_models.loop.trials import Secants
+from litho_models.loop.screening import Screened, Screening, Secants, best_grouping
 from litho_models.scan_terms.grouped import ALL, Labels
 
 # Two effects whose changes correlate at least this much count as indistinguishable.
@@ -182,7 +181,7 @@ def _regroup(found: Found, name: str) -> None:
     p = screening.exchanged_p(by, gains[by], lambda labels: gained(labels)[0])
     if p > EXCHANGED_P:
         return
-    known = twin.values({})[name]
+    known = twin.values()[name]
     starts = {label: dict(known) for label in groups[by]}
     for label, steps in gained(groups[by])[1].items():
         for slot, step in zip(slots.values(), steps.tolist(), strict=True):

@@ -79,7 +79,7 @@ class Judge:
 
     def among_rivals(self, question: Question) -> Decision:
         """Fit every rival, and a model without rivals, to all scans, and judge the fits on the new scans."""
-        twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
+        twins = [rival.twin(self.twin) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
         twins.append(without)

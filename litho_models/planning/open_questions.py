@@ -94,7 +94,7 @@ class _Asking:
         Return None if neither is open.
         """
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
-        if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
+        if len(members) == 1 and len(_owners(cause.name, self.twin.values()[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
         # A rival that replaces another starts from the model before any of them was found.
@@ -128,7 +128,7 @@ class _Asking:
         # The loop estimated the error of the model's form without these effects. Here it is estimated with
         # each of them.
         learner = Learner(self.study, self.maps)
-        fitted = [rival.twin(self.twin.alone()) for rival in rivals]
+        fitted = [rival.twin(self.twin) for rival in rivals]
         rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
         return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
 
@@ -142,7 +142,7 @@ class _Asking:
             free = fitted.free()[:, None]
             linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
             information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
-            effects = fitted.values({})
+            effects = fitted.values()
             rivals += [
                 Rival(
                     effect=member,

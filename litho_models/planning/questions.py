@@ -22,7 +22,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
 from litho_models.loop.fits import ALL_FREE, RULES, TwinProblem
-from litho_models.loop.model import Twin
+from litho_models.loop.model import Added, Twin
 from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.loop.run import QUESTIONS_FILE
 from litho_models.scan_terms import freed_um
@@ -114,17 +114,14 @@ class Rival(Record):
         """Return the answer in words."""
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
-    def twin(self, bare: Twin) -> Twin:
-        """Return the model of this answer. If the owner is known, the effect rotates with the print (printer)
-        or with the scan (microscope).
-
-        ``bare`` is the base without effects.
+    def twin(self, base: Twin) -> Twin:
+        """Return the model of this answer: a base, whose effects are replaced. If the owner is known, the
+        effect rotates with the print (printer) or with the scan (microscope).
         """
-        for name, values in self.effects.items():
-            bare = bare.with_effect(name, ALL, {"": values})
-        frames: dict[Owner, Frame] = {"microscope": "scan", "printer": "print"}
+        effects = {name: Added(ALL, {"": values}) for name, values in self.effects.items()}
+        frames: dict[str, Frame] = {"microscope": "scan", "printer": "print"}
         own = {self.effect: frames[self.owner]} if self.owner else {}
-        return replace(bare.at(np.array(self.vector)), frames=own)
+        return replace(base, effects=effects, frames=own).at(np.array(self.vector))
 
 
 class Question(Record):

@@ -16,7 +16,7 @@ from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.run_facts import run_info
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
-from litho_models.loop.saving import MODEL_FOLDER
+from litho_models.loop.run import MODEL_FOLDER
 from litho_models.planning.answers import of_others, of_rivals
 from litho_models.planning.designer import TURNED, choose, climbed, together
 from litho_models.planning.folder import HOLDS, schedule, write_plan

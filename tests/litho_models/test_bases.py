@@ -19,12 +19,11 @@ from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.frozen.card import ModelCard
 from litho_models.loop import closing
-from litho_models.loop.bases import bases_for
+from litho_models.loop.bases import bases_for, train_folds
 from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.fits import Study, fit_state
-from litho_models.loop.folded_base import FoldedBase, train_folds
-from litho_models.loop.model import Twin
+from litho_models.loop.model import FoldedBase, Twin
 from litho_models.loop.run import close_loop
 from litho_models.loop.search import search
 from litho_models.models import build_model

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -77,9 +76,9 @@ def squared(squares_nm2: float) -> dict[str, object]:
     }
 
 
-def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -> SimpleNamespace:
-    """Return a fitted model in which these parameters lie at a limit of their range."""
-    return SimpleNamespace(exhausts=lambda name: exhausts, outgrows=lambda name: outgrows, slots=())
+def twin_at_limits(**limits: str) -> SimpleNamespace:
+    """Return a fitted model in which these parameters, by kind, lie at a limit of their range."""
+    return SimpleNamespace(at_limits=lambda name, kind: limits.get(kind, ""), slots=())
 
 
 @pytest.mark.parametrize(
@@ -88,16 +87,16 @@ def twin_at_limits(exhausts: Sequence[str] = (), outgrows: Sequence[str] = ()) -
         (1.4, 0.0, {}, ""),  # the gain in other shapes is 14 %
         (1.6, 5.0, {}, "would add 16 % to its gain"),
         (1.6, 5.4, {}, ""),  # missing causes could explain more than three times as much
-        (1.6, 5.4, {"exhausts": ["fraction"]}, "exceeds the largest possible value: fraction"),
-        (1.4, 0.0, {"exhausts": ["fraction"]}, ""),
+        (1.6, 5.4, {"amplitude": "fraction"}, "exceeds the largest possible value: fraction"),
+        (1.4, 0.0, {"amplitude": "fraction"}, ""),
         # A length at the limit of its range means another effect, however well the form fits.
-        (0.0, 0.0, {"outgrows": ["length_px"]}, "outside the range of this effect: length_px"),
+        (0.0, 0.0, {"shape": "length_px"}, "outside the range of this effect: length_px"),
     ],
 )
 def test_a_name_is_refused_at_the_stated_limits(
     reshaped_nm2: float,
     left_nm2: float,
-    limits: dict[str, list[str]],
+    limits: dict[str, str],
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -24,17 +24,15 @@ from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import freeze
 from litho_models.loop import bases, closing, run
-from litho_models.loop.closing import Closed, close
+from litho_models.loop.closing import Closed, close, freed_scans
 from litho_models.loop.errors import REPORTED, HeldOut, error_rows
 from litho_models.loop.fits import Study
-from litho_models.loop.measured import freed_scans
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.record import CloseLoop, Explained
 from litho_models.loop.report import said
 from litho_models.loop.results import _verdict, clustered_covariance
-from litho_models.loop.run import close_loop
-from litho_models.loop.saving import save_model
+from litho_models.loop.run import close_loop, save_model
 from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_units

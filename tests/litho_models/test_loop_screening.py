@@ -10,8 +10,7 @@ import pytest
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Effect, Parameter
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.screening import PERMUTATIONS, Screened, Screening
-from litho_models.loop.trials import Trial, trials_of
+from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
 from litho_models.scan_terms.grouped import ALL, Labels
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
