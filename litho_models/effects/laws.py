@@ -109,118 +109,24 @@ class Surface:
 
 # A function that computes the map (b, 1, y, x) that a strength multiplies.
 Column = Callable[[Surface], Tensor]
-
-
-# The name, the formula, the unit of the column, and the column.
-Facts = tuple[str, str, str, Column]
-Families = tuple[tuple[Iterable[Facts], Mapping[str, Parameter]], ...]
-_POSITION = {
-    "position": Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
-}
-_POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 3.0))}
-_TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
-_REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
-_TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0))}
-# If the position is known, one trial value of the length is close enough to start a fit.
-_NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
-
-
-def _fixed() -> Iterator[Facts]:
-    for axis in ("x", "y"):
-        yield from _along_axis(axis)
-        yield from (_slope_at(axis, word) for word in _WORDS)
-    yield "height-power-2", "h²", "µm²", lambda s: s.h**2
-    yield "height-power-3", "h³", "µm³", lambda s: s.h**3
-    yield "height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order
-    yield from (_height_at(word) for word in _WORDS)
-
-
-def _at_place() -> Iterator[Facts]:
-    yield _height_at("rim")
-    yield from (_slope_at(axis, "rim") for axis in ("x", "y"))
-    yield from (_blurred_at(word) for word in _WORDS)
-
-
-_STEEPNESS: Facts = (
-    "steepness-power",
-    "|∇h|^power",
-    "1",
-    lambda s: s.size("x", "y", power=s.values["power"]),
-)
-
-
-def _nearby() -> Iterator[Facts]:
-    yield "surroundings", "h̄ - h", "µm", lambda s: s.mean() - s.h
-    yield "blur-height", "h (h̄ - h)", "µm²", lambda s: s.h * (s.mean() - s.h)
-    yield "above-surroundings", "(h - h̄)²", "µm²", lambda s: (s.h - s.mean()) ** 2
-    yield "steps-nearby", "mean of |∇h| within the length", "1", lambda s: s.mean(s.size("x", "y"))
-
-
-def _power(axis: str) -> Facts:
-    return f"slope-{axis}-power", f"|∂h/∂{axis}|^power", "1", lambda s: s.size(axis, power=s.values["power"])
-
-
-def _one_way(axis: str) -> Iterator[Facts]:
-    yield f"rising-slope-{axis}", f"max(∂h/∂{axis}, 0)", "1", lambda s: s.slope(axis).relu()
-    yield f"falling-slope-{axis}", f"max(-∂h/∂{axis}, 0)", "1", lambda s: (-s.slope(axis)).relu()
-
-
-def _along_axis(axis: str) -> Iterator[Facts]:
-    yield f"height-times-slope-{axis}", f"h ∂h/∂{axis}", "µm", lambda s: s.h * s.slope(axis)
-    yield f"height-times-slope-size-{axis}", f"h |∂h/∂{axis}|", "µm", lambda s: s.h * s.size(axis)
-    yield f"curvature-{axis}", f"∂²h/∂{axis}²", "1/µm", lambda s: s.slope(axis, s.slope(axis))
-    name = f"slope-size-{axis}-times-order"
-    yield name, f"|∂h/∂{axis}| t", "1", lambda s: s.size(axis) * s.context.order
-
-
-def _slope_at(axis: str, word: str) -> Facts:
-    name = f"slope-size-{axis}-times-{word.replace('²', '2')}"
-    return name, f"|∂h/∂{axis}| {word}", "1", lambda s: s.size(axis) * s.place(word)
-
-
-def _height_at(word: str) -> Facts:
-    return f"height-times-{word.replace('²', '2')}", f"h {word}", "µm", lambda s: s.h * s.place(word)
-
-
-def _blurred_at(word: str) -> Facts:
-    name = f"blur-times-{word.replace('²', '2')}"
-    return name, f"(h̄ - h) {word}", "µm", lambda s: (s.mean() - s.h) * s.place(word)
-
-
-def _jumps(axis: str) -> Iterator[Facts]:
-    name, formula = f"jump-along-{axis}", f"({axis} > position)"
-    yield f"{name}-in-height", formula, "1", lambda s: s.beyond(axis)
-    yield f"{name}-in-gain", f"h {formula}", "µm", lambda s: s.h * s.beyond(axis)
-    yield from (_displaced(name, formula, axis, way) for way in ("x", "y"))
-
-
-def _displaced(name: str, formula: str, axis: str, way: str) -> Facts:
-    return f"{name}-in-{way}", f"∂h/∂{way} {formula}", "1", lambda s: s.slope(way) * s.beyond(axis)
-
-
-def _beside(name: str, *sides: str) -> Facts:
-    formula = f"(mean of D {' and '.join(sides)} over the length) - D"
-    return name, formula, "µm", lambda s: s.trailing(*sides) - s.h
-
-
-_CROWDING: Facts = (
-    "dose-times-density",
-    "D (mean of D within the length / full height)^power",
-    "µm",
-    lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
-)
+_UNIT_OF_STRENGTH = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
 
 def _law(
-    name: str, formula: str, unit: str, column: Column, shapes: Mapping[str, Parameter], on: ActsOn
+    name: str,
+    formula: str,
+    unit: str,
+    column: Column,
+    shapes: Mapping[str, Parameter] = {},
+    on: ActsOn = "height",
 ) -> Effect:
-    unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
+    """Make a law from its name, its formula, and the column that its strength multiplies, with its unit."""
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
         return field + values["strength"] * column(Surface(field, context, values))
 
-    strength = Parameter(unit_of_strength[unit], -4.0, 4.0, 0.05)
-    return _nameless(name, formula, {"strength": strength, **shapes}, apply, on)
+    strength = Parameter(_UNIT_OF_STRENGTH[unit], -4.0, 4.0, 0.05)
+    return _nameless(name.replace("²", "2"), formula, {"strength": strength, **shapes}, apply, on)
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
@@ -257,6 +163,100 @@ def _nameless(
         separating=_TURNED,
         knowledge="law",
     )
+
+
+_POSITION = {
+    "position": Parameter("1", -0.95, 0.95, 0.0, "shape", tried=(-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75))
+}
+_POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 3.0))}
+_TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
+_REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
+_TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0)), **_TURN}
+# If the position is known, one trial value of the length is close enough to start a fit.
+_NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
+
+
+def _along_axis(a: str) -> Iterator[Effect]:
+    yield _law(f"height-times-slope-{a}", f"h ∂h/∂{a}", "µm", lambda s: s.h * s.slope(a))
+    yield _law(f"height-times-slope-size-{a}", f"h |∂h/∂{a}|", "µm", lambda s: s.h * s.size(a))
+    yield _law(f"curvature-{a}", f"∂²h/∂{a}²", "1/µm", lambda s: s.slope(a, s.slope(a)))
+    yield _law(f"slope-size-{a}-times-order", f"|∂h/∂{a}| t", "1", lambda s: s.size(a) * s.context.order)
+    yield from (_slope_at(a, word) for word in _WORDS)
+
+
+def _slope_at(a: str, word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
+    name, formula = f"slope-size-{a}-times-{word}", f"|∂h/∂{a}| {word}"
+    return _law(name, formula, "1", lambda s: s.size(a) * s.place(word), shapes)
+
+
+def _height_at(word: str, shapes: Mapping[str, Parameter] = {}) -> Effect:
+    return _law(f"height-times-{word}", f"h {word}", "µm", lambda s: s.h * s.place(word), shapes)
+
+
+def _blurred_at(word: str) -> Effect:
+    name, formula = f"blur-times-{word}", f"(h̄ - h) {word}"
+    return _law(name, formula, "µm", lambda s: (s.mean() - s.h) * s.place(word), _NEAR)
+
+
+def _power(a: str) -> Effect:
+    name, formula = f"slope-{a}-power", f"|∂h/∂{a}|^power"
+    return _law(name, formula, "1", lambda s: s.size(a, power=s.values["power"]), _POWER | _TURN)
+
+
+def _one_way(a: str) -> Iterator[Effect]:
+    yield _law(f"rising-slope-{a}", f"max(∂h/∂{a}, 0)", "1", lambda s: s.slope(a).relu(), _TURN)
+    yield _law(f"falling-slope-{a}", f"max(-∂h/∂{a}, 0)", "1", lambda s: (-s.slope(a)).relu(), _TURN)
+
+
+def _jumps(a: str) -> Iterator[Effect]:
+    name, formula = f"jump-along-{a}-in", f"({a} > position)"
+    yield _law(f"{name}-height", formula, "1", lambda s: s.beyond(a), _POSITION)
+    yield _law(f"{name}-gain", f"h {formula}", "µm", lambda s: s.h * s.beyond(a), _POSITION)
+    yield _law(f"{name}-x", f"∂h/∂x {formula}", "1", lambda s: s.slope("x") * s.beyond(a), _POSITION)
+    yield _law(f"{name}-y", f"∂h/∂y {formula}", "1", lambda s: s.slope("y") * s.beyond(a), _POSITION)
+
+
+def _beside(name: str, *sides: str) -> Effect:
+    formula = f"(mean of D {' and '.join(sides)} over the length) - D"
+    return _law(name, formula, "µm", lambda s: s.trailing(*sides) - s.h, _TAIL, "layout")
+
+
+_FOUND = [
+    *_along_axis("x"),
+    *_along_axis("y"),
+    _law("height-power-2", "h²", "µm²", lambda s: s.h**2),
+    _law("height-power-3", "h³", "µm³", lambda s: s.h**3),
+    _law("height-squared-times-order", "h² t", "µm²", lambda s: s.h**2 * s.context.order),
+    *map(_height_at, _WORDS),
+    _law("steepness-power", "|∇h|^power", "1", lambda s: s.size("x", "y", power=s.values["power"]), _POWER),
+    *map(_power, "xy"),
+    *_one_way("x"),
+    *_one_way("y"),
+    _law("surroundings", "h̄ - h", "µm", lambda s: s.mean() - s.h, _REACH),
+    _law("blur-height", "h (h̄ - h)", "µm²", lambda s: s.h * (s.mean() - s.h), _REACH),
+    _law("above-surroundings", "(h - h̄)²", "µm²", lambda s: (s.h - s.mean()) ** 2, _REACH),
+    _law("steps-nearby", "mean of |∇h| within the length", "1", lambda s: s.mean(s.size("x", "y")), _REACH),
+    _height_at("rim", _NEAR),
+    _slope_at("x", "rim", _NEAR),
+    _slope_at("y", "rim", _NEAR),
+    *map(_blurred_at, _WORDS),
+    *_jumps("x"),
+    *_jumps("y"),
+    _beside("dose-along-x", "left", "right"),
+    _beside("dose-along-y", "above", "below"),
+    *(_beside(f"dose-from-{side}", side) for side in _SIDES),
+    _law(
+        "dose-times-density",
+        "D (mean of D within the length / full height)^power",
+        "µm",
+        lambda s: s.h * rounded_power((s.mean() / s.context.full_height_um) ** 2, s.values["power"]),
+        _REACH | _POWER,
+        "layout",
+    ),
+    _wave("height", _WAVES_PER_UM),
+    _wave("layout", _WAVES_PER_UM[:9]),
+]
+LAWS = {law.name: law for law in _FOUND}
 
 
 def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Effect]:
@@ -305,28 +305,4 @@ def place_map(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     return height * (1 + sum(values[name] * y**i * x**j for name, (i, j) in _POWERS.items()))
 
 
-_OF_HEIGHT: Families = (
-    (_fixed(), {}),
-    ([_STEEPNESS], _POWER),
-    (map(_power, "xy"), {**_POWER, **_TURN}),
-    ((*_one_way("x"), *_one_way("y")), _TURN),
-    (_nearby(), _REACH),
-    (_at_place(), _NEAR),
-    ((*_jumps("x"), *_jumps("y")), _POSITION),
-)
-_OF_DOSE: Families = (
-    (
-        (_beside("dose-along-x", "left", "right"), _beside("dose-along-y", "above", "below")),
-        {**_TAIL, **_TURN},
-    ),
-    ((_beside(f"dose-from-{side}", side) for side in _SIDES), {**_TAIL, **_TURN}),
-    ([_CROWDING], {**_REACH, **_POWER}),
-)
-_FOUND = [
-    *(_law(*facts, shapes, "height") for family, shapes in _OF_HEIGHT for facts in family),
-    *(_law(*facts, shapes, "layout") for family, shapes in _OF_DOSE for facts in family),
-    _wave("height", _WAVES_PER_UM),
-    _wave("layout", _WAVES_PER_UM[:9]),
-]
-LAWS = {law.name: law for law in _FOUND}
 TABLES = {one.name: one for one in (level_table, linear_response, place_map)}

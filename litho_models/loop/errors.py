@@ -166,15 +166,15 @@ class HeldOut:
         fixed.
         """
 
+        @cache
         def error_nm(state: State) -> float:
             rows = self._rows(*self._by_fold(state, refit=False), "all")
             return next(row.leading_nm for row in rows if row.is_headline)
 
         model, found = self.closed.final, {}
-        whole_nm = error_nm(model) if model.twin.names else 0.0
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
-            found[name] = error_nm(model.without(name)) - whole_nm
+            found[name] = error_nm(model.without(name)) - error_nm(model)
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:

@@ -283,26 +283,20 @@ class Screening:
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
-        best = best_grouping({by: (one.gain_nm2, one.numbers) for by, one in better.items()})
-        if best is None:
-            return None
-        one = better[best]
-        p = self.exchanged_p(best, one.gain_nm2, lambda labels: self._gains(one.trial, labels)[0])
-        return replace(one, group_p=p) if p <= EXCHANGED_P else None
+        best = self.best_grouping(
+            {by: (one.gain_nm2, one.numbers) for by, one in better.items()},
+            lambda by, labels: self._gains(better[by].trial, labels)[0],
+        )
+        return replace(better[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Return the cosine of the angle between the changes of two candidates, pooled over scans."""
-        one, other = self._change(a), self._change(b)
-        inner = np.einsum("asi,sij,bsj->ab", [one, other], self.freed, [one, other], optimize=True)
+        # A change is the sum of the columns multiplied by factors (scans, columns).
+        factors = np.zeros((2, *self.freed.shape[:2]))
+        for own, one in zip(factors, (a, b), strict=True):
+            own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
+        inner = np.einsum("asi,sij,bsj->ab", factors, self.freed, factors, optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
-
-    def _change(self, one: Screened) -> np.ndarray:
-        """Return the change of a candidate as factors (scans, columns). The change is the sum of the columns
-        multiplied by these factors.
-        """
-        found = np.zeros(self.freed.shape[:2])
-        found[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
-        return found
 
     def _candidate(self, trial: Trial, by: str) -> Screened:
         gains, multiples = self._gains(trial, self.study.groups[by])
@@ -346,36 +340,38 @@ class Screening:
                     gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
         return gains * NM_PER_UM**2, multiples
 
-    def exchanged_p(self, by: str, gain_nm2: float, gains_of: Callable[[Labels], np.ndarray]) -> float:
-        """Return the share of permutations of the scans after which any grouping gains as much as this one.
+    def best_grouping(
+        self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, Labels], np.ndarray]
+    ) -> tuple[str, float] | None:
+        """Choose the grouping with the fewest parameters among those that gain nearly the most.
 
-        Permutations that reproduce the tested grouping are not counted.
+        Args:
+            options: gain, nm², and number of parameters by grouping.
+            gains_of: function that returns the gains (scans,), nm², if the strengths of the candidate in a
+                grouping differ by other labels.
+
+        Returns:
+            The grouping, and the share of permutations of the scans after which any grouping gains as much.
+            Permutations that reproduce the grouping are not counted. None if no grouping has a gain, or if
+            the gain may be chance.
         """
+        most = max((gain for gain, _ in options.values()), default=0.0)
+        close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}
+        if not close:
+            return None
+        best = min(close, key=lambda by: close[by])
         groupings = {name: np.array(own) for name, own in self.study.groups.items() if name != ALL}
-        rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[by])
-        exchanged = beaten = 0
+        rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[best])
+        exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
             order = rng.permutation(len(self.study.scans))
             moved = [own[order] for own in groupings.values()]
-            if any((_beside(own) == judged).all() for own in moved):
-                continue
-            exchanged += 1
-            beaten += any(gains_of(tuple(own)).mean() >= gain_nm2 * (1 - 1e-12) for own in moved)
-        return (1 + beaten) / (1 + exchanged)
-
-
-def best_grouping(options: Mapping[str, tuple[float, int]]) -> str | None:
-    """Choose the grouping with the fewest parameters among those that gain nearly the most.
-
-    Args:
-        options: gain and number of parameters by grouping.
-
-    Returns:
-        The grouping; None if no grouping has a gain.
-    """
-    most = max((gain for gain, _ in options.values()), default=0.0)
-    close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}
-    return min(close, key=lambda by: close[by], default=None)
+            if not any((_beside(own) == judged).all() for own in moved):
+                exchanged += 1
+                least = options[best][0] * (1 - 1e-12)
+                beaten += any(gains_of(best, tuple(own)).mean() >= least for own in moved)
+        p = beaten / exchanged
+        return (best, p) if p <= EXCHANGED_P else None
 
 
 def _beside(labels: np.ndarray) -> np.ndarray:

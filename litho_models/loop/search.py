@@ -16,9 +16,9 @@ import numpy as np
 from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
 from litho_models.loop.fits import State, Study, fit_state
-from litho_models.loop.judging import EXCHANGED_P, GROUPED_P, Judgement, judge, judge_states, told_apart
+from litho_models.loop.judging import GROUPED_P, Judgement, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
-from litho_models.loop.screening import Screened, Screening, Secants, best_grouping
+from litho_models.loop.screening import Screened, Screening, Secants
 from litho_models.scan_terms.grouped import ALL, Labels
 
 # Two effects whose changes correlate at least this much count as indistinguishable.
@@ -173,17 +173,19 @@ def _regroup(found: Found, name: str) -> None:
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return screening.gains_by(labels, [1 + at for at in slots])
 
-    groups = {by: labels for by, labels in study.groups.items() if by != ALL}
-    gains = {by: float(gained(labels)[0].mean()) for by, labels in groups.items()}
-    by = best_grouping({by: (gain, len(set(groups[by]))) for by, gain in gains.items()})
-    if by is None:
+    best = screening.best_grouping(
+        {
+            by: (float(gained(labels)[0].mean()), len(set(labels)))
+            for by, labels in study.groups.items()
+            if by != ALL
+        },
+        lambda _, labels: gained(labels)[0],
+    )
+    if best is None:
         return
-    p = screening.exchanged_p(by, gains[by], lambda labels: gained(labels)[0])
-    if p > EXCHANGED_P:
-        return
-    known = twin.values()[name]
-    starts = {label: dict(known) for label in groups[by]}
-    for label, steps in gained(groups[by])[1].items():
+    (by, p), known = best, twin.values()[name]
+    starts = {label: dict(known) for label in study.groups[by]}
+    for label, steps in gained(study.groups[by])[1].items():
         for slot, step in zip(slots.values(), steps.tolist(), strict=True):
             value = known[slot.parameter] + step
             starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
@@ -255,11 +257,10 @@ def _defend(found: Found) -> None:
 
     A strength that differs by group may become visible only when the other causes are in the model.
     """
-    if len(found.causes) < 2:
-        return
-    for name in found.names:
-        _regroup(found, name)
-    _test_again(found)
+    if len(found.causes) > 1:
+        for name in found.names:
+            _regroup(found, name)
+        _test_again(found)
 
 
 def _test_again(found: Found) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cache, cached_property
+from itertools import permutations
 
 import numpy as np
 
@@ -52,7 +53,7 @@ class SingleScans:
         """Test each per-scan effect in addition to those already found; line offsets come last."""
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
-        names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect is not None)
+        names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect)
         lines = [name for name in names if line_terms(terms_of_effect(name))]
         for name in names:
             if name not in lines:
@@ -77,11 +78,11 @@ class SingleScans:
         # If scans of one print agree, the printer may be the cause as well.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
-        terms = [np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after)]
-        rmse_nm = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
+        few, many = (np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after))
+        was, now = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
-            f"if the number of terms per scan rises from {terms[0]:.0f} to {terms[1]:.0f}, the RMSE on "
-            f"pixels outside the fit changes from {rmse_nm[0]:.2f} to {rmse_nm[1]:.2f} nm"
+            f"if the number of terms per scan rises from {few:.0f} to {many:.0f}, the RMSE on "
+            f"pixels outside the fit changes from {was:.2f} to {now:.2f} nm"
         )
         return ScanFinding.of(
             name,
@@ -130,23 +131,20 @@ class SingleScans:
         bare, freed = (self._freed(by_column, terms) for terms in (accepted, accepted | {"layout-columns"}))
         columns = _as_variance(bare, freed, self.study).gains_nm2
         found = []
-        for at, name in enumerate(names):
-            (other,) = (one for one in names if one != name)
+        for name, other in permutations(names):
             gains = judged[name].gains_nm2
             behind = judged[other].gains_nm2 - gains
             beaten, better = (one_sided_flip_p(sign * behind) <= CONFIRM_P for sign in (1, -1))
             excess_p = one_sided_flip_p(gains - columns)
-            excess = (
-                ""
-                if excess_p <= CONFIRM_P
-                else f"offsets of rows gain no more than offsets of columns (p = {excess_p:.3f})"
-            )
-            follows = ""
+            reasons = [*filter(None, [judged[name].reason()])]
+            if excess_p > CONFIRM_P:
+                reasons.append(f"offsets of rows gain no more than offsets of columns (p = {excess_p:.3f})")
             if beaten:
-                follows = f"the offsets follow {_frame(other)} more closely, which indicates {other}"
-            elif at and not better:
-                follows = f"cannot be distinguished from {other}: no scan is rotated enough on its layout"
-            reasons = [*filter(None, (judged[name].reason(), excess, follows))]
+                reasons.append(f"the offsets follow {_frame(other)} more closely, which indicates {other}")
+            elif not better and found:
+                reasons.append(
+                    f"cannot be distinguished from {other}: no scan is rotated enough on its layout"
+                )
             deviation = np.sqrt(np.maximum(gains, 0).mean()) / NM_PER_UM
             taken = f"{gains.mean():.1f} nm² along {_frame(name)} and {columns.mean():.1f} nm² along columns"
             found.append(

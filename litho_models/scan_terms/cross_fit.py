@@ -32,12 +32,10 @@ class CrossFit:
             are not scored.
         degrees_of_freedom: effective number of terms, averaged over the scored parts of the scan. A line
             offset that is shrunk counts with its weight.
-        line_sd_um: standard deviation of the line offsets; 0 if there are no line offsets.
     """
 
     residual_um: FloatMap
     degrees_of_freedom: float
-    line_sd_um: float
 
 
 def cross_fit(
@@ -83,22 +81,20 @@ def cross_fit(
     lines = [term.lines(height.shape, scan_line) for term in chosen_terms(terms) if term.lines is not None]
     axes = [axis_along(line) for line in lines]
     cells = line_cells(height.shape, axes, blocks.line_gap_px)
-    freedom, variances = [], []
+    freedom = []
     for half in checkerboard(height.shape, blocks):
         rest = difference - _fitted(basis, difference, half.calibrate & usable)
         for cell in cells:
             freed, weights = rest, 0.0
             for line, axis in zip(lines, axes, strict=True):
                 other = cell.other_side[axis] & usable
-                offsets, weight, variance = shrunk_line_offsets(freed, other, line, blocks.block_px)
+                offsets, weight, _ = shrunk_line_offsets(freed, other, line, blocks.block_px)
                 freed = freed - offsets[line]
                 weights += float(weight.sum())
-                variances.append(variance)
             scored = half.score & cell.score & usable
             residual[scored] = freed[scored]
             freedom.append(len(basis) + weights)
-    line_sd = float(np.sqrt(np.mean(variances))) if variances else 0.0
-    return CrossFit(residual, float(np.mean(freedom)), line_sd)
+    return CrossFit(residual, float(np.mean(freedom)))
 
 
 def fitted_terms(

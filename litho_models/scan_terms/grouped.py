@@ -79,6 +79,7 @@ def _is_grouped(labels: Labels) -> bool:
 
 
 def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
+    """Return whether a grouping is identical to one of these, up to the names of its labels."""
     return any(
         len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found.values()
     )
@@ -214,22 +215,16 @@ class _Expanded:
         for scan in scans:
             by.setdefault(tuple(products.groups[block.by][scan] for block in blocks), []).append(int(scan))
         usual = np.einsum("sii->i", self._grams[scans]) / max(len(scans), 1)
-        self.rows: list[dict[str, np.ndarray]] = []
-        shrunk: list[float] = []
-        for number, block in enumerate(blocks):
-            own = {}
+        self.rows: list[dict[str, np.ndarray]] = [{} for _ in blocks]
+        self._shrunk = np.empty(0)
+        for number, (own, block) in enumerate(zip(self.rows, blocks, strict=True)):
             for label in sorted({labels[number] for labels in by}):
-                own[label] = len(shrunk) + np.arange(len(block.columns))
-                shrunk += (block.shrinking * usual[list(block.columns)]).tolist()
-            self.rows.append(own)
+                own[label] = len(self._shrunk) + np.arange(len(block.columns))
+                self._shrunk = np.append(self._shrunk, block.shrinking * usual[list(block.columns)])
         self.alike = [
-            (
-                members,
-                np.array([row for own, one in zip(self.rows, labels, strict=True) for row in own[one]], int),
-            )
-            for labels, members in by.items()
+            (members, np.concatenate([np.empty(0, int), *(o[n] for o, n in zip(self.rows, at, strict=True))]))
+            for at, members in by.items()
         ]
-        self._shrunk = np.array(shrunk)
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
         """Return the least-squares strengths (rows, targets) that fit each target. A target is the index of a

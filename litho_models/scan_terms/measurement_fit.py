@@ -54,8 +54,7 @@ _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# An offer is a part to try, with its degree and grouping. A pair is a scan with its predicted print (ny, nx).
-_Offer = tuple[Shared, int, Block]
+# A pair is a scan with its predicted print (ny, nx).
 _Pair = tuple[PrintedScan, np.ndarray]
 
 
@@ -81,7 +80,7 @@ def learn_measurement(
     pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
     levelling = like.levelling if like else _best_levelling(pairs)
     model = model.model_copy(update={"levelling": levelling, "scans": len(pairs)})
-    chosen = [_offer(part.what, part.degree, part.by, part.shrinking) for part in like.parts] if like else []
+    chosen = like.parts if like else []
     for _ in range(_ROUNDS):
         products = _products(pairs, model)
         if not (chosen or like):
@@ -101,14 +100,14 @@ def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
     return Products(np.stack(grams), groupings([scan for scan, _ in pairs], by_order=False))
 
 
-def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
+def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
     """Choose the parts to add. ``fold_of`` contains the fold of each scan, (scans,)."""
-    chosen: list[_Offer] = []
+    chosen: list[SharedPart] = []
     if len(fold_of) < 2:
         return chosen
     left = products.held_out([], fold_of)
     while offers := _offers(products.groups, chosen):
-        tried = [products.held_out([block for *_, block in (*chosen, one)], fold_of) for one in offers]
+        tried = [products.held_out([*map(_block, (*chosen, one))], fold_of) for one in offers]
         best = int(np.argmin([one.mean() for one in tried]))
         gain = left - tried[best]
         error = gain.std(ddof=1) / np.sqrt(len(gain))
@@ -119,10 +118,10 @@ def _chosen(products: Products, fold_of: np.ndarray) -> list[_Offer]:
     return chosen
 
 
-def _offers(groups: Iterable[str], chosen: Sequence[_Offer]) -> list[_Offer]:
-    taken = {(what, block.by) for what, _, block in chosen}
+def _offers(groups: Iterable[str], chosen: Sequence[SharedPart]) -> list[SharedPart]:
+    taken = {(part.what, part.by) for part in chosen}
     return [
-        _offer(what, degree, by, shrinking)
+        SharedPart(what=what, by=by, degree=degree, shrinking=shrinking, coefficients={})
         for what, degree, grouped in _OFFERS
         for by in groups
         if (by != ALL) == grouped and (what, by) not in taken
@@ -130,22 +129,12 @@ def _offers(groups: Iterable[str], chosen: Sequence[_Offer]) -> list[_Offer]:
     ]
 
 
-def _offer(what: Shared, degree: int, by: str, shrinking: float) -> _Offer:
-    return what, degree, Block(_columns_of(what, degree), by, shrinking)
-
-
-def _fitted(products: Products, chosen: Sequence[_Offer]) -> list[SharedPart]:
+def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart]:
     """Fit the strengths of the chosen parts."""
-    fitted = products.strengths([block for *_, block in chosen], np.arange(len(products.grams)))
+    fitted = products.strengths([*map(_block, chosen)], np.arange(len(products.grams)))
     return [
-        SharedPart(
-            what=what,
-            by=block.by,
-            degree=degree,
-            shrinking=block.shrinking,
-            coefficients={label: own.tolist() for label, own in strengths.items()},
-        )
-        for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
+        part.model_copy(update={"coefficients": {label: own.tolist() for label, own in strengths.items()}})
+        for part, strengths in zip(chosen, fitted, strict=True)
     ]
 
 
@@ -171,13 +160,13 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     rows[0] = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
     for part in model.parts:
         if known := part.of(scan):
-            rows[0] += known @ rows[list(_columns_of(part.what, part.degree))]
+            rows[0] += known @ rows[list(_block(part).columns)]
     rows -= rows.mean(axis=1, keepdims=True)
     return rows
 
 
-def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
-    """Return the indices of the columns of a part in the result of ``_rows``."""
+def _block(part: SharedPart) -> Block:
+    """Return the columns of a part in the result of ``_rows``, with its groups and its prior."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,
@@ -185,8 +174,8 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
         "shift-y": surface + lateral,
         "gain": surface + 2 * lateral,
     }
-    count = polynomial_count(degree) - (what == "background")
-    return tuple(range(starts[what], starts[what] + count))
+    start, count = starts[part.what], polynomial_count(part.degree) - (part.what == "background")
+    return Block(tuple(range(start, start + count)), part.by, part.shrinking)
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:

@@ -75,10 +75,10 @@ def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
         if name == LAW and by != ALL:
             assert other.gain_nm2 < 1.02 * one.gain_nm2
             gains_of = partial(_gains_of, screening, other)
-            assert screening.exchanged_p(by, other.gain_nm2, gains_of) > 0.02
+            assert screening.best_grouping({by: (other.gain_nm2, 1)}, gains_of) is None
 
 
-def _gains_of(screening: Screening, one: Screened, labels: Labels) -> np.ndarray:
+def _gains_of(screening: Screening, one: Screened, by: str, labels: Labels) -> np.ndarray:
     return screening.gains_by(labels, one.trial.columns)[0]
 
 

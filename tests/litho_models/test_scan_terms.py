@@ -25,6 +25,7 @@ from litho_models.scan_terms import (
     parameter_names,
     policy_terms,
     register_scan_term,
+    row_index,
     scan_line_index,
     shrunk_line_offsets,
     term_maps,
@@ -151,7 +152,8 @@ def test_noise_is_not_fitted_away():
     # White noise has no line offsets, so shrinkage keeps them at zero. Seven terms from about 80,000
     # calibration pixels add 16 nm * sqrt(7 / 80000) = 0.15 nm in quadrature, below 0.1 %.
     assert np.nanstd(free.residual_um) == pytest.approx(noise.std(), rel=1e-3)
-    assert free.line_sd_um < 0.0005
+    rows = row_index(noise.shape)
+    assert shrunk_line_offsets(noise, np.ones(noise.shape, bool), rows, 32)[2] < 0.0005**2
 
 
 def test_line_offsets_are_recovered_and_shrunk():
@@ -162,7 +164,8 @@ def test_line_offsets_are_recovered_and_shrunk():
     height = prediction + offsets[:, None] + random.normal(0, noise, shape)
     free = cross_fit(height, prediction, np.ones(shape, bool), POLICIES["full+rows"])
     # The standard deviation of 512 offsets is known to 1/sqrt(2*512) = 3 %. Allow three times this.
-    assert free.line_sd_um == pytest.approx(sd, rel=0.1)
+    _, _, variance = shrunk_line_offsets(height - prediction, np.ones(shape, bool), row_index(shape), 32)
+    assert variance**0.5 == pytest.approx(sd, rel=0.1)
     # From 224 pixels beyond the gap, an offset has an error of 16/15 = 1.1 nm: sqrt(16² + 1.1²) = 16.04 nm.
     assert np.nanstd(free.residual_um) == pytest.approx(np.hypot(noise, noise / 15), rel=0.01)
     assert 300 < free.degrees_of_freedom - 7 < 512
