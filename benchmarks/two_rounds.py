@@ -36,10 +36,10 @@ from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_
 from litho_models.loop.closing import Closed
 from litho_models.loop.record import CloseLoop, Decision
 from litho_models.loop.run import close_loop
-from litho_models.planning.deciding import MICROSCOPE, PRINTER, decide
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import PlannedQuestion
+from litho_models.planning.rounds import MICROSCOPE, PRINTER, decide
 from litho_models.planning.run import next_print
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"

@@ -47,38 +47,36 @@ class EffectChain(nn.Module):
         """Return the tile of the base model; effects act on the whole field."""
         return self.base.tile if isinstance(self.base, Simulator) else None
 
-    def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
-        """Return the height (b, 1, y, x), µm. Without a context, the layout is taken as one write field."""
+    def forward(
+        self,
+        layout_um: Tensor,
+        context: FieldContext | None = None,
+        known: Fields | None = None,
+        base_key: object = None,
+    ) -> Tensor:
+        """Return the height (b, 1, y, x), µm. Without a context, the layout is taken as one write field.
+
+        Args:
+            known: fields after the base and after each effect, as far as they were already computed for the
+                same scan; newly computed fields are added.
+            base_key: identifies the base among the chains that share ``known``.
+        """
         if context is None:
             assert isinstance(self.base, Simulator)
             geometry = self.base.config
             context = FieldContext(
                 layout_um, geometry.pitch_um, geometry.full_height_um, geometry.level_height_um
             )
-        return self.after_base(self.base(self.before_base(layout_um, context)[0]), context)
-
-    def before_base(
-        self, layout_um: Tensor, context: FieldContext, known: Fields | None = None
-    ) -> tuple[Tensor, Key]:
-        """Apply the effects that act before the base model to the layout; see ``after_base``."""
-        return self._run_stage("layout", layout_um, context, known, ())
-
-    def after_base(
-        self, height_um: Tensor, context: FieldContext, known: Fields | None = None, key: Key = ()
-    ) -> Tensor:
-        """Apply the height effects to the base model's height.
-
-        Args:
-            known: fields after each effect, as far as they were already computed for the same scan and base;
-                newly computed fields are added.
-            key: the effects and values on which ``height_um`` depends, as returned by ``before_base``.
-        """
-        return self._run_stage("height", height_um, context, known, key)[0]
-
-    def _run_stage(
-        self, acts_on: ActsOn, field: Tensor, context: FieldContext, known: Fields | None, key: Key
-    ) -> tuple[Tensor, Key]:
         known = {} if known is None else known
+        exposed_um, key = self._applied("layout", layout_um, context, known, ())
+        key = (*key, base_key)
+        if key not in known:
+            known[key] = self.base(exposed_um)
+        return self._applied("height", known[key], context, known, key)[0]
+
+    def _applied(
+        self, acts_on: ActsOn, field: Tensor, context: FieldContext, known: Fields, key: Key
+    ) -> tuple[Tensor, Key]:
         for name, values in self.values.items():
             effect = get_effect(name)
             if effect.acts_on == acts_on:

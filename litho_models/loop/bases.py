@@ -52,7 +52,7 @@ def bases_for(
         InputError: the base is unknown, its pitch differs from that of the scans, or settings are given
             for a base that is not a small model.
     """
-    scans = [scan.stored for scan in study.scans]
+    scans = study.stored
     named = _built(base, scans[0], fields) if base in MODELS else None
     if fields and not (named and is_small(named)):
         raise InputError(

@@ -63,7 +63,7 @@ class Check:
         cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
-        unneeded, reason = cause.judgement.reason(grouped=cause.by != ALL), ""
+        unneeded, reason = cause.judgement.reason(cause.by), ""
         larger = "" if unneeded else self._larger(cause, without)
         if unneeded:
             reason = f"not needed when the other effects are in the model: {unneeded}"
@@ -116,7 +116,7 @@ class Check:
             state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
             numbers -= law.numbers
             laws.append(law.name)
-            if judge_states(self.state, state).passed():
+            if not judge_states(self.state, state).reason():
                 return replace(cause, reason=f"short laws fit better than it: {', '.join(laws)}")
         return cause
 
@@ -131,7 +131,7 @@ class Check:
             if table.judgement.gain_nm2 > least_nm2:
                 both = with_table(self.state, table)
                 judged = judge_states(both.without(cause.name), both)
-                if reason := judged.reason(grouped=cause.by != ALL):
+                if reason := judged.reason(cause.by):
                     return replace(cause, reason=f"not needed when {table.name} is in the model: {reason}")
         return cause
 

@@ -29,7 +29,6 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
-from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # Duration of a loop divided by that of its first fits. In four datasets this ratio was between 11 and 33.
@@ -161,9 +160,7 @@ def freed_scans(state: State) -> list[PrintedScan]:
     learned from scans outside the scan's fold.
     """
     study = state.study
-    maps = state.maps_um(study.scans)
-    scans = [scan.stored for scan in study.scans]
-    freed = list(scans)
+    maps, scans, freed = state.maps_um(study.scans), study.stored, study.stored
     for own, held_out in study.folds:
         if len(own) < 2:
             continue
@@ -251,7 +248,7 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
     for table in described:
         fitted = with_table(found.state, table)
         judgement = judge_states(found.state, fitted)
-        if judgement.passed(grouped=table.by != ALL):
+        if not judgement.reason(table.by):
             found.state = fitted
             found.causes.append(replace(table, judgement=judgement))
     return found

@@ -78,7 +78,7 @@ def error_rows(
 
     Args:
         numbers: numbers of fitted parameters of the printer and of the measurement model.
-        terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``.
+        terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``, if not the usual ones.
     """
     rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
@@ -117,7 +117,7 @@ class HeldOut:
 
     def __init__(self, closed: Closed):
         self.closed, self.study = closed, closed.given
-        self.scans = [one.stored for one in self.study.scans]
+        self.scans = self.study.stored
         self._by_fold = cache(self._without_folds)
         self.fit = cache(lambda state: fit_with_measurement(state.twin, self.study.scans, self.study.seed))
 
@@ -194,7 +194,6 @@ class HeldOut:
         ]
 
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
-        terms = {"measurement": "shared", "held_out": "scans", **terms}
         return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)
 
     def _without_folds(self, state: State, refit: bool = True) -> tuple[Maps, tuple[int, int]]:
@@ -253,9 +252,8 @@ def errors_of_others(
             fit = models.fit(state)
             maps[stage] |= {scan.id: fit.expected_um(scan) for scan in prepared}
             numbers[stage] = max(fit.numbers, numbers[stage])
-    terms = {"measurement": "shared", "held_out": held_out}
     rows = []
     for stage, known in maps.items():
         own = [known[scan.id] for scan in scans]
-        rows += error_rows(scans, own, numbers[stage], seed, model=stage, **terms)
+        rows += error_rows(scans, own, numbers[stage], seed, model=stage, held_out=held_out)
     return rows

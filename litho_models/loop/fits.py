@@ -76,10 +76,6 @@ class Study:
         fold = {one: number for number, members in enumerate(lists) for one in members}
         return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
 
-    def of_others(self, scans: Sequence[PrintedScan]) -> Study:
-        """Divide other scans into folds in the same way, without progress messages."""
-        return Study.dealt(scans, len(self.folds), self.seed, self.workers)
-
     def __getstate__(self) -> dict[str, object]:
         """Drop workers and progress messages, which cannot be sent to another process."""
         return {**self.__dict__, "workers": HERE, "report": _silent}
@@ -89,6 +85,10 @@ class Study:
         """Return, for each fold, the indices of the scans outside it and of those inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
+
+    @property
+    def stored(self) -> list[PrintedScan]:
+        return [scan.stored for scan in self.scans]
 
     @property
     def windows(self) -> list[PreparedScan]:
@@ -114,7 +114,7 @@ class Study:
     @cached_property
     def groups(self) -> dict[str, Labels]:
         """Return the label of each scan in every grouping."""
-        return groupings([scan.stored for scan in self.scans])
+        return groupings(self.stored)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.fits import State, Study
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
@@ -52,25 +53,19 @@ class Judgement:
         """Return the number of scans that improve, and the number of all scans."""
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
-    @property
-    def matters(self) -> bool:
-        """Return whether the gain is large enough to be useful."""
-        return self.gain_nm2 >= 2 * SMALLEST_SHARE * self.before_nm2
+    def reason(self, by: str = ALL) -> str:
+        """Return why the change is not confirmed; empty if it is confirmed.
 
-    def passed(self, *, grouped: bool = False) -> bool:
-        """Return whether the change is confirmed."""
-        return not self.reason(grouped=grouped)
-
-    def reason(self, *, grouped: bool = False) -> str:
-        """Return why the change is not confirmed; empty if it is confirmed."""
+        ``by`` is the grouping by which its strength differs.
+        """
         better, count = self.improved
         if count < FEWEST_SCANS:
             return f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm anything"
-        if self.p > (GROUPED_P if grouped else CONFIRM_P):
+        if self.p > (CONFIRM_P if by == ALL else GROUPED_P):
             return f"only {better} of {count} held-out scans improve (p = {self.p:.3f})"
         if self.low_nm2 <= 0:
             return "the confidence interval of the gain on held-out scans includes zero"
-        if not self.matters:
+        if self.gain_nm2 < 2 * SMALLEST_SHARE * self.before_nm2:
             return f"the gain of {100 * self.gain_nm2 / self.before_nm2:.2f} % is too small to matter"
         return ""
 

@@ -211,8 +211,11 @@ class Twin:
         """Return the chain of effects for one scan or, without a scan, with mean strengths; ``extra`` is a
         further effect to try.
         """
-        labels = {one.by: label_of(scan.stored, one.by) for one in self.effects.values()} if scan else {}
-        return EffectChain(self.fitted_base, {**self.values(labels), **(extra or {})}, self.frames)
+        base, labels = self.fitted_base, dict[str, str]()
+        if scan is not None:
+            labels = {one.by: label_of(scan.stored, one.by) for one in self.effects.values()}
+            base = base.of_scan(scan.id) if isinstance(base, FoldedBase) else base
+        return EffectChain(base, {**self.values(labels), **(extra or {})}, self.frames)
 
     @torch.no_grad()
     def height(
@@ -225,13 +228,8 @@ class Twin:
             known: fields of this scan that twins with the same base have already computed. New fields are
                 added.
         """
-        chain, known = self.chain(scan, extra), {} if known is None else known
-        exposed_um, key = chain.before_base(scan.context.layout_um, scan.context, known)
-        key = (*key, self.numbers.tobytes())
-        if key not in known:
-            base = self.fitted_base
-            known[key] = (base.of_scan(scan.id) if isinstance(base, FoldedBase) else base)(exposed_um)
-        return chain.after_base(known[key], scan.context, known, key)[0, 0].numpy()
+        chain, context = self.chain(scan, extra), scan.context
+        return chain(context.layout_um, context, known, self.numbers.tobytes())[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
         """Return the step of each parameter, (p,), for difference quotients. It is negative only near an
@@ -280,7 +278,8 @@ class Twin:
         counted = (
             parameter
             for parameter, facts, bound in own
-            if facts.kind == kind and (bound != facts.null if kind == "amplitude" else facts.is_length)
+            if facts.kind == kind
+            and (bound != facts.null if kind == "amplitude" else facts.unit in ("µm", "px"))
         )
         return ", ".join(dict.fromkeys(counted))
 

@@ -52,10 +52,10 @@ class ErrorRow(Record):
     """
 
     model: Stage
-    measurement: MeasuredBy
+    measurement: MeasuredBy = "shared"
     policy: Policy
     k: float
-    held_out: Literal["scans", "prints", "nested folds", "nested prints", "locked"]
+    held_out: Literal["scans", "prints", "nested folds", "nested prints", "locked"] = "scans"
     printer_numbers: int
     measurement_numbers: int
     mae_nm: float

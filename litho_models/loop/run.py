@@ -113,7 +113,7 @@ def close_loop(
         own = {closed.base_name: bases[closed.base_name]}
 
         def close_again(scans: Sequence[PrintedScan]) -> Closed:
-            return close(study.of_others(scans), own)
+            return close(Study.dealt(scans, folds, seed, places), own)
 
         models = HeldOut(closed)
         errors, left_out_nm = models.errors(), models.left_out_nm()
@@ -178,7 +178,7 @@ def _nested(
 
     Also count how often each effect was chosen.
     """
-    scans = [scan.stored for scan in study.scans]
+    scans = study.stored
     ids = [scan.id for scan in scans]
     parts = (
         [[ids[i] for i in own] for _, own in study.folds]
@@ -250,8 +250,8 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
             **result.split.model_dump(mode="json"),
             "lock_box_files_sha256": sorted(store.files_sha256(result.split.lock_box).values()),
         },
-        training_level_share=level_share([scan.stored for scan in closed.given.scans]),
-        training_step_share=step_share([scan.stored for scan in closed.given.scans]),
+        training_level_share=level_share(closed.given.stored),
+        training_step_share=step_share(closed.given.stored),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
             {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},

@@ -112,7 +112,7 @@ def describe(
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
-        if judgement.passed(grouped=one.by != ALL):
+        if not judgement.reason(one.by):
             found.append(Cause(one.name, one.by, (), judgement, one.family_p, one.group_p, one.start()))
     return found
 
@@ -138,7 +138,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
         fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
             judgement = judge_states(found.state, fitted[one.name])
-            if refused := judgement.reason(grouped=one.by != ALL):
+            if refused := judgement.reason(one.by):
                 found.refused[one.name] = refused
                 continue
             alike = _alike(one, fitted, found.state, screening)
@@ -273,7 +273,7 @@ def _test_again(found: Found) -> None:
         without = found.state.without(cause.name)
         judgement = judge_states(without, found.state)
         at = found.causes.index(cause)
-        if judgement.passed(grouped=cause.by != ALL):
+        if not judgement.reason(cause.by):
             found.causes[at] = replace(cause, judgement=judgement)
         else:
             found.causes.pop(at)

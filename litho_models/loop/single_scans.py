@@ -88,7 +88,7 @@ class SingleScans:
             name,
             "; ".join(filter(None, (judgement.reason(), told))),
             role="undetermined" if unclear else effect.role,
-            seen=judgement.passed(),
+            seen=not judgement.reason(),
             p=judgement.p,
             spread={parameter: self._spread(own, facts.unit) for (parameter, facts), own in spread},
         )

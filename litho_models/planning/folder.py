@@ -14,8 +14,7 @@ from litho_data.foundation.files import atomic_file
 from litho_data.layouts.card_text import TABLE_NAME, write_card, write_layout, write_table
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_data.reports.page import filled
-from litho_models.planning.designer import WORDS
-from litho_models.planning.layouts import Limits
+from litho_models.planning.layouts import WORDS, Limits
 from litho_models.planning.record import NextPrint, PlannedScan
 from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 

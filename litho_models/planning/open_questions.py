@@ -55,7 +55,7 @@ def open_questions(
     """Return all open questions with fitted rivals, the most valuable question first."""
     asking = _Asking(closed, report)
     found = [asking.of_cause(one) for one in closed.traced]
-    stored = [scan.stored for scan in closed.study.scans]
+    stored = closed.study.stored
     return OpenQuestions(
         dataset=result.dataset,
         noise=asking.noise,

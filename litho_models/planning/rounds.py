@@ -1,19 +1,50 @@
-"""Run a loop, write its open questions, and decide them with later prints of the same printer."""
+"""Run a loop, write its open questions, and decide them with later prints of the same printer.
+
+Every rival is fitted to all prints, old and new, and judged only on the new prints. The difference of two
+squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
+standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
+one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
+better. The difference must have p <= 0.005, and it must be at least 1 % of the squared error of the better
+rival. If only one rival remains, it is the answer.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from scipy.stats import f as f_distribution
+from scipy.stats import f_oneway
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.effects import get_effect
+from litho_models.effects.effect import Role
 from litho_models.loop import run
 from litho_models.loop.closing import Closed
-from litho_models.loop.record import CloseLoop
-from litho_models.planning.deciding import decide, with_decisions
+from litho_models.loop.fits import Study
+from litho_models.loop.judging import CONFIRM_P, SMALLEST_SHARE
+from litho_models.loop.model import Twin
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision
+from litho_models.loop.single_scans import SingleScans
+from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.open_questions import open_questions
+from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
+from litho_models.scan_terms import freed_um, terms_of_effect
+from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
+from litho_models.scan_terms.term import row_index
+
+NONE: Decided = "none of them"
+UNSEEN: Decided = "not shown by these prints"
+BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
+_ROLES: dict[Owner | None, Role] = {"printer": "process", "microscope": "measurement"}
+_BLOCK_PX = 32
 
 
 def close_loop(
@@ -27,7 +58,7 @@ def close_loop(
     """Close the loop on a store by ``loop.run.close_loop``, and write its open questions with the result.
 
     Args:
-        new_prints: further stores of the same printer. They decide the open questions (see ``deciding``) and
+        new_prints: further stores of the same printer. They decide the open questions (see ``decide``) and
             change nothing that was found on the first store.
         settings: settings of ``loop.run.close_loop``.
 
@@ -82,3 +113,208 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
                 hint="enter it in the column turned_deg of the card's table, and build the store again",
             )
     return scans
+
+
+def decide(
+    closed: Closed,
+    open_: OpenQuestions,
+    new: Sequence[PrintedScan],
+    report: Callable[[str], None] = lambda message: None,
+) -> list[Decision]:
+    """Return the decision on every declared question that scans can answer.
+
+    Args:
+        closed: the loop that asked the questions.
+        new: scans that this loop did not use.
+    """
+    judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
+    kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
+    decisions = []
+    for question in open_.questions:
+        if question.kind != "fact":
+            report(f"deciding on {question.name}")
+            decisions.append(kinds.get(question.kind, judge.among_rivals)(question))
+    return decisions
+
+
+@dataclass(frozen=True)
+class Judge:
+    """New scans, together with the scans to which a model was fitted.
+
+    Attributes:
+        twin: the corrected model with common strengths.
+        study: the study to which this model was fitted.
+        new: scans that were not used in the fits of the study.
+    """
+
+    twin: Twin
+    study: Study
+    new: Sequence[PreparedScan]
+
+    def among_rivals(self, question: Question) -> Decision:
+        """Fit every rival, and a model without rivals, to all scans, and judge the fits on the new scans."""
+        twins = [rival.twin(self.twin) for rival in question.rivals]
+        without = twins[0].without(question.rivals[0].effect)
+        names = [*(rival.name for rival in question.rivals), NONE]
+        twins.append(without)
+        left = {}
+        windows = [*self.study.windows, *(scan.window for scan in self.new)]
+        for name, twin, fit in zip(names, twins, fit_rivals(twins, windows), strict=True):
+            fitted = twin.at(fit.vector)
+            left[name] = [left_nm(scan, fitted.height(scan)) for scan in self.new]
+        return compared(question, self.new, left)
+
+    def of_single_scans(self, question: Question) -> Decision:
+        """Compare the variance of a per-scan term between prints with its variance between repeats."""
+        own = terms_of_effect(question.name)
+        scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
+        by_print: dict[str, list[np.ndarray]] = {}
+        for scan, values in zip(
+            self.new, scans.coefficients(own, own | {"offset", "gain", "bow"}), strict=True
+        ):
+            by_print.setdefault(scan.stored.print_id, []).append(values)
+        repeated = [np.array(one) for one in by_print.values() if len(one) > 1]
+        count, total = len(repeated), sum(map(len, repeated))
+        if count < 2:
+            return _decision(question, self.new, BOTH, "no print was scanned twice", UNSEEN)
+        ratio = float(np.median(f_oneway(*repeated).statistic))
+        law = f_distribution(count - 1, total - count)
+        expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
+        told = (
+            "the ratio of the variance between prints to the variance between repeats is "
+            f"F({count - 1}, {total - count}) = {ratio:.2f}"
+        )
+        left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
+        return _decision(question, self.new, left, told)
+
+    def of_lines(self, question: Question) -> Decision:
+        """In rotated scans, compare the offsets along the rows of the layout with the offsets along the scan
+        lines.
+        """
+        turned = [scan for scan in self.new if axis_along(scan.line) == 0]
+        if not turned:
+            return _decision(question, self.new, BOTH, "no scan is rotated", UNSEEN)
+        rows, lines = [], 0
+        for scan in turned:
+            used, index = scan.usable, row_index(scan.usable.shape)
+            residual = freed_um(scan.stored.height_um, self.twin.height(scan), used, frozenset({"offset"}))
+            offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in (index, scan.line))
+            rows.append([*offsets, residual[used].var() / used.shape[1]])
+            lines += len(used)
+        written, scanned, own = 1e6 * np.mean(rows, axis=0)
+        z = (written - scanned) / ((written + scanned + own) * np.sqrt(2 / lines))
+        told = (
+            f"in the rotated scans, the variance of line offsets is {written:.1f} nm² along the layout's "
+            f"rows and {scanned:.1f} nm² along the scan lines (z = {z:.1f})"
+        )
+        return _decision(question, turned, _left(z >= Z_DECIDED, z <= -Z_DECIDED), told)
+
+
+def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
+    """Add the decisions to the result. If an effect is the only remaining answer, its verdict becomes
+    ``explained``, and its role is set to that of its owner.
+    """
+    decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
+    roles = {
+        rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
+        for question in open_.questions
+        for rival in question.rivals
+        if (question.name, rival.name) in decided
+    }
+    effects = [
+        one.model_copy(update={"verdict": "explained", "confusable_with": [], "role": roles[one.name]})
+        if one.name in roles
+        else one
+        for one in result.effects
+    ]
+    return result.model_copy(update={"decisions": decisions, "effects": effects})
+
+
+def compared(
+    question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
+) -> Decision:
+    """Judge the answers to a question by their residuals on the new scans, maps (y, x) in nm."""
+    comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
+    # A smaller gain does not count, as in the loop: it may come from effects that are not among the rivals.
+    least = {
+        name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
+        for name, own in left_nm.items()
+    }
+    excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
+    left = [name for name in left_nm if name not in {*excluded, NONE}]
+    told = [
+        f"{one.better} fits better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})"
+        for one in comparisons
+        if one.better in left and one.worse != NONE
+    ] or ["no rival fits better than another"]
+    if len(left) > 1 and question.form_nm is not None:
+        nearest_nm = min(one.difference_nm for one in comparisons if {one.better, one.worse} <= {*left})
+        told.append(
+            f"the model's own error is at most {question.form_nm:.1f} nm, and the two most similar "
+            f"remaining rivals differ by {nearest_nm:.1f} nm"
+        )
+    nothing = not left or (NONE not in excluded and len(left) == 1)
+    decision = _decision(question, new, left, "; ".join(told), NONE if nothing else None)
+    return decision.model_copy(update={"comparisons": comparisons})
+
+
+def _compare(
+    pair: tuple[str, str],
+    left_nm: Mapping[str, Sequence[np.ndarray]],
+    new: Sequence[PreparedScan],
+    question: Question,
+) -> Comparison:
+    """Compare the squared errors of two rivals.
+
+    The errors are summed over blocks, and their difference is compared with its spread within and between
+    prints.
+    """
+    by_print: dict[str, np.ndarray] = {}
+    pixels, difference = 0, 0.0
+    for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
+        pixels += int(np.isfinite(first).sum())
+        difference += float(np.nansum((second - first) ** 2))
+        name = scan.stored.print_id
+        by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
+    total = float(sum(sums.sum() for sums in by_print.values()))
+    # The mean over blocks is the result of a print; the spread about this mean is noise.
+    noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
+    sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
+    form = pixels * (question.form_nm or 0.0) ** 2
+    return Comparison(
+        better=pair[total < 0],
+        worse=pair[total >= 0],
+        gain_nm2=abs(total) / max(pixels, 1),
+        z=surely_better(abs(total), difference, sd, form),
+        difference_nm=float(np.sqrt(difference / max(pixels, 1))),
+    )
+
+
+def _block_sums(gain: np.ndarray) -> np.ndarray:
+    rows, columns = (np.arange(max(2, n // _BLOCK_PX)) * n // max(2, n // _BLOCK_PX) for n in gain.shape)
+    return np.add.reduceat(np.add.reduceat(np.nan_to_num(gain), rows, axis=0), columns, axis=1)
+
+
+def _left(printer: bool, microscope: bool) -> Sequence[str]:
+    """Return the owners that remain possible after the test."""
+    return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
+
+
+def _decision(
+    question: Question,
+    scans: Sequence[PreparedScan],
+    left: Sequence[str],
+    evidence: str,
+    verdict: Decided | None = None,
+) -> Decision:
+    """Return the decision on a question. By default, the question is decided if only one answer remains."""
+    return Decision(
+        question=question.name,
+        kind=question.kind,
+        declared=[rival.name for rival in question.rivals] or list(BOTH),
+        left=list(left),
+        verdict=verdict or ("decided" if len(left) == 1 else "still open"),
+        evidence=evidence,
+        prints=len({scan.stored.print_id for scan in scans}),
+        scans=len(scans),
+    )

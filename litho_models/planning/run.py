@@ -18,9 +18,18 @@ from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
 from litho_models.loop.run import MODEL_FOLDER
 from litho_models.planning.answers import of_others, of_rivals
-from litho_models.planning.designer import TURNED, choose, climbed, together
 from litho_models.planning.folder import HOLDS, schedule, write_plan
-from litho_models.planning.layouts import STEPS, TILE_PX, Limits, as_tensor, assemble
+from litho_models.planning.layouts import (
+    STEPS,
+    TILE_PX,
+    TURNED,
+    Limits,
+    as_tensor,
+    assemble,
+    choose,
+    climbed,
+    together,
+)
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report

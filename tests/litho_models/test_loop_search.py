@@ -206,12 +206,12 @@ STUDY = Study((), np.empty(0))
 
 def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> None:
     before = np.full(10, 100.0)
-    assert judge(before, np.full(10, 90.0), STUDY).passed()
+    assert judge(before, np.full(10, 90.0), STUDY).reason() == ""
     half = judge(before, before - 20.0 * (np.arange(10) % 2), STUDY)
     # All five gains are positive, which is one of 2^5 arrangements of signs.
     assert half.p == pytest.approx(2**-5)
-    assert not half.passed()
-    assert half.passed(grouped=True)
+    assert half.reason()
+    assert not half.reason("field")
     assert half.improved == (5, 10)
 
 
@@ -234,7 +234,7 @@ def test_a_common_strength_too_large_for_some_scans_is_evidence_all_the_same() -
     # The gain of a scan is s² - (s - m)² for its strength s and the mean strength m, plus noise.
     gains = strengths**2 - (strengths - strengths.mean()) ** 2
     np.testing.assert_allclose(judged.gains_nm2, gains, atol=4 * 2 / 50_000**0.5)
-    assert judged.passed()
+    assert not judged.reason()
 
 
 def test_the_reason_says_what_is_missing() -> None:

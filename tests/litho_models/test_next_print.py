@@ -42,7 +42,6 @@ from litho_models.loop.record import CloseLoop, Decision, FoundEffect
 from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
-from litho_models.planning.deciding import MICROSCOPE, NONE, PRINTER, Judge, compared, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.open_questions import _Asking, _owners, _question
 from litho_models.planning.questions import (
@@ -57,7 +56,16 @@ from litho_models.planning.questions import (
 )
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
-from litho_models.planning.rounds import close_loop, new_scans
+from litho_models.planning.rounds import (
+    MICROSCOPE,
+    NONE,
+    PRINTER,
+    Judge,
+    close_loop,
+    compared,
+    new_scans,
+    with_decisions,
+)
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
@@ -168,20 +176,20 @@ def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_d
     values = {"length_um": 0.3, "rising": 0.5, "direction": 1.0}
     lag, thinning = get_effect("feedback-lag"), get_effect("slope-thinning")
     chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values})
-    seen = chain.after_base(height, replace(plain, quarter_turns=1))
+    seen = chain(height, replace(plain, quarter_turns=1))
     by_hand = torch.rot90(lag(torch.rot90(height, 1, (-2, -1)), values, plain), -1, (-2, -1))
     assert torch.equal(seen, by_hand)
-    back = chain.after_base(height, replace(plain, backward=True))
+    back = chain(height, replace(plain, backward=True))
     assert torch.allclose(back, lag(height, {**values, "direction": -1.0}, plain))
     amounts = thinning.with_values({"along_x_um": 0.2})
     frames: tuple[dict[str, Frame], ...] = ({}, {"slope-thinning": "scan"})
     for own, axis in zip(frames, ("along_x_um", "along_y_um"), strict=True):
         chain = EffectChain(torch.nn.Identity(), {"slope-thinning": amounts}, own)
         expected = thinning(height, thinning.with_values({axis: 0.2}), plain)
-        assert torch.allclose(chain.after_base(height, replace(plain, quarter_turns=1)), expected, atol=1e-6)
+        assert torch.allclose(chain(height, replace(plain, quarter_turns=1)), expected, atol=1e-6)
     tip = EffectChain(torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}})
-    assert torch.equal(tip.after_base(height, replace(plain, new_tip=True)), height)
-    assert not torch.equal(tip.after_base(height, plain), height)
+    assert torch.equal(tip(height, replace(plain, new_tip=True)), height)
+    assert not torch.equal(tip(height, plain), height)
 
 
 def test_the_position_of_a_window_turns_with_the_scan() -> None:

@@ -17,9 +17,8 @@ from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.prepared import prepare_scans
-from litho_models.planning import designer
-from litho_models.planning.designer import SECOND_DOSE
-from litho_models.planning.layouts import as_tensor
+from litho_models.planning import layouts
+from litho_models.planning.layouts import SECOND_DOSE, as_tensor
 from litho_models.planning.rivalry import PlannedPrint, Printing, Way
 from litho_models.planning.run import next_print
 from tests.litho_models.loop_scans import base_model, blank_scans
@@ -82,14 +81,14 @@ def test_a_plan_takes_a_second_dose_where_it_separates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float, doses: set[float]
 ) -> None:
     loop = closed_loop(tmp_path / "loop", [slope_question()])
-    plain = designer.score
+    plain = layouts.score
     asked: list[tuple[float, ...]] = []
 
     def score(rivalry, level, ways, place="centre", doses=(1.0,)):
         asked.append(tuple(doses))
         return plain(rivalry, level, ways, place) * (gain if SECOND_DOSE in doses else 1.0)
 
-    monkeypatch.setattr(designer, "score", score)
+    monkeypatch.setattr(layouts, "score", score)
     plan = next_print(loop, tmp_path / "plan", prints=2, field_um=9.6, steps=0, layouts="random")
     assert plan is not None
     assert (1.0, SECOND_DOSE) in asked
