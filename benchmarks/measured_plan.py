@@ -20,8 +20,8 @@ from benchmarks.record import publish
 from litho_data.commands.progress import run_script
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
-from litho_models.planning.folder import HOLDS
 from litho_models.planning.record import NextPrint
+from litho_models.planning.run import HOLDS
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "next-print"

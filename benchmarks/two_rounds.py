@@ -147,7 +147,7 @@ def run_trial(
     asked: list[tuple[Closed, OpenQuestions]] = []
 
     def ask(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[OpenQuestions]]:
-        asked.append((closed, open_questions(closed, result, report)))
+        asked.append((closed, open_questions(closed, result)))
         return result, [asked[-1][1]]
 
     result = close_loop(folder / "first.zarr", folder / "loop", base=BASE, further=ask)

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.fits import State, Study, fit_state, without_terms
+from litho_models.loop.fits import State, fit_state, without_terms
 from litho_models.loop.judging import judge_states
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Secants
@@ -47,19 +47,10 @@ class Check:
     left_nm2: float
     secants: Secants
 
-    @property
-    def laws_in(self) -> list[str]:
-        """Return the names of the laws in the model."""
-        return [one.name for one in self.others if get_effect(one.name).knowledge == "law"]
-
-    @property
-    def study(self) -> Study:
-        """Return the study that the model is fitted to."""
-        return self.state.study
-
     def of(self, cause: Cause) -> Cause:
         """Judge one cause in the model that contains all other effects."""
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
+        laws = ", ".join(one.name for one in self.others if get_effect(one.name).knowledge == "law")
         cause = replace(cause, judgement=judge_states(without, self.state))
         reshaped_nm2 = reshaped_gain(without, self.state)
         share = reshaped_nm2 / max(cause.judgement.gain_nm2, 1e-9)
@@ -69,8 +60,8 @@ class Check:
             reason = f"not needed when the other effects are in the model: {unneeded}"
         elif larger:
             reason = f"it may merely correct an error in the formula of {larger}"
-        elif self.laws_in and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
-            reason = f"with {', '.join(self.laws_in)} in the model, its gain falls to less than half"
+        elif laws and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
+            reason = f"with {laws} in the model, its gain falls to less than half"
         elif outgrown := self.state.twin.at_limits(cause.name, "shape"):
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
@@ -113,7 +104,7 @@ class Check:
         state = self.state.without(cause.name)
         laws: list[str] = []
         while len(laws) < 2 and (law := self._best_law(state, numbers)):
-            state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), self.study)
+            state = fit_state(state.twin.with_effect(law.name, law.by, law.start()), state.study)
             numbers -= law.numbers
             laws.append(law.name)
             if not judge_states(self.state, state).reason():

@@ -196,7 +196,7 @@ def _simplest(searches: Mapping[str, Found]) -> str:
         for name, found in searches.items()
         if found.state.mse_nm2 <= (1 + 2 * SMALLEST_SHARE) * best_nm2
     }
-    return min(close, key=lambda name: close[name])
+    return min(close, key=close.__getitem__)
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:

@@ -219,9 +219,10 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
     common = twin.at(fitted.vector)
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
-    per_fold = []
-    for fold, (own, _) in enumerate(study.folds):
-        per_fold.append(_without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own]))
+    per_fold = [
+        _without(common, fold, [fitted.linear[i] for i in own], [windows[i] for i in own])
+        for fold, (own, _) in enumerate(study.folds)
+    ]
     maps = [per_fold[fold].height(one) for fold, one in zip(study.fold_of, windows, strict=True)]
     held_out = [one.height - one.at_sample(own) for one, own in zip(windows, maps, strict=True)]
     freed = [

@@ -109,11 +109,12 @@ def _values(twin: Twin) -> dict[str, float]:
         return {}
     found = {}
     for name, parameter in base.named_parameters():
-        if name in base.ranges:
-            found[base.ranges[name].name] = float(base.ranges[name].value(parameter.detach()))
-            continue
-        for i, value in enumerate(parameter.detach().reshape(-1)):
-            found[f"{name} {i}" if parameter.numel() > 1 else name] = float(value)
+        if known := base.ranges.get(name):
+            found[known.name] = float(known.value(parameter.detach()))
+        else:
+            numbers = parameter.detach().reshape(-1).tolist()
+            names = [f"{name} {i}" for i in range(len(numbers))] if len(numbers) > 1 else [name]
+            found |= zip(names, numbers, strict=True)
     return found
 
 

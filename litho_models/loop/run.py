@@ -118,14 +118,12 @@ def close_loop(
         models = HeldOut(closed)
         errors, left_out_nm = models.errors(), models.left_out_nm()
         planted = [plant(*one, closed, close_again) for one in wanted]
-        often: dict[str, int] = {}
+        often = Counter[str]()
         if nested:
-            rows, often = _nested(study, nested, close_again)
-            errors += rows
+            errors += _nested(study, nested, close_again, often)
         if open_lock_box and locked:
             errors += errors_of_others([(models, locked)], locked, "locked", seed)
         alone: list[ScanFinding] = []
-        residuals = models.residuals()
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
@@ -147,7 +145,7 @@ def close_loop(
         result, beside = further(closed, result) if further else (result, ())
         for written in (result, *beside):
             written.write(folder)
-        write_report(result, residuals, folder)
+        write_report(result, models.residuals(), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
         save_laws(result, folder)
     return result
@@ -171,12 +169,13 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 
 
 def _nested(
-    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
-) -> tuple[list[ErrorRow], dict[str, int]]:
+    study: Study,
+    nested: Nested,
+    close_again: Callable[[Sequence[PrintedScan]], Closed],
+    often: Counter[str],
+) -> list[ErrorRow]:
     """Repeat all choices without each fold (or print), and judge them on the fold (or print) that was left
-    out.
-
-    Also count how often each effect was chosen.
+    out. Count in ``often`` how often each effect is chosen.
     """
     scans = study.stored
     ids = [scan.id for scan in scans]
@@ -185,7 +184,6 @@ def _nested(
         if nested == "folds"
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
-    often = Counter[str]()
 
     def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
         for number, out in enumerate(progress(parts, "repeating all choices"), 1):
@@ -194,7 +192,7 @@ def _nested(
             often.update(closed.final.twin.names)
             yield HeldOut(closed), [scan for scan in scans if scan.id in out]
 
-    return errors_of_others(anew(), scans, f"nested {nested}", study.seed), dict(often)
+    return errors_of_others(anew(), scans, f"nested {nested}", study.seed)
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
@@ -218,13 +216,11 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
     """Save the corrected model of the printer, with the strengths of the latest scan."""
-    twin = closed.final.twin
-    base = twin.fitted_base
-    if isinstance(base, FoldedBase):
-        base = base.common
+    base = closed.final.twin.fitted_base
+    base = base.common if isinstance(base, FoldedBase) else base
     assert isinstance(base, Simulator)
     latest = max(closed.study.scans, key=lambda scan: scan.stored.order)
-    values = twin.chain(latest).values
+    values = closed.final.twin.chain(latest).values
     sides = {"process": "printer", "measurement": "microscope"}
 
     def on(*roles: str) -> dict[str, dict[str, float]]:
@@ -254,6 +250,6 @@ def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) ->
         training_step_share=step_share(closed.given.stored),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         metrics=[
-            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy},
+            {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": error.policy}
         ],
     )

@@ -133,7 +133,10 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
     left = screening.standing()
     study.report(f"{len(left)} of {len(effects)} candidates are significant")
     while left:
-        entering = [left[0], *_rivals(left[0], left[1:], screening)]
+        best = left[0]
+        # Up to three rivals enter with the best candidate.
+        near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
+        entering = [best, *[one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]]
         left = [one for one in left if one not in entering]
         fitted = _fitted(found.state, entering)
         for one in sorted(entering, key=lambda one: fitted[one.name].mse_nm2):
@@ -184,24 +187,19 @@ def _regroup(found: Found, name: str) -> None:
     if best is None:
         return
     (by, p), known = best, twin.values()[name]
-    starts = {label: dict(known) for label in study.groups[by]}
-    for label, steps in gained(study.groups[by])[1].items():
-        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
-            value = known[slot.parameter] + step
-            starts[label][slot.parameter] = min(max(value, slot.facts.lower), slot.facts.upper)
+    starts = {
+        label: known
+        | {
+            slot.parameter: min(max(known[slot.parameter] + step, slot.facts.lower), slot.facts.upper)
+            for slot, step in zip(slots.values(), steps.tolist(), strict=True)
+        }
+        for label, steps in gained(study.groups[by])[1].items()
+    }
     state = fit_state(twin.without(name).with_effect(name, by, starts), study, from_here=True)
     if judge_states(found.state, state).p <= GROUPED_P:
         study.report(f"the strength of {name} differs by {by}")
         found.causes[at_cause] = replace(cause, by=by, group_p=p)
         found.state = state
-
-
-def _rivals(best: Screened, standing: Sequence[Screened], screening: Screening) -> list[Screened]:
-    """Return up to three rivals of the best candidate. A rival makes a similar change, and its predicted gain
-    is at least 30 % of the best gain.
-    """
-    near = (one for one in standing if one.gain_nm2 >= 0.3 * best.gain_nm2)
-    return [one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]
 
 
 def _alike(

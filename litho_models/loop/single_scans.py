@@ -130,7 +130,7 @@ class SingleScans:
         }
         bare, freed = (self._freed(by_column, terms) for terms in (accepted, accepted | {"layout-columns"}))
         columns = _as_variance(bare, freed, self.study).gains_nm2
-        found = []
+        found: list[ScanFinding] = []
         for name, other in permutations(names):
             gains = judged[name].gains_nm2
             behind = judged[other].gains_nm2 - gains

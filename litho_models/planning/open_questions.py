@@ -7,7 +7,7 @@ becomes two rivals. One of them rotates with the print, and the other rotates wi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from litho_data.layouts.statistics import layout_statistics
 from litho_data.store import PrintedScan
-from litho_models.effects import CATALOGUE, get_effect
+from litho_models.effects import get_effect
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
@@ -47,13 +47,9 @@ _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
-def open_questions(
-    closed: Closed,
-    result: CloseLoop,
-    report: Callable[[str], None] = lambda message: None,
-) -> OpenQuestions:
+def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
     """Return all open questions with fitted rivals, the most valuable question first."""
-    asking = _Asking(closed, report)
+    asking = _Asking(closed)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = closed.study.stored
     return OpenQuestions(
@@ -82,11 +78,11 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 class _Asking:
     """Make the questions of a closed loop that have rivals."""
 
-    def __init__(self, closed: Closed, report: Callable[[str], None]):
-        self.closed, self.study, self.report = closed, closed.study, report
+    def __init__(self, closed: Closed):
+        self.closed, self.study = closed, closed.study
         self.twin = closed.final.twin.ungrouped()
         self.maps = closed.final.maps_um(closed.study.scans)
-        self.left_nm = self._left_by(self.maps)
+        self.left_nm = [*map(left_nm, self.study.scans, self.maps)]
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
@@ -123,17 +119,16 @@ class _Asking:
         names = [one.name for one in standing]
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
-        twins = [_with(self.twin, one) for one in standing]
-        rivals = self._rivals(names, twins)
+        rivals = self._rivals(names, [_with(self.twin, one) for one in standing])
         # The loop estimated the error of the model's form without these effects. Here it is estimated with
         # each of them.
         learner = Learner(self.study, self.maps)
-        fitted = [rival.twin(self.twin) for rival in rivals]
-        rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in fitted]
-        return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
+        maps = ([*map(rival.twin(self.twin).height, self.study.scans)] for rival in rivals)
+        form_nm = min(learner.rest(one).most_nm for one in maps)
+        return _question("suspects", names, rivals=rivals, form_nm=form_nm)
 
     def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> list[Rival]:
-        self.report(f"fitting the rivals {', '.join(members)}")
+        self.study.report(f"fitting the rivals {', '.join(members)}")
         windows, units = self.study.windows, independent(self.study.scans)
         stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
         rivals = []
@@ -156,9 +151,6 @@ class _Asking:
             ]
         return rivals
 
-    def _left_by(self, maps_um: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
-
     def _spread(self, name: str) -> float:
         """Return the spread of the evidence for an effect over scans, after the spread due to noise is
         subtracted. The result is relative to the mean of the evidence.
@@ -169,7 +161,7 @@ class _Asking:
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
-        for before, after in zip(self._left_by(without), self.left_nm, strict=True):
+        for before, after in zip(map(left_nm, self.study.scans, without), self.left_nm, strict=True):
             change = np.nan_to_num(before - after)
             size = float((change**2).sum())
             if size:
@@ -228,9 +220,6 @@ def _missing_facts(closed: Closed) -> dict[str, str]:
     """Return the effects that could not be tested because a fact about the prints is missing, with
     reasons.
     """
-    reasons = {name: why for name, why in closed.untestable.items() if name in CATALOGUE}
-    if "field_um" not in (closed.study.scans[0].stored.write or {}):
-        reasons = (
-            dict.fromkeys(_OF_PLACE, "the position of the prints in the write field is not known") | reasons
-        )
-    return reasons
+    known = "field_um" in (closed.study.scans[0].stored.write or {})
+    unplaced = "the position of the prints in the write field is not known"
+    return dict.fromkeys(() if known else _OF_PLACE, unplaced) | closed.untestable

@@ -10,7 +10,7 @@ rival. If only one rival remains, it is the answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -52,7 +52,6 @@ def close_loop(
     out: str | Path,
     *,
     new_prints: Sequence[str | Path] = (),
-    report: Callable[[str], None] = lambda message: None,
     **settings: Any,
 ) -> CloseLoop:
     """Close the loop on a store by ``loop.run.close_loop``, and write its open questions with the result.
@@ -70,13 +69,13 @@ def close_loop(
     new = [scan for one in further for scan in new_scans(first, one)]
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
-        open_ = open_questions(closed, result, report)
+        open_ = open_questions(closed, result)
         if new:
-            result = with_decisions(result, open_, decide(closed, open_, new, report))
+            result = with_decisions(result, open_, decide(closed, open_, new))
         return result, [open_]
 
     used = [one.sha256 for one in further]
-    return run.close_loop(store, out, further=asked, decided_by=used, report=report, **settings)
+    return run.close_loop(store, out, further=asked, decided_by=used, **settings)
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
@@ -115,12 +114,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
     return scans
 
 
-def decide(
-    closed: Closed,
-    open_: OpenQuestions,
-    new: Sequence[PrintedScan],
-    report: Callable[[str], None] = lambda message: None,
-) -> list[Decision]:
+def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> list[Decision]:
     """Return the decision on every declared question that scans can answer.
 
     Args:
@@ -132,7 +126,7 @@ def decide(
     decisions = []
     for question in open_.questions:
         if question.kind != "fact":
-            report(f"deciding on {question.name}")
+            closed.study.report(f"deciding on {question.name}")
             decisions.append(kinds.get(question.kind, judge.among_rivals)(question))
     return decisions
 

@@ -209,7 +209,7 @@ def test_only_what_is_the_printers_is_exported(closed, store: Path, tmp_path: Pa
     twin = Twin.bare(base_model())
     for name in roles_of:
         twin = twin.with_effect(name, ALL, {"": get_effect(name).with_values({})})
-    study = SimpleNamespace(scans=scans)
+    study = SimpleNamespace(scans=scans, stored=[scan.stored for scan in scans])
     found = SimpleNamespace(final=SimpleNamespace(twin=twin), study=study, given=study)
     effects = [SimpleNamespace(name=n, role=role, confusable_with=[]) for n, role in roles_of.items()]
     save_model(found, result.model_copy(update={"effects": effects}), opened, tmp_path / "model")  # type: ignore[arg-type]

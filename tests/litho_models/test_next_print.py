@@ -700,9 +700,8 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     few = [replace(scan, sample=scan.sample[::4], height=scan.height[::4]) for scan in scans]
     known = []
     for study in (scans, few):
-        asking = SimpleNamespace(
-            study=SimpleNamespace(windows=study, scans=scans), report=lambda message: None
-        )
+        own = SimpleNamespace(windows=study, scans=scans, report=lambda message: None)
+        asking = SimpleNamespace(study=own)
         known += [np.trace(_Asking._rivals(cast(Any, asking), [name], [model(SLOPE)])[0].information)]
     # An evenly drawn quarter of the pixels gives a quarter of the sum, which is then scaled up.
     assert known[1] == pytest.approx(known[0], rel=0.1)
