@@ -39,7 +39,7 @@ class EffectChain(nn.Module):
         self.base = base
         self.frames = frames or {}
         self.values = {
-            name: get_effect(name).with_values(effects[name]) for name in in_forward_order(list(effects))
+            name: get_effect(name).with_values(effects[name]) for name in in_forward_order(effects)
         }
 
     @property

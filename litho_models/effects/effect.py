@@ -100,12 +100,12 @@ class FieldContext:
 
     def in_scan_frame(self) -> FieldContext:
         """Rotate the field into the frame of the scan, with the fast axis along x."""
-        if not self.quarter_turns % 4:
+        turn = self.quarter_turns % 4
+        if not turn:
             return self
         (ny, nx), whole, (top, left) = self.layout_um.shape[-2:], self.whole_shape(), self.origin_px
         below, right = whole[0] - top - ny, whole[1] - left - nx
         corners = [(top, left), (right, top), (below, right), (left, below)]
-        turn = self.quarter_turns % 4
         return replace(
             self,
             layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),

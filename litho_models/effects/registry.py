@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -165,17 +165,15 @@ def get_effect(name: str) -> Effect:
     return CATALOGUE[name]
 
 
-def in_forward_order(names: Sequence[str]) -> list[str]:
+def in_forward_order(names: Iterable[str]) -> list[str]:
     """Sort names in the order in which the effects act, from exposure to microscope.
 
     Raises:
         InputError: an unknown name.
     """
-    given = {get_effect(name).name for name in names}
-    known = {**CATALOGUE, **_NAMELESS}
     # Laws and tables act on the finished print, before the microscope.
-    ordered = sorted(known, key=lambda name: known[name].stage == "measurement")
-    return [name for name in ordered if name in given]
+    known = [*CATALOGUE, *_NAMELESS]
+    return sorted(set(names), key=lambda one: (get_effect(one).stage == "measurement", known.index(one)))
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
@@ -187,15 +185,10 @@ def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:
-        effects[TIP] = _tried_at(effects[TIP], tip_radius_um)
+        tip = effects[TIP]
+        radius_um = min(tip_radius_um, tip.parameters["radius_um"].upper)
+        known = [trial["radius_um"] for trial in tip.trials]
+        # A second trial with nearly the same radius would give no further information.
+        if all(abs(radius_um - one) >= 0.2 * one for one in known):
+            effects[TIP] = replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))
     return [*effects.values()]
-
-
-def _tried_at(tip: Effect, radius_um: float) -> Effect:
-    limits = tip.parameters["radius_um"]
-    radius_um = min(radius_um, limits.upper)
-    known = [trial["radius_um"] for trial in tip.trials]
-    # A second trial with nearly the same radius would give no further information.
-    if any(abs(radius_um - one) < 0.2 * one for one in known):
-        return tip
-    return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))

@@ -134,12 +134,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         return learner.rest(state.maps_um(freed.scans))
 
     lawful, described = _checked(start, named, rest)
-    stages: dict[State, str] = {}
-    for name, state in (
-        ("base", start), ("causes", named.state), ("laws", lawful.state), ("tables", described.state)
-    ):  # fmt: skip
-        # Stages are identified by their model: a stage that changes nothing equals the stage before it.
-        stages.setdefault(state, name)
+    stages = {"base": start, "causes": named.state, "laws": lawful.state, "tables": described.state}
     return Closed(
         base_name=chosen,
         rivals=searches,
@@ -148,7 +143,12 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         named=named,
         lawful=lawful,
         described=described,
-        rests={name: rest(state) for state, name in stages.items()},
+        # A stage that changes nothing has the model of the stage before it.
+        rests={
+            name: rest(state)
+            for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
+            if state is not before
+        },
         untestable=excluded,
     )
 

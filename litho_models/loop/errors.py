@@ -56,13 +56,13 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
         refit: whether to fit the printer again once the measurement model is known.
     """
     stored = [scan.stored for scan in scans]
-    maps = [twin.height(scan) for scan in scans]
+    maps = [*map(twin.height, scans)]
     measurement = learn_measurement(stored, maps, seed=seed)
     if refit and len(twin.vector):
-        freed = [measurement.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
+        freed = [*map(measurement.freed, stored, maps)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        maps = [twin.height(scan) for scan in scans]
+        maps = [*map(twin.height, scans)]
         measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
     return Fit(twin, measurement)
 
@@ -140,8 +140,9 @@ class HeldOut:
         if not self.study.of_films:
             # A smooth background has five coefficients.
             rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
-        between: dict[Stage, State] = {} if causes in self.ends.values() else {"causes": causes}
-        for name, state in {"base": self.closed.base, **between, **self.ends}.items():
+        for name, state in {"base": self.closed.base, "causes": causes, **self.ends}.items():
+            if name == "causes" and causes in self.ends.values():
+                continue
             self.study.report("scoring the base" if name == "base" else f"scoring {name}")
             rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]

@@ -87,8 +87,8 @@ def judge(
 
 def judge_states(before: State, after: State) -> Judgement:
     """Judge the change from one fitted model to another."""
-    evidence = [evidence_nm2(*pair) for pair in zip(before.freed_um, after.freed_um, strict=True)]
-    return judge(before.freed_nm2, after.freed_nm2, after.study, np.array(evidence))
+    evidence = np.array([*map(evidence_nm2, before.freed_um, after.freed_um)])
+    return judge(before.freed_nm2, after.freed_nm2, after.study, evidence)
 
 
 def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:

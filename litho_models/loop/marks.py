@@ -44,13 +44,15 @@ def marks(
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
     """Merge terms and marks by name; a name counts as seen if either list contains it as seen."""
-    found = {one.name: one for one in findings}
-    for mark in seen:
-        # Of two findings with the same name, the one that was seen is kept.
-        pair = sorted((found.get(mark.name, mark), mark), key=lambda one: not one.seen)
-        evidence = "; ".join(dict.fromkeys(one.evidence for one in pair))
-        found[mark.name] = pair[0].model_copy(update={"evidence": evidence})
-    return [*found.values()]
+    found: dict[str, list[ScanFinding]] = {}
+    for one in (*findings, *seen):
+        found.setdefault(one.name, []).append(one)
+    # Of two findings with the same name, the one that was seen is kept.
+    ordered = [sorted(own, key=lambda one: not one.seen) for own in found.values()]
+    return [
+        first.model_copy(update={"evidence": "; ".join(one.evidence for one in (first, *others))})
+        for first, *others in ordered
+    ]
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
@@ -86,8 +88,7 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
     """Test for scars: more outliers must be elongated along the scan lines than across them."""
-    counts = np.array([_drawn_out(scan, own) for scan, own in zip(scans, residuals, strict=True)])
-    along, across = counts.T
+    along, across = np.array([*map(_drawn_out, scans, residuals)]).T
     p = one_sided_flip_p((along - across).astype(float))
     text = (
         f"{along.sum()} outliers are elongated along the scan lines and {across.sum()} across them "
@@ -104,10 +105,10 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
     numbered, _ = label(scan.usable & (np.abs(residual_um) > 5 * spread))
     sizes, along, across = np.bincount(numbered.ravel()), 0, 0
-    for number, box in enumerate(find_objects(numbered), 1):
+    for size, box in zip(sizes[1:], find_objects(numbered), strict=True):
         height, width = (part.stop - part.start for part in box)
         # Patches with fewer pixels are noise; a scratch is at least four times as long as wide.
-        if sizes[number] >= 9:
+        if size >= 9:
             along += width >= 4 * height
             across += height >= 4 * width
     return (across, along) if axis_along(scan.line) == 0 else (along, across)
@@ -121,8 +122,7 @@ def _short_lines(
 
     Slopes are excluded, because the residuals there contain errors of the model.
     """
-    shared = np.array([_shared_nm2(*one) for one in zip(scans, maps_um, residuals, strict=True)])
-    along, across = shared.T
+    along, across = np.array([*map(_shared_nm2, scans, maps_um, residuals)]).T
     p = one_sided_flip_p(along - across)
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
     first, last = _LINE_LAGS_UM

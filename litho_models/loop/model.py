@@ -116,7 +116,7 @@ class Twin:
     @property
     def names(self) -> tuple[str, ...]:
         """Return the names of the effects, in the order in which they act."""
-        return tuple(in_forward_order(list(self.effects)))
+        return tuple(in_forward_order(self.effects))
 
     @cached_property
     def slots(self) -> list[Slot]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ class PreparedScan:
 
     @property
     def window(self) -> PreparedScan:
-        return self if self.quadrant is None else self.quadrant
+        return self.quadrant or self
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
         """Return the values of a (…, y, x) map at the sampled pixels, float64."""
@@ -79,8 +80,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
         raise InputError("scans to close the loop on", got="none", wanted="at least one")
     ranks = np.argsort(np.argsort([scan.order for scan in scans], kind="stable"), kind="stable")
     scaled = ranks / max(len(scans) - 1, 1) - 0.5 if len({s.order for s in scans}) > 1 else 0.0 * ranks
-    prepared = map(_prepare, scans, scaled.tolist())
-    return [_with_quadrant(one, number) for number, one in enumerate(prepared)]
+    return [*map(_with_quadrant, map(_prepare, scans, scaled.tolist()), count())]
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
@@ -91,10 +91,10 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
     def placed(scan: PreparedScan) -> PreparedScan:
         order = float(np.interp(scan.stored.order, orders, places))
-        part = None if scan.quadrant is None else placed(scan.quadrant)
+        part = scan.quadrant and placed(scan.quadrant)
         return replace(scan, context=replace(scan.context, order=order), quadrant=part)
 
-    return [placed(scan) for scan in prepare_scans(scans)]
+    return [*map(placed, prepare_scans(scans))]
 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:

@@ -103,10 +103,17 @@ def _residuals(page: Page, maps: Maps) -> None:
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:
-    rows = []
-    for name, strengths in one.strengths.items():
-        for own in strengths:
-            low, high = own.ci95 or (None, None)
-            facts = {"group": own.label, "value": own.value, "unit": own.unit, "from": low, "to": high}
-            rows.append({"effect": one.name, "parameter": name, **facts})
-    return rows
+    return [
+        {
+            "effect": one.name,
+            "parameter": name,
+            "group": own.label,
+            "value": own.value,
+            "unit": own.unit,
+            "from": low,
+            "to": high,
+        }
+        for name, strengths in one.strengths.items()
+        for own in strengths
+        for low, high in [own.ci95 or (None, None)]
+    ]

@@ -214,8 +214,7 @@ def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: S
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
-    evidence = [evidence_nm2(*pair) for pair in zip(*residuals_um, strict=True)]
-    return judge(was, now, study, np.array(evidence))
+    return judge(was, now, study, np.array([*map(evidence_nm2, *residuals_um)]))
 
 
 def _frame(effect: str) -> str:

@@ -175,12 +175,11 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
         shown = drawn.contrasts(prints, drawn.refitted(prints, first=first))
         powers.append([[of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in shown])
     fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2))
-    directed = dict(
-        zip(rivalry.pairs, zip(np.mean(powers, axis=0).tolist(), fitted, strict=True), strict=True)
-    )
+    directed = zip(np.mean(powers, axis=0).tolist(), fitted, strict=True)
+    ways = dict(zip(rivalry.pairs, directed, strict=True))
     found = []
     for pair in combinations(range(len(rivalry.twins)), 2):
-        mean, contrast = min((directed[pair], directed[pair[::-1]]), key=lambda one: one[0])
+        mean, contrast = min((ways[pair], ways[pair[::-1]]), key=lambda one: one[0])
         one, other = (rivalry.question.rivals[at].name for at in pair)
         found.append(
             PlannedPair(

@@ -155,7 +155,7 @@ class Rivalry:
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
         # Each of these models is assumed to be true in turn; refits start from ``twins``.
-        self.true = self.chains = [_chain(twin) for twin in self.twins]
+        self.true = self.chains = [*map(_chain, self.twins)]
 
     @property
     def pairs(self) -> list[tuple[int, int]]:

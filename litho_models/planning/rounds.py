@@ -163,9 +163,8 @@ class Judge:
         own = terms_of_effect(question.name)
         scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
         by_print: dict[str, list[np.ndarray]] = {}
-        for scan, values in zip(
-            self.new, scans.coefficients(own, own | {"offset", "gain", "bow"}), strict=True
-        ):
+        found = scans.coefficients(own, own | {"offset", "gain", "bow"})
+        for scan, values in zip(self.new, found, strict=True):
             by_print.setdefault(scan.stored.print_id, []).append(values)
         repeated = [np.array(one) for one in by_print.values() if len(one) > 1]
         count, total = len(repeated), sum(map(len, repeated))

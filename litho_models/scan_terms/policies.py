@@ -13,7 +13,7 @@ from litho_data.store import PrintedScan
 from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scan_terms.lines import shrunk_line_offsets
-from litho_models.scan_terms.term import TermPixels, Terms, chosen_terms, line_terms, row_index, term_maps
+from litho_models.scan_terms.term import TermPixels, Terms, line_terms, parameter_names, row_index, term_maps
 
 Policy = Literal["none", "offset", "offset-gain", "full", "full+rows"]
 BackgroundUse = Literal["none", "training", "shared"]
@@ -71,9 +71,7 @@ class NuisanceProtocol(Record):
     @classmethod
     def of_policy(cls, policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
         """Return the standard protocol of a policy."""
-        k = float(
-            sum(len(term.labels) for term in chosen_terms(policy_terms(policy)) if term.maps is not None)
-        )
+        k = float(len(parameter_names(policy_terms(policy))))
         return cls(policy=policy, k=k, background=background, **Blocks(seed=seed)._asdict())
 
     @property
