@@ -271,8 +271,9 @@ class Twin:
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def at_limits(self, name: str, kind: Kind) -> str:
-        """Return the amplitudes of an effect that lie on a limit of their range in some group, or its fitted
-        lengths (``shape``), such as ranges and depths. The null of an amplitude does not count as a limit.
+        """Return the names of an effect's amplitudes that lie on a limit of their range in some group,
+        separated by commas; for the kind ``shape``, those of its lengths, such as ranges and depths. The null
+        of an amplitude does not count as a limit.
         """
         own = ((one.parameter, one.facts, bound) for one, bound in self._on_bounds() if one.effect == name)
         counted = (

@@ -243,7 +243,6 @@ class CloseLoop(Result):
         errors: see ``ErrorRow``.
         gain_nm: the error of the base model minus the error of the corrected model, at k = 1 and with the
             shared measurement model. ``over_scans`` and ``over_prints`` contain its confidence intervals.
-        chosen: how often the nested selections chose each effect.
         confounded: pairs of parameters that these scans cannot determine separately, with the correlation of
             each pair.
         decisions: open questions of this store to which the prints of further stores were applied.
@@ -251,6 +250,7 @@ class CloseLoop(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
     FILE_NAME: ClassVar[str] = "close_loop.json"
+    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen"})
 
     run: RunInfo
     dataset: DatasetId
@@ -260,7 +260,6 @@ class CloseLoop(Result):
     settings: dict[str, Any]
     at_bounds: dict[str, float]
     split: Split
-    groups: dict[str, list[str]]
     errors: list[ErrorRow]
     gain_nm: float
     over_scans: OverUnits
@@ -272,7 +271,6 @@ class CloseLoop(Result):
     confounded: list[tuple[str, str, float]] = Field(default_factory=list)
     measurement: MeasurementModel
     explained: list[Explained]
-    chosen: dict[str, int] = Field(default_factory=dict)
     decisions: list[Decision] = Field(default_factory=list)
     verdict: Verdict
     fewest_scans: int

@@ -32,7 +32,6 @@ from litho_models.loop.record import (
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
-from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
 
@@ -68,7 +67,6 @@ def record(
         base_values=_values(closed.base.twin),
         corrected_values=_values(final),
         at_bounds=final.at_bounds(),
-        groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
         errors=errors,
         gain_nm=float(np.mean(gains)),
         over_scans=over_units(gains, seed=study.seed),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -118,9 +117,8 @@ def close_loop(
         models = HeldOut(closed)
         errors, left_out_nm = models.errors(), models.left_out_nm()
         planted = [plant(*one, closed, close_again) for one in wanted]
-        often = Counter[str]()
         if nested:
-            errors += _nested(study, nested, close_again, often)
+            errors += _nested(study, nested, close_again)
         if open_lock_box and locked:
             errors += errors_of_others([(models, locked)], locked, "locked", seed)
         alone: list[ScanFinding] = []
@@ -140,7 +138,6 @@ def close_loop(
             planted=planted,
             settings=settings,
             split=Split(kind="grouped", folds=len(study.folds), lock_box=opened.locked_ids),
-            chosen=often,
         )  # fmt: skip
         result, beside = further(closed, result) if further else (result, ())
         for written in (result, *beside):
@@ -169,13 +166,10 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 
 
 def _nested(
-    study: Study,
-    nested: Nested,
-    close_again: Callable[[Sequence[PrintedScan]], Closed],
-    often: Counter[str],
+    study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
     """Repeat all choices without each fold (or print), and judge them on the fold (or print) that was left
-    out. Count in ``often`` how often each effect is chosen.
+    out.
     """
     scans = study.stored
     ids = [scan.id for scan in scans]
@@ -189,7 +183,6 @@ def _nested(
         for number, out in enumerate(progress(parts, "repeating all choices"), 1):
             study.report(f"leaving out {', '.join(out)} and repeating all choices ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
-            often.update(closed.final.twin.names)
             yield HeldOut(closed), [scan for scan in scans if scan.id in out]
 
     return errors_of_others(anew(), scans, f"nested {nested}", study.seed)

@@ -75,8 +75,7 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 def prints_needed(powers: Sequence[float]) -> int | None:
     """Return the smallest number of prints with enough power; None if no tested number is enough."""
-    found = np.flatnonzero(np.array(powers) >= ENOUGH)
-    return int(found[0]) + 1 if len(found) else None
+    return next((prints for prints, power in enumerate(powers, start=1) if power >= ENOUGH), None)
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
@@ -235,8 +234,7 @@ def _planned(
 
 
 def _status(powers: Sequence[float], prints: int) -> Status:
-    reached = powers[prints - 1]
-    if reached >= ENOUGH:
+    if powers[prints - 1] >= ENOUGH:
         return "decides"
-    hopeful = reached > HOPELESS or prints_needed(powers) is not None
+    hopeful = powers[prints - 1] > HOPELESS or max(powers) >= ENOUGH
     return "may decide" if hopeful else _HOPELESS

@@ -257,9 +257,8 @@ def climbed(
     steps: int,
     kept: Path,
     report: Callable[[str], None],
-) -> tuple[list[np.ndarray], list[str]]:
-    """Optimise tiles for one question after the other. Return the soft levels of the tiles and the names of
-    the layouts from which they started.
+) -> list[np.ndarray]:
+    """Optimise tiles for one question after the other. Return the soft levels of the tiles.
 
     Args:
         kept: folder of finished tiles; tiles of an interrupted run are reused.
@@ -268,7 +267,7 @@ def climbed(
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
     able = [one for one in starts(tile_px, limits, seed) if _repeats(one[1]) <= _MOST_REPEATING]
     ranked = [sorted(able, key=lambda one: -score(rivalry, one[1], chosen.ways)) for rivalry in rivalries]
-    tiles, names = [], []
+    tiles = []
     for number in range(count):
         rank, which = divmod(number, len(rivalries))
         name, start = ranked[which][rank % len(ranked[which])]
@@ -281,8 +280,7 @@ def climbed(
             with atomic_file(file) as temporary:
                 np.save(temporary, tile)
         tiles.append(np.load(file))
-        names.append(name)
-    return tiles, names
+    return tiles
 
 
 def _repeats(level: np.ndarray) -> float:

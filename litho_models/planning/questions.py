@@ -83,7 +83,7 @@ def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
         powers += [*np.abs(np.fft.fft2(about_mean * window)) ** 2 / size**2]
     if not powers:
         powers = [np.full((size, size), float(np.mean([np.nanvar(one) for one in residuals_nm])))]
-    return NoiseSpectrum(power_nm2=np.round(np.mean(powers, axis=0), 3).tolist())
+    return NoiseSpectrum(power_nm2=np.mean(powers, axis=0).round(3).tolist())
 
 
 Kind = Literal["set", "suspects", "role", "per-scan", "lines", "fact"]

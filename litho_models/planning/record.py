@@ -81,6 +81,7 @@ class NextPrint(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"
+    FORMER: ClassVar[frozenset[str]] = frozenset({"smallest_feature_um", "level_distance", "starts"})
 
     run: RunInfo
     dataset: DatasetId
@@ -89,8 +90,5 @@ class NextPrint(Result):
     field_um: float
     levels: tuple[int, int]
     cutoff_per_um: float
-    smallest_feature_um: float
-    level_distance: float
-    starts: list[str]
     scans: list[PlannedScan]
     questions: list[PlannedQuestion]

@@ -51,13 +51,9 @@ def write_report(
         layouts_figure(first, plan.levels),
         "Levels of the first prints. Every print has the same tiles in a different order.",
     )
+    at = plan.prints - 1
     rows = [
-        {
-            **q.model_dump(),
-            "power": q.power[plan.prints - 1],
-            "random_power": q.random_power[plan.prints - 1],
-        }
-        for q in plan.questions
+        q.model_dump() | {"power": q.power[at], "random_power": q.random_power[at]} for q in plan.questions
     ]
     page.table(rows, "Open questions, and whether the plan decides them.", "questions.csv", columns=_COLUMNS)
     pictured = {rivalry.question.name: rivalry for rivalry in rivalries}

@@ -142,12 +142,12 @@ def next_print(
         turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
         chosen = together(choices, turned)
         count = _TILES if size_px > tile_px else prints
-        tiles, starts = [limits.random(tile_px, seed + 31 + i) for i in range(count)], ["random"]
+        tiles = [limits.random(tile_px, seed + 31 + i) for i in range(count)]
         # The finished tiles of an interrupted run are stored here.
         cache = Path(f"{out}-cache")
         if rivalries and layouts == "optimised":
             kept = cache / record_sha256({**open_.model_dump(mode="json"), **asked})[:16]
-            tiles, starts = climbed(
+            tiles = climbed(
                 rivalries, chosen, limits, tile_px, count, seed=seed, steps=steps, kept=kept, report=report
             )
         planned = [
@@ -178,8 +178,6 @@ def next_print(
         # A single print may have a defect.
         planned = planned[: max([_FEWEST_PRINTS, *needed])]
         scans, maps = schedule(planned, limits, printing, seed)
-        levels = np.stack([one.level.numpy() for one in planned]).astype(int)
-        share = np.bincount(levels.ravel(), minlength=card.levels) / levels.size
         plan = NextPrint(
             run=run_info([seed], len(scans)),
             dataset=open_.dataset,
@@ -188,9 +186,6 @@ def next_print(
             field_um=field_um,
             levels=(limits.lowest, limits.highest),
             cutoff_per_um=limits.cutoff_per_um,
-            smallest_feature_um=0.5 / limits.cutoff_per_um,
-            level_distance=float(0.5 * np.abs(share - open_.level_share).sum()),
-            starts=starts,
             scans=scans,
             questions=questions,
         )

@@ -221,10 +221,10 @@ class _Expanded:
             for label in sorted({labels[number] for labels in by}):
                 own[label] = len(self._shrunk) + np.arange(len(block.columns))
                 self._shrunk = np.append(self._shrunk, block.shrinking * usual[list(block.columns)])
-        self.alike = [
-            (members, np.concatenate([np.empty(0, int), *(o[n] for o, n in zip(self.rows, at, strict=True))]))
-            for at, members in by.items()
-        ]
+        self.alike = []
+        for labels, members in by.items():
+            rows = [own[label] for own, label in zip(self.rows, labels, strict=True)]
+            self.alike.append((members, np.concatenate([np.empty(0, int), *rows])))
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
         """Return the least-squares strengths (rows, targets) that fit each target. A target is the index of a

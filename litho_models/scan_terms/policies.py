@@ -109,11 +109,12 @@ def estimate_scan_terms(
 
     Use these terms only for training. Reported errors use the terms that ``cross_fit`` estimates.
     """
-    fitted = [
-        fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]
-        for scan, prediction in zip(scans, predictions_um, strict=True)
-    ]
-    coefficients = np.array(fitted)
+    coefficients = np.array(
+        [
+            fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]
+            for scan, prediction in zip(scans, predictions_um, strict=True)
+        ]
+    )
     # Offset and gain come first in the catalogue, with one map each.
     pinned = len(PINNED & terms)
     coefficients[:, :pinned] -= coefficients[:, :pinned].mean(axis=0)
