@@ -37,8 +37,16 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.heading("What was found")
         page.points([said("effect", one) for one in result.effects])
         columns = (
-            *("name", "knowledge", "verdict", "role", "by", "gain_nm2", "left_out_nm", "p_confirm"),
-            *("family_p", "confusable_with"),
+            "name",
+            "knowledge",
+            "verdict",
+            "role",
+            "by",
+            "gain_nm2",
+            "left_out_nm",
+            "p_confirm",
+            "family_p",
+            "confusable_with",
         )
         page.table(result.effects, "Effects added to the model.", "effects.csv", columns=columns)
         page.table(

@@ -209,46 +209,43 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
 
     Per-scan effects (``seen``) are listed elsewhere.
     """
+    named, films, count = closed.named, closed.study.of_films, len(closed.study.scans)
     sets = {other: one.name for one in added for other in one.confusable_with}
-    films, first, last = closed.study.of_films, closed.named.first, closed.named.last
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
     tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
     told = {*seen, *(one.name for one in added)}
+
+    def refused(name: str) -> tuple[CandidateVerdict, str]:
+        last, reason = named.last.get(name), named.refused.get(name, "")
+        if name in untestable:
+            return "not-testable", untestable[name]
+        if name in sets:
+            return "confusable", f"cannot be distinguished from {sets[name]}, which was added"
+        if any(one.name == name for one in named.failed):
+            return "resembles", reason
+        if last is None:
+            return "not-testable", "it was not screened"
+        if count < FEWEST_SCANS:
+            few = f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm it"
+            return "too-few-scans", few
+        if last.beside_base < SMALLEST_RETAINED:
+            return "not-testable", "on these layouts it cannot be distinguished from per-scan terms"
+        if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
+            return "absorbed", "a change of the base's parameters has the same effect"
+        if not last.allowed and named.first[name].family_p <= FAMILY_P:
+            return "contradicted", "its best-fitting strength has the wrong sign"
+        gained = f"it removes only {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
+        return "below-noise", reason or gained
+
     return [
         Candidate(
             name=name,
             verdict=verdict,
             reason=reason,
-            p_screen=first[name].family_p if name in first else None,
-            gain_nm2=last[name].gain_nm2 if name in last else None,
+            p_screen=named.first[name].family_p if name in named.first else None,
+            gain_nm2=named.last[name].gain_nm2 if name in named.last else None,
         )
         for name in dict.fromkeys([*untestable, *tried])
         if name not in told
-        for verdict, reason in [_refused(closed, name, sets, untestable)]
+        for verdict, reason in [refused(name)]
     ]
-
-
-def _refused(
-    closed: Closed, name: str, sets: Mapping[str, str], untestable: Mapping[str, str]
-) -> tuple[CandidateVerdict, str]:
-    """Explain why an effect is not in the model."""
-    named, count = closed.named, len(closed.study.scans)
-    last, refused = named.last.get(name), named.refused.get(name, "")
-    if name in untestable:
-        return "not-testable", untestable[name]
-    if name in sets:
-        return "confusable", f"cannot be distinguished from {sets[name]}, which was added"
-    if any(one.name == name for one in named.failed):
-        return "resembles", refused
-    if last is None:
-        return "not-testable", "it was not screened"
-    if count < FEWEST_SCANS:
-        return "too-few-scans", f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm it"
-    if last.beside_base < SMALLEST_RETAINED:
-        return "not-testable", "on these layouts it cannot be distinguished from per-scan terms"
-    if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-        return "absorbed", "a change of the base's parameters has the same effect"
-    if not last.allowed and named.first[name].family_p <= FAMILY_P:
-        return "contradicted", "its best-fitting strength has the wrong sign"
-    gained = f"it removes only {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
-    return "below-noise", refused or gained
