@@ -49,6 +49,11 @@ class Parameter:
     null: float = 0.0
     tried: tuple[float, ...] = ()
 
+    @property
+    def off(self) -> float:
+        """Return the value that this parameter has while its effect is off."""
+        return self.null if self.kind == "amplitude" else self.typical
+
 
 @dataclass(frozen=True)
 class FieldContext:
@@ -227,8 +232,7 @@ class Effect:
 
     def off_values(self) -> dict[str, float]:
         """Return the parameters at which the effect changes nothing."""
-        facts = self.parameters.items()
-        return {name: one.null if one.kind == "amplitude" else one.typical for name, one in facts}
+        return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return the values of all parameters; those that are not given have the values at which the effect

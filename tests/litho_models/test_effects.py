@@ -99,21 +99,20 @@ def test_gradient_equals_finite_difference(effect: Effect) -> None:
     for name, parameter in effect.parameters.items():
         if parameter.kind == "choice":
             continue
-        off = effect.off_values()[name]
-        for at in (parameter.typical, off):
+        for at in (parameter.typical, parameter.off):
             value = torch.tensor(at, dtype=array.dtype, requires_grad=True)
             (gradient,) = torch.autograd.grad(
                 (weights * effect(array, {**typical, name: value}, context)).sum(), value
             )
             # At its null, an amplitude may be at a bound or a kink, so step to one side only.
-            step = 1e-6 * (parameter.typical - parameter.null if at == off else parameter.typical)
+            step = 1e-6 * (parameter.typical - parameter.null if at == parameter.off else parameter.typical)
             # The typical size of an angle may be zero. Its step is then relative to its range.
             step = step or 1e-6 * (parameter.typical or parameter.upper - parameter.lower)
             up, here, down = (
                 float((weights * effect(array, {**typical, name: at + k * step}, context)).sum())
                 for k in (1, 0, -1)
             )
-            difference = (up - here) / step if at == off else (up - down) / (2 * step)
+            difference = (up - here) / step if at == parameter.off else (up - down) / (2 * step)
             # One-sided differences err by truncation, ~ step, and by rounding, ~ 1e-16 * 1584 px / step.
             assert float(gradient) == pytest.approx(difference, rel=1e-3, abs=1e-3)
 

@@ -253,8 +253,8 @@ def test_the_reason_says_what_is_missing() -> None:
 
 def test_a_gain_matters_from_two_percent_of_the_squared_error() -> None:
     before = np.full(8, 400.0)
-    assert judge(before, before - 8.1, STUDY).matters
-    assert not judge(before, before - 7.9, STUDY).matters
+    assert judge(before, before - 8.1, STUDY).reason() == ""
+    assert "too small to matter" in judge(before, before - 7.9, STUDY).reason()
 
 
 def test_a_rival_is_told_apart_by_a_quarter_of_the_gain_in_all_scans() -> None:
