@@ -117,10 +117,14 @@ class HeldOut:
 
     def __init__(self, closed: Closed):
         self.closed, self.study = closed, closed.given
-        self.ends: dict[Stage, State] = {"base": closed.base, "all": closed.final}
         self.scans = self.study.stored
         self._by_fold = cache(self._without_folds)
         self.fit = cache(lambda state: fit_with_measurement(state.twin, self.study.scans, self.study.seed))
+
+    @property
+    def ends(self) -> dict[Stage, State]:
+        """Return the base and the corrected model."""
+        return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
         """Return the errors of all models.
