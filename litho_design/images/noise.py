@@ -17,6 +17,9 @@ T = TypeVar("T")
 # Number of random draws within the uncertainty of a measurement. With this number, their rms is known to
 # 25 %.
 DRAWS = 8
+# Errors of a print are alike over long distances. A fit therefore hides more of them than it would if they
+# were independent, by this factor (found with ``benchmarks.coverage``).
+HIDDEN = 1.5
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
@@ -56,27 +59,25 @@ def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.outer(*map(np.hanning, shape)), np.logical_and.outer(*along)
 
 
-def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:
-    """Return the standard deviation of every figure in ``measured``, computed as the rms change of the figure
-    over variants of the measurement.
-    """
-    return {name: float(np.sqrt(np.mean(found**2))) for name, found in _changes(score, measured, variants)}
-
-
-def freed_of_noise(
-    score: Callable[[T], Record], measured: Record, variants: Iterable[T]
+def estimated(
+    score: Callable[[T], Record], measured: Record, noisier: Iterable[T], elsewhere: Iterable[T]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Correct figures for the bias that noise causes. Return the corrected figures, and the standard
-    deviation of each.
+    """Correct the figures of a measurement for noise and for what the registration and the levelling have
+    fitted. Return the corrected figures, and the standard deviation of each.
 
-    The measurement already contains noise, and each variant adds the same amount of noise again. The mean
-    change of a figure over the variants therefore estimates how much the noise in the measurement changed the
-    figure (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). The variants come in pairs
-    with opposite noise, so figures that are linear in the noise are not corrected.
+    The measurement already contains noise, and each variant in ``noisier`` adds the same amount of noise
+    again. Their mean change therefore estimates how much noise changed the figure, and is subtracted (bias
+    correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Each variant in ``elsewhere`` is a
+    measurement that the registration and the levelling cannot distinguish from the best fit. Fits make a
+    print look more like the expected one than it is, so the mean change of these variants is added. Variants
+    come in pairs with opposite signs, so figures that are linear in a change are not corrected for it.
     """
-    changes = dict(_changes(score, measured, variants))
-    figures = {name: getattr(measured, name) - float(found.mean()) for name, found in changes.items()}
-    return figures, {name: float(found.std()) for name, found in changes.items()}
+    noise, place = (dict(_changes(score, measured, variants)) for variants in (noisier, elsewhere))
+    figures = {
+        name: getattr(measured, name) - float(noise[name].mean()) + float(place[name].mean())
+        for name in noise
+    }
+    return figures, {name: float(np.hypot(noise[name].std(), HIDDEN * place[name].std())) for name in noise}
 
 
 def _changes(

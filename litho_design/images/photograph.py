@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
 from litho_design.images.measurements import PhotoSource
-from litho_design.images.noise import DRAWS, noise_of_light
+from litho_design.images.noise import DRAWS, HIDDEN, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
@@ -34,6 +34,11 @@ _VIGNETTING_SD = 0.1
 # A tilt is accepted if it reduces the unexplained variance to less than this share of the variance without a
 # tilt.
 _NEEDED = 0.93
+# Chance of a tilt this large at random: 0.1 %, from chi squared with two degrees of freedom.
+_TILT_SURE = 13.8 * HIDDEN**2
+# Images of prints by different models of the same printer differ in size by this standard deviation, so a
+# photograph of unknown scale cannot tell the scale better.
+_PRINT_SCALE_SD = 0.01
 # Standard deviation of the plausible tilts of a camera, over half the window.
 _TILT_SD = 0.1
 # Number of tiles along each side of the window.
@@ -121,6 +126,8 @@ class Photograph:
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
+        other_warps: pairs of maps like ``window_to_photo`` that are as plausible, given how well the
+            photograph determines it.
     """
 
     counts: np.ndarray
@@ -130,12 +137,13 @@ class Photograph:
     finest_per_um: float
     record: CameraRecord
     expected: np.ndarray
+    other_warps: list[np.ndarray]
 
     def image(self) -> np.ndarray:
         """Return the photograph resampled on the pixels of the window, shape (m, m), in counts per camera
         pixel. Some counts may be negative because of noise.
         """
-        return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
+        return self._warped(self.counts, self.window_to_photo)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
         """Express ``image`` as shares of the light on the element. ``power_counts`` is the sum of the counts
@@ -145,32 +153,31 @@ class Photograph:
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
-    def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images that are as plausible as the measured one, with different noise, dark level,
-        position, size and vignetting.
-        """
+    def with_more_noise(self) -> Iterator[np.ndarray]:
+        """Yield pairs of images with the noise of the photograph added once more, with opposite signs."""
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
         sd = np.sqrt(record.noise_counts**2 + (record.noise_share * light) ** 2)
         for _ in range(DRAWS):
             noise = sd * generator.standard_normal(light.shape)
-            noise -= record.dark_level_sd * generator.standard_normal()
-            moved = record.position_sd_um / self.pitch_um * generator.standard_normal(2)
-            scale, edge = generator.standard_normal(2) * (record.scale_sd, record.vignetting_sd)
             for sign in (1, -1):
-                counts = (self.counts + sign * noise).astype(np.float32)
-                yield self._warped(counts, sign * moved, sign * scale, sign * edge)
+                yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
-    def _warped(
-        self, counts: np.ndarray, moved_px: np.ndarray, scale: float, vignetting: float
-    ) -> np.ndarray:
+    def with_other_cameras(self) -> Iterator[np.ndarray]:
+        """Yield pairs of images that are as plausible as the measured one, with another position, size, dark
+        level and vignetting.
+        """
+        generator = np.random.default_rng(0)
+        for pair in zip(self.other_warps[::2], self.other_warps[1::2], strict=True):
+            dark, edge = generator.standard_normal(2) * (self.record.dark_level_sd, self.record.vignetting_sd)
+            for sign, warp in zip((1, -1), pair, strict=True):
+                yield self._warped(self.counts - np.float32(sign * dark), warp, sign * edge)
+
+    def _warped(self, counts: np.ndarray, warp: np.ndarray, vignetting: float = 0.0) -> np.ndarray:
         import cv2
         from scipy.fft import dctn, idctn
 
-        side, middle = self.side_px, (self.side_px - 1) / 2
-        about = np.diag([1 + scale, 1 + scale, 1])
-        about[:2, 2] = moved_px - scale * middle
-        warp = self.window_to_photo @ about
+        side = self.side_px
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
@@ -274,9 +281,8 @@ def photographed_image(
         notes=notes,
     )
     side = len(wanted)
-    return Photograph(
-        counts, fit.window_to_photo, side, wanted_pitch_um, finest_per_um, record, fit.gain * wanted
-    )
+    where, lit = fit.window_to_photo, fit.gain * wanted
+    return Photograph(counts, where, side, wanted_pitch_um, finest_per_um, record, lit, fit.other_warps)
 
 
 def _saturated(raw: np.ndarray) -> float:
@@ -383,8 +389,8 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fitted camera: the map (3, 3) from window to photograph pixels, and its other parameters with their
-    standard deviations.
+    """A fitted camera: the map (3, 3) from window to photograph pixels, pairs of maps that are as plausible,
+    and its other parameters with their standard deviations.
     """
 
     window_to_photo: np.ndarray
@@ -395,6 +401,7 @@ class _Fit:
     gamma: float = 1.0
     gamma_sd: float = 0.0
     blur_px: float = 0.0
+    other_warps: list[np.ndarray] = field(default_factory=list)
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
@@ -452,22 +459,36 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         images = smooth, fixed
         if more:
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
-        pose, found = solved(free, *images, pose)
+        pose, _ = solved(free, *images, pose)
     correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
     if further:
-        tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
+        with_tilt = [*free, 4, 5]
+        tilted, of_tilt = solved(with_tilt, smooth, fixed, pose)
         closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
-        if 1 - closer**2 < _NEEDED * (1 - correlation**2):
-            pose, found, correlation = tilted, of_tilt, closer
+        spread = _covariance(of_tilt.jac, of_tilt.fun, side)
+        tilt = tilted[4:] / unit[4:]
+        surely = tilt @ np.linalg.solve(spread[-2:, -2:], tilt) > _TILT_SURE
+        if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
+            pose, correlation = tilted, closer
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
-    spread = _covariance(found.jac, found.fun, side)
+    if pitch_sd:
+        spread[3, 3] += (min(pitch_sd, _PRINT_SCALE_SD) / unit[3]) ** 2
     scale_sd = float(np.sqrt(spread[3, 3]) * unit[3]) if pitch_sd else 0.0
     light = _light(seen(photo, pose), wanted, alike)
+    size, ways = np.linalg.eigh(spread)
+    generator, others = np.random.default_rng(0), []
+    for _ in range(DRAWS):
+        step = ways @ (np.sqrt(size.clip(0)) * generator.standard_normal(len(size)))
+        for sign in (1, -1):
+            at = pose.copy()
+            at[with_tilt] += sign * step * unit[with_tilt]
+            others.append(_camera(at, photo.shape, side, scale))
     return _Fit(
         warp,
         correlation,
+        other_warps=others,
         position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
         scale_sd=scale_sd,
         **light,

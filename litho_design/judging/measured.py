@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
+from numpy.polynomial import Legendre
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError, require_known
@@ -29,6 +31,8 @@ _SMALLEST_FOR_TIP = 64
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
 # This share of the change that the tip causes remains uncertain.
 _TIP_SD = 0.3
+# Orders of the terms from which the print's own tilt and bow are extrapolated.
+_ORDERS = (3, 4, 5, 6)
 
 
 class MeasuredRecord(Record):
@@ -51,6 +55,7 @@ class MeasuredRecord(Record):
     levelling: Levelling
     tilt_um_per_um: tuple[float, float]
     bow_um: float
+    removed_sd_um: float
     noise_um: float
     position_sd_um: float
     scale_sd: float
@@ -152,6 +157,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         levelling=source.levelling,
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
+        removed_sd_um=_removed_sd_um(complete - expected),
         noise_um=white_noise(complete - expected),
         position_sd_um=placed.position_sd_um,
         scale_sd=source.scale_sd,
@@ -261,10 +267,10 @@ def fitted_background(
     ny, nx = height_um.shape
     y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
     terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
-    columns = np.stack([expected_um, np.ones_like(x), *terms], axis=-1)
+    columns = np.stack([*terms, expected_um, np.ones_like(x)], axis=-1)
     found, *_ = np.linalg.lstsq(columns[valid], height_um[valid].astype(float), rcond=None)
-    slopes = found[2:4] if terms else np.zeros(2)
-    bow = columns[..., 4:] @ found[4:]
+    slopes = found[:2] if terms else np.zeros(2)
+    bow = columns[..., 2 : len(terms)] @ found[2 : len(terms)]
     tilt = slopes[0] * x + slopes[1] * y if terms else np.zeros_like(x)
     return Background(
         map_um=tilt + bow - bow.mean(),
@@ -276,9 +282,20 @@ def fitted_background(
     )
 
 
-def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield prints in µm, shape (ny, nx), that are as plausible as the measured one. They differ in noise,
-    position, height scale and tip.
+def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, with the noise of the scan added once more, with
+    opposite signs.
+    """
+    generator = np.random.default_rng(0)
+    for _ in range(DRAWS):
+        noise_um = record.noise_um * generator.standard_normal(height_um.shape)
+        for sign in (1, -1):
+            yield height_um + torch.from_numpy(sign * noise_um).to(height_um)
+
+
+def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one, with another
+    position, height scale and tip, and with tilt and bow of their own, which the levelling would remove.
     """
     from scipy.ndimage import shift
 
@@ -291,9 +308,41 @@ def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -
     if record.tip_um:
         pitches = (pitch_um, pitch_um)
         under_tip = paraboloid_erosion(measured, pitches, record.tip_um).surface - measured
+    removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
     for _ in range(DRAWS):
-        moved = shift(measured, position_px * generator.standard_normal(2), order=3, mode="nearest")
-        scale = 1 + record.scale_sd * generator.standard_normal()
-        noisy = scale * moved + record.noise_um * generator.standard_normal(measured.shape)
-        noisy += _TIP_SD * generator.standard_normal() * under_tip
-        yield torch.from_numpy(noisy.astype(np.float32)).to(height_um)
+        moved, scale, tip = (
+            generator.standard_normal(2),
+            generator.standard_normal(),
+            generator.standard_normal(),
+        )
+        own_um = removed @ (record.removed_sd_um * generator.standard_normal(removed.shape[-1]))
+        for sign in (1, -1):
+            print_um = shift(measured, sign * position_px * moved, order=3, mode="nearest")
+            print_um *= 1 + sign * record.scale_sd * scale
+            print_um += sign * (_TIP_SD * tip * under_tip + own_um)
+            yield torch.from_numpy(print_um).to(height_um)
+
+
+def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
+    """Return the products of Legendre polynomials of the given total orders, of shape (ny, nx, number of
+    products), each with an rms of 1.
+    """
+    y, x = (np.linspace(-1, 1, size) for size in shape)
+    pairs = [(i, order - i) for order in orders for i in range(order + 1)]
+    along = [[math.sqrt(2 * n + 1) * Legendre.basis(n)(at) for n in range(max(_ORDERS) + 1)] for at in (y, x)]
+    products = [np.outer(along[0][i], along[1][j]) for i, j in pairs]
+    return np.stack(products, axis=-1) if products else np.zeros((*shape, 0))
+
+
+def _removed_sd_um(off_um: np.ndarray) -> float:
+    """Return the standard deviation, in µm, of each term of tilt and bow that a print may have.
+
+    It is extrapolated from the next orders of the deviation from the expected print, ``off_um`` of shape (ny,
+    nx), whose power is taken to fall with the square of the order.
+    """
+    power = []
+    for order in _ORDERS:
+        shapes = _shapes(off_um.shape, [order])
+        amounts = np.tensordot(shapes, off_um, ((0, 1), (0, 1))) / off_um.size
+        power.append(float(np.mean(amounts**2)) * (order / 2) ** 2)
+    return math.sqrt(np.mean(power))

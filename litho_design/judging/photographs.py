@@ -15,7 +15,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.measurements import PhotoSource
-from litho_design.images.noise import freed_of_noise, uncertainties
+from litho_design.images.noise import estimated
 from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
 from litho_design.images.similarity import light_figures, likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject, object_name
@@ -104,7 +104,9 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    freed, uncertainty = freed_of_noise(figures, figures(image), photo.as_it_might_be())
+    freed, uncertainty = estimated(
+        figures, figures(image), photo.with_more_noise(), photo.with_other_cameras()
+    )
     # A blur beyond the expected image may come from the camera or the print, so part of its effect stays
     # uncertain.
     sharp, soft = (
@@ -190,10 +192,12 @@ def score_lens_photo(
     pictures = {f"object {object_name(which)}": wanted}
     for name, estimate in estimates(image).items():
         pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
-    score = figures(image)
+    freed, uncertainty = estimated(
+        figures, figures(image), photo.with_more_noise(), photo.with_other_cameras()
+    )
     return PhotoVerdict(
-        score,
-        uncertainties(figures, score, photo.as_it_might_be()),
+        LensPhotoScore(**freed),
+        uncertainty,
         photo.record.model_copy(update={"imaged": which}),
         {name: picture.cpu().numpy() for name, picture in pictures.items()},
     )

@@ -18,10 +18,10 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.measurements import MeasuredSource, PhotoSource
-from litho_design.images.noise import uncertainties
+from litho_design.images.noise import estimated
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredRecord, as_it_might_be, measured_print
+from litho_design.judging.measured import MeasuredRecord, measured_print, with_more_noise, with_other_fits
 from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
@@ -174,11 +174,12 @@ def judge_design(
 
 def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
     """Score a predicted or measured print, and compare its height with the designed height."""
-    figures, spread = loaded.score(height), None
+    scored, spread = loaded.score(height), None
+    figures = scored.model_dump()
     measured = isinstance(judge, MeasuredRecord)
     if isinstance(judge, MeasuredRecord):
-        variants = as_it_might_be(height, judge, loaded.record.layout.pitch_um)
-        spread = uncertainties(loaded.score, figures, variants)
+        others = with_other_fits(height, judge, loaded.record.layout.pitch_um)
+        figures, spread = estimated(loaded.score, scored, with_more_noise(height, judge), others)
     off = (height - loaded.expected_um).double()
     in_rings = loaded.record.in_rings
     area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)
@@ -189,6 +190,6 @@ def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, he
         independent=measured or judge.sha256 != loaded.record.printer.sha256,
         mean_height_difference_um=float((off * share).sum()),
         rms_height_difference_um=float((off.square() * share).sum().sqrt()),
-        figures=figures.model_dump(),
+        figures=figures,
         uncertainty=spread,
     )

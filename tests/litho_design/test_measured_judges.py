@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.coverage import Camera
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.measurements import MeasuredSource, PhotoSource
-from litho_design.images.noise import freed_of_noise
+from litho_design.images.noise import HIDDEN, estimated
 from litho_design.images.photograph import _saturated
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
@@ -26,44 +27,6 @@ from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
 
 DARK, WHITE, RANGE = 8000.0, 40000.0, 65535
-_FINER = 4
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Describe a camera by its position and its effect on the light."""
-
-    pitch_um: float = 0.15
-    turn_deg: float = 0.0
-    shift_um: tuple[float, float] = (0.0, 0.0)
-    scale: float = 1.0
-    tilt: tuple[float, float] = (0.0, 0.0)
-    vignetting: float = 0.0
-    noise: float = 0.0
-    exposure: float = 1.0
-    gamma: float = 1.0
-
-    def counts(self, light: np.ndarray, pitch_um: float, seed: int) -> np.ndarray:
-        """Return a uint16 photograph of the light (n, n), which is given on pixels of ``pitch_um``."""
-        step = self.pitch_um / pitch_um / self.scale
-        side = round(1.15 * len(light) / step)
-        place = (np.arange(side * _FINER) + 0.5) / _FINER - side / 2
-        across = 1 + 2 / side * (self.tilt[0] * place[None] + self.tilt[1] * place[:, None])
-        turn, middle = step * np.exp(1j * np.deg2rad(self.turn_deg)), (len(light) - 1) / 2
-        seen_at = turn * (place[None] + 1j * place[:, None]) / across + complex(*self.shift_um) / pitch_um
-        fine = cv2.remap(
-            light.astype(np.float32),
-            (seen_at.real + middle).astype(np.float32),
-            (seen_at.imag + middle).astype(np.float32),
-            cv2.INTER_CUBIC,
-        )
-        seen: np.ndarray = fine.clip(0).reshape(side, _FINER, side, _FINER).mean((1, 3))
-        edge = np.square(np.linspace(-1, 1, side))
-        seen *= (1 - self.vignetting * (edge[:, None] + edge) / 2) / seen.max()
-        seen += np.random.default_rng(seed).normal(0, self.noise, seen.shape)
-        bent = seen if self.gamma == 1 else seen.clip(0) ** self.gamma
-        counts = WHITE * self.exposure * bent + DARK
-        return counts.round().clip(0, RANGE).astype(np.uint16)
 
 
 @pytest.fixture(scope="module")
@@ -298,8 +261,8 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
         noise = sd * generator.standard_normal((4, *truth.shape))
         pairs = [seen + sign * one for one in noise for sign in (1, -1)]
         measured = Power(mean=seen.mean(), power=np.square(seen).mean())
-        figures, spread = freed_of_noise(
-            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs
+        figures, spread = estimated(
+            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs, [seen]
         )
         assert figures["mean"] == pytest.approx(measured.mean, abs=1e-12)
         drawn.append(measured.power)
@@ -309,6 +272,23 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
     assert np.mean(drawn) - wanted == pytest.approx(sd**2, abs=4e-3)
     assert np.mean(freed) == pytest.approx(wanted, abs=4e-3)
     assert spread["mean"] == pytest.approx(sd / np.sqrt(4000), rel=0.8)
+
+
+def test_what_a_fit_hides_is_added_to_figures():
+    """Check that the mean effect of what a fit cannot see is added. A shift of standard deviation s that is
+    fitted away hides a mean square of s^2.
+    """
+    shifts = 0.3 * np.random.default_rng(0).standard_normal(2000)
+    pairs = [sign * np.full(10, shift) for shift in shifts for sign in (1, -1)]
+
+    def score(one: np.ndarray) -> Power:
+        return Power(mean=one.mean(), power=np.square(one).mean())
+
+    figures, spread = estimated(score, score(np.zeros(10)), [np.zeros(10)], pairs)
+    # The mean of 2000 squares is known to sqrt(2 / 2000) = 3 %.
+    assert figures["power"] == pytest.approx(0.3**2, rel=0.1)
+    assert figures["mean"] == pytest.approx(0, abs=1e-12)
+    assert spread["mean"] == pytest.approx(0.3 * HIDDEN, rel=0.1)
 
 
 def test_baselines_stand_beside_every_score(printed_design, tmp_path):
