@@ -137,9 +137,11 @@ def scan(loaded: LoadedDesign, height: torch.Tensor, rng: np.random.Generator, f
     pitch_um = loaded.record.layout.pitch_um
     around = np.pad(height.double().numpy(), 16)
     size = len(around)
-    turn = cv2.getRotationMatrix2D((size / 2, size / 2), rng.normal(0, 1.5), 1 + rng.normal(0, 0.005))
+    turn = np.asarray(
+        cv2.getRotationMatrix2D((size / 2, size / 2), rng.normal(0, 1.5), 1 + rng.normal(0, 0.005)), float
+    )
     turn[:, 2] += rng.normal(0, 2, 2)
-    seen = cv2.warpAffine(around, turn, (size, size), flags=cv2.INTER_CUBIC)
+    seen = np.asarray(cv2.warpAffine(around, turn, (size, size), flags=cv2.INTER_CUBIC), float)
     y, x = np.mgrid[-1 : 1 : size * 1j, -1 : 1 : size * 1j]
     seen *= 1 + 0.02 * rng.standard_normal()
     tilt, bow = rng.normal(0, 0.2, 2), rng.normal(0, 0.05, 3)
