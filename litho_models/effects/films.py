@@ -121,7 +121,7 @@ def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor
     """Move edges along their normals. Films or gaps that are narrower than twice the shift vanish."""
     share = height[0, 0].detach() / context.full_height_um
     reach_px = float(outwards_px.detach().abs().max()) + _FLAT_PX + 1
-    distance, normal = map(torch.from_numpy, _from_edge(share.double().numpy(), reach_px))
+    distance, normal = map(torch.from_numpy, _from_edge(share.double().cpu().numpy(), reach_px))
     distance, normal = distance.to(height), normal.to(height)
     wanted = distance + outwards_px
     # Beyond its rim a film is flat. The value of a pixel there is taken from no farther than needed, because
@@ -131,20 +131,20 @@ def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor
     # Without a shift both limits are met. The derivative there is that of a shift outwards.
     nearer = wanted.clamp(min=-most)
     nearer = torch.where(nearer < most, nearer, most)
-    inwards = torch.where(distance.isfinite(), nearer + flat * (farthest - nearer) - distance, 0.0)
+    inwards = nearer + flat * (farthest - nearer) - distance
     return add_warp(height, inwards * normal[0], inwards * normal[1], 1.0)
 
 
 def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
     """Return the distance of each pixel from the nearest edge of a film, of shape (ny, nx), in px, positive
-    on the film, and the unit vector along which it grows, of shape (2, ny, nx). Farther than ``reach_px``,
-    the distance is infinite and the vector is zero.
+    on the film, and the unit vector along which it grows, of shape (2, ny, nx). At pixels that are farther
+    away, the distance is ``reach_px`` or its negative, and the vector is zero.
 
     Args:
         share: fraction of each pixel that the film covers, of shape (ny, nx). Edges are where it is one half.
     """
     points, normals = _crossings(share)
-    distance, normal = np.full(share.shape, np.inf), np.zeros((2, *share.shape))
+    distance, normal = np.where(share > 0.5, reach_px, -reach_px), np.zeros((2, *share.shape))
     if not len(points):
         return distance, normal
     pixels = np.moveaxis(np.indices(share.shape, float), 0, -1)
