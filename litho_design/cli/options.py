@@ -243,8 +243,9 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """Return the help text of an option, which begins with a lower-case letter."""
-    return f"{leaf.help[:1].lower()}{_told(leaf)[1:]}"
+    """Return the help text of an option. It begins with a lower-case letter, except in an abbreviation."""
+    told = _told(leaf)
+    return told if told[1:2].isupper() else told[:1].lower() + told[1:]
 
 
 def _told(leaf: Leaf) -> str:

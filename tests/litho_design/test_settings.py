@@ -21,6 +21,7 @@ from litho_data.commands.settings import Leaf, changed, leaves
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.quantities import LENGTH_UM
 from litho_design.cli.app import app
+from litho_design.cli.options import _described
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.settings import LensSettings, lens_settings
@@ -149,6 +150,14 @@ def test_help_shows_default_and_unit_of_every_option(command, monkeypatch):
         value = f"{leaf.value:g}" if isinstance(leaf.value, float) else str(leaf.value)
         assert value in shown
     assert ", µm" in shown
+
+
+@pytest.mark.parametrize(
+    ("meaning", "wanted"), [("Height map", "height map, nm"), ("AFM height map", "AFM height map, nm")]
+)
+def test_a_help_text_begins_in_lower_case_except_in_an_abbreviation(meaning, wanted):
+    leaf = Leaf(path="scan", kind=str, value="", help=meaning, unit="nm", options=("--scan",))
+    assert _described(leaf) == wanted
 
 
 def options_of(command):
