@@ -1,4 +1,6 @@
-"""The catalogue of effects: named, differentiable changes that do nothing at their null value."""
+"""The catalogue of effects: named, differentiable changes of the layout or height that can be
+switched off.
+"""
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, of_single_scans
 from litho_models.effects.registry import (

@@ -11,9 +11,10 @@ from litho_models.effects.effect import ActsOn, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
 from litho_models.simulator import Simulator, Tile
 
-# Whether an effect rotates with the print or with the scan.
+# The frame of an effect: whether the effect rotates with the print or with the scan.
 Frame = Literal["scan", "print"]
-# What a field depends on: the effects before it, with their values, and the base.
+# Key of a cached field: everything on which the field depends, which is the effects before it, their values,
+# and the base.
 Key = tuple[object, ...]
 Fields = MutableMapping[Key, Tensor]
 
@@ -22,10 +23,11 @@ class EffectChain(nn.Module):
     """Apply layout effects, then the base model, then height effects, in the order of the catalogue.
 
     Args:
-        base: a simulator, layout (b, 1, y, x) µm -> height (b, 1, y, x) µm.
-        effects: parameter values by the name of the effect; parameters that are not given are off.
-        frames: for height effects that deviate from the default, whether they rotate with the print or with
-            the scan. By default, effects of stage ``measurement`` rotate with the scan, and all others rotate
+        base: a simulator that maps a layout in µm to a height in µm. Both tensors have shape (b, 1, ny, nx).
+        effects: parameter values of each effect, by its name. A parameter that is not given has the value
+            that it has while its effect is off.
+        frames: for each effect that deviates from the default, whether it rotates with the print or with the
+            scan. By default, effects of stage ``measurement`` rotate with the scan, and all others rotate
             with the print.
     """
 
@@ -44,7 +46,7 @@ class EffectChain(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile of the base model; effects act on the whole field."""
+        """Return the tile with which the base model is applied. Effects act on the whole field."""
         return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(
@@ -54,12 +56,13 @@ class EffectChain(nn.Module):
         known: Fields | None = None,
         base_key: object = None,
     ) -> Tensor:
-        """Return the height (b, 1, y, x), µm. Without a context, the layout is taken as one write field.
+        """Return the predicted height, µm, of shape (b, 1, ny, nx). Without a context, the layout is taken as
+        one whole write field.
 
         Args:
-            known: fields after the base and after each effect, as far as they were already computed for the
-                same scan; newly computed fields are added.
-            base_key: identifies the base among the chains that share ``known``.
+            known: cached fields after the base and after each effect that other chains have already computed
+                for the same scan. Newly computed fields are added to it.
+            base_key: value that identifies the base among the chains that share ``known``.
         """
         if context is None:
             assert isinstance(self.base, Simulator)

@@ -1,4 +1,4 @@
-"""Define an effect: a differentiable change of the layout or the height that vanishes at its null value."""
+"""Define an effect: a differentiable change of the layout or height, which vanishes at its null values."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
-# What is known about a found effect: its cause, its formula, or only a variable on which it depends.
+# What is known about an effect that was found: its physical cause, only its formula, or only the variable on
+# which it depends.
 Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
-# Tolerance, as a share of the range, for values on a bound: storing them in float32 rounds them.
+# Tolerance, as a share of the range, for values that lie on a bound. It is needed because storing a value in
+# float32 rounds it.
 _ROUNDING = 1e-6
 
 
@@ -31,14 +33,14 @@ class Parameter:
     """One parameter of an effect.
 
     Args:
-        unit: ``1`` for a dimensionless parameter.
-        lower, upper: bounds of the physical range. An estimate outside this range contradicts the effect.
+        unit: unit of the value; ``1`` for a dimensionless parameter.
+        lower, upper: bounds of the physical range. A fitted value outside this range contradicts the effect.
         typical: a usual value, used for screening and as the starting value of fits.
-        kind: an ``amplitude`` switches the effect off when it equals its ``null``. A ``shape`` (such as a
-            length or a position) has no meaning while all amplitudes are switched off. A ``choice`` is a
+        kind: kind of parameter. The effect is off if every ``amplitude`` equals its ``null``. A ``shape``
+            (such as a length or a position) has no meaning while the effect is off. A ``choice`` is a
             shape with few possible values (such as a direction) and is never fitted.
         null: value of an amplitude at which the effect changes nothing.
-        tried: values that screening tries; if there are none, screening tries ``typical``.
+        tried: values that screening tries. If this tuple is empty, screening tries ``typical``.
     """
 
     unit: str
@@ -51,31 +53,34 @@ class Parameter:
 
     @property
     def off(self) -> float:
-        """Return the value that this parameter has while its effect is off."""
+        """Return the value that this parameter has while its effect is switched off."""
         return self.null if self.kind == "amplitude" else self.typical
 
 
 @dataclass(frozen=True)
 class FieldContext:
-    """The information about a field that an effect receives in addition to the array that it changes.
+    """The information about a printed field that an effect receives in addition to the array that it changes.
 
     Args:
-        layout_um: exposure (1, 1, y, x), µm: the nominal height times the relative dose.
+        layout_um: exposure of the field, which is the nominal height times the relative dose, µm, as a tensor
+            of shape (1, 1, ny, nx).
         pitch_um: lateral sampling, µm.
-        full_height_um: nominal height of the highest level, µm, the scale of pointwise effects.
-        slice_um: height of one slice, which is one level, µm.
-        field_centre_um: (y, x) of this field's centre in the write field, µm.
+        full_height_um: nominal height of the highest level, µm. Effects that act on each pixel separately use
+            it as their unit of height.
+        slice_um: height of one printed slice, which is the height of one level, µm.
+        field_centre_um: position (y, x) of the centre of this field in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
         slow_axis: axis perpendicular to the written lines.
         order: position of this field in the writing order, scaled so that the dataset spans -0.5 to 0.5.
-        scan_shape: (rows, columns) of the whole scan, if this field is only a part of a scan.
-        origin_px: (row, column) of this field's first pixel in the whole scan.
-        quarter_turns: number of quarter turns by which the print was rotated under the microscope, counted as
-            in ``rot90``.
+        scan_shape: numbers of rows and columns of the whole scan, if this field is only a part of a scan.
+        origin_px: row and column of this field's first pixel in the whole scan.
+        quarter_turns: number of quarter turns by which the print was rotated under the microscope, with the
+            direction of rotation of ``torch.rot90``.
         backward: whether the scan consists of retrace lines.
         new_tip: whether the scan was made with a new, sharp tip.
-        pixel_size: pixel size relative to that of the other scans. Lags in time are scaled by this ratio.
-        dose: dose relative to the recipe, already contained in ``layout_um``.
+        pixel_size: pixel size relative to that of the other scans. The length over which the probe lags is
+            proportional to it, because the time per pixel is the same.
+        dose: dose relative to the recipe. It is already contained in ``layout_um``.
     """
 
     layout_um: Tensor
@@ -96,15 +101,15 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return a quantity that depends only on the field; ``make`` computes it once, and the result is
-        cached.
+        """Return a quantity that depends only on this field. ``make`` computes it at the first call, and
+        later calls with the same ``name`` return the cached result.
         """
         if name not in self._kept:
             self._kept[name] = make(self)
         return self._kept[name]
 
     def in_scan_frame(self) -> FieldContext:
-        """Rotate the field into the frame of the scan, with the fast axis along x."""
+        """Return this context rotated into the frame of the scan, in which the fast axis runs along x."""
         turn = self.quarter_turns % 4
         if not turn:
             return self
@@ -120,34 +125,34 @@ class FieldContext:
         )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
-        """Return the position of each pixel relative to the centre of the write field, µm: shapes (y, 1) and
-        (1, x).
+        """Return the y and x positions of the pixels relative to the centre of the write field, µm. The two
+        tensors have shapes (ny, 1) and (1, nx).
         """
         rows, columns = self._pixels()
         (ny, nx), (y, x) = self.layout_um.shape[-2:], self.field_centre_um
         return (rows - (ny - 1) / 2) * self.pitch_um + y, (columns - (nx - 1) / 2) * self.pitch_um + x
 
     def whole_shape(self) -> tuple[int, int]:
-        """Return (rows, columns) of the whole scan."""
+        """Return the numbers of rows and columns of the whole scan."""
         return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
-        """Return the position of each pixel, which runs from -1 to 1 over the whole scan: shapes (y, 1) and
-        (1, x).
+        """Return the y and x positions of the pixels in the whole scan, over which each coordinate runs from
+        -1 to 1. The two tensors have shapes (ny, 1) and (1, nx).
         """
         rows, columns = self._pixels()
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
         return 2 * (rows + top) / max(ny - 1, 1) - 1, 2 * (columns + left) / max(nx - 1, 1) - 1
 
     def _pixels(self) -> tuple[Tensor, Tensor]:
-        """Return the row and column of each pixel, shapes (y, 1) and (1, x)."""
+        """Return the row numbers and the column numbers of the pixels, of shapes (ny, 1) and (1, nx)."""
         layout = self.layout_um
         y, x = (torch.arange(n, dtype=layout.dtype, device=layout.device) for n in layout.shape[-2:])
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
-        """Return half the width of the write field. If the card states no write field, return half the longer
-        side of this field.
+        """Return half the width of the write field, µm. If the dataset card states no write field, return
+        half the longer side of this field.
         """
         if self.field_radius_um is not None:
             return self.field_radius_um
@@ -158,7 +163,7 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise an error, because the terms of a per-scan effect are fitted to each scan and have no formula."""
+    """Raise InputError, because a per-scan effect has no formula: its terms are fitted to each scan."""
     raise InputError(
         "an effect in a model",
         got="a per-scan effect",
@@ -173,23 +178,27 @@ class Effect:
     Args:
         name: the identifier used in code, JSON and on the command line.
         title: short description for a process engineer.
-        stage: stage of the process.
-        role: whether the effect may become part of the exported process model.
+        stage: stage of printing or measurement at which the effect acts.
+        role: ``process`` if the printer causes the effect, ``measurement`` if the microscope causes it,
+            ``undetermined`` if the scans must show which of the two does, and ``nuisance`` if designs should
+            not depend on it. Only ``process`` effects become part of the exported process model.
         acts_on: ``layout``, the input of the base model, or ``height``, its output; both are in µm.
-        parameters: mapping from name to ``Parameter``, with at least one amplitude.
-        apply: pure function (field, values, context) -> field; both fields have the shape (b, 1, y, x) and
-            are in µm. For per-scan effects, it is ``of_single_scans``.
-        trials: parameter sets that screening compares with the null values. By default, screening tries one
-            amplitude at a time, at each of its ``tried`` values and for each combination of shapes.
+        parameters: the parameters by name. At least one of them must be an amplitude.
+        apply: the formula, a pure function ``apply(field, values, context)`` that returns the changed field.
+            Both fields have shape (b, 1, ny, nx) and are in µm. For per-scan effects, it is
+            ``of_single_scans``.
+        trials: parameter sets whose results screening compares with those of the null values. By default,
+            screening tries one amplitude at a time: each of its ``tried`` values, for every combination of
+            the values of the shapes.
         source: source of the formula.
         separating: experiment that distinguishes this effect from similar effects.
         needs: what a test of the effect requires: a known order of the scans, or a microscope with a probe.
-        reverses: parameters whose sign is opposite on retrace lines.
+        reverses: names of the parameters whose sign is opposite on retrace lines.
         of_tip: whether a new tip removes this effect.
-        of_films: true if this effect moves the edges of a film seen from above, and false if it changes
+        of_films: True if this effect moves the edges of a film seen from above, and False if it changes
             heights.
-        knowledge: what is known about the effect: the physical cause for a ``cause``, only a formula for a
-            ``law``, and only a covariate for a ``description``.
+        knowledge: what is known about the effect. For a ``cause``, the physical cause is known; for a
+            ``law``, only a formula; for a ``description``, only the variable on which it depends.
     """
 
     name: str
@@ -219,7 +228,7 @@ class Effect:
 
     @property
     def per_scan(self) -> bool:
-        """Return whether every scan has its own parameters."""
+        """Return whether this effect has separate parameters for every scan."""
         return self.apply is of_single_scans
 
     def _trials(self) -> Iterator[dict[str, float]]:
@@ -231,15 +240,15 @@ class Effect:
                     yield {name: value, **dict(zip(shapes, shape, strict=True))}
 
     def off_values(self) -> dict[str, float]:
-        """Return the parameters at which the effect changes nothing."""
+        """Return values of all parameters at which the effect changes nothing."""
         return {name: parameter.off for name, parameter in self.parameters.items()}
 
     def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the values of all parameters; those that are not given have the values at which the effect
-        is off.
+        """Return the values of all parameters. A parameter that is not in ``values`` gets the value that it
+        has while the effect is off.
 
         Raises:
-            InputError: a name that is not a parameter of this effect.
+            InputError: ``values`` contains a name that is not a parameter of this effect.
         """
         for name in values:
             require_known(f"parameter of {self.name}", name, self.parameters)
@@ -249,7 +258,8 @@ class Effect:
         """Check that all values are within their physical ranges.
 
         Raises:
-            InputError: a name that is not a parameter of this effect, or a value outside its physical range.
+            InputError: ``values`` contains a name that is not a parameter of this effect, or a value outside
+                the physical range of its parameter.
         """
         for name, value in self.with_values(values).items():
             limits = self.parameters[name]
@@ -266,11 +276,12 @@ class Effect:
         context: FieldContext,
         scanned: bool = False,
     ) -> Tensor:
-        """Apply the effect. Numbers are converted to tensors on the device of the array. Parameters that are
-        not given have the values at which the effect is off.
+        """Apply the effect to a layout or height. Numbers in ``values`` are converted to tensors on the
+        device of the array. A parameter that is not in ``values`` gets the value that it has while the effect
+        is off.
 
         Args:
-            scanned: whether to apply the effect as one of the microscope, which depends on the orientation,
+            scanned: whether the microscope causes the effect. If so, the effect depends on the orientation,
                 the direction and the tip of the scan.
         """
         tensors = {
@@ -297,8 +308,8 @@ def entry(
     acts_on: ActsOn,
     **facts: Any,
 ) -> Callable[[Apply], Effect]:
-    """Make a decorator that turns a formula into an effect of the same name. ``facts`` sets the other fields
-    of ``Effect``.
+    """Make a decorator that turns a formula (a function ``apply``) into an effect. The effect gets the name
+    of the function, with hyphens for underscores. ``facts`` sets the other fields of ``Effect``.
     """
 
     def of_formula(apply: Apply) -> Effect:

@@ -1,4 +1,6 @@
-"""Effects of the exposure: shape and background of the writing spot, and separately cured slices."""
+"""Effects of the exposure: the shape and background of the writing spot, the response of the resist to the
+dose, and slices that cure separately.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,9 @@ from torch import Tensor
 from litho_models.effects.effect import FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
-# Up to this difference of variances, the spot is narrowed along one axis by as much as it is widened along
-# the other. Above this difference the spot is only widened, so that high frequencies are not amplified
-# further.
+# If the variances of the spot along its two axes differ by less than about this value, the spot is narrowed
+# along one axis by as much as it is widened along the other. If they differ by more, the additional
+# difference only widens the spot, so that high frequencies are not amplified further.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
 
@@ -31,8 +33,8 @@ _SLICED_REACH_UM = 0.8
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Make the spot elliptical: T = exp(-2 π² f' C f), where C is added to the second moments of the spot.
-    The parameters are Cxx - Cyy and 2 Cxy.
+    """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² f' C f), where the
+    matrix C is added to the second moments of the spot. The parameters are Cxx - Cyy and 2 Cxy.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -54,8 +56,8 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
     separating="print one feature alone and inside dense surroundings of three sizes",
 )
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add the dose that leaks in from the neighbourhood: D = (M + η G_b * M) / (1 + η), where G_b is a
-    Gaussian of standard deviation b.
+    """Add the dose that leaks in from the neighbourhood of each pixel: D = (M + η G_b * M) / (1 + η), where
+    G_b is a Gaussian of standard deviation b.
     """
     weight, length = values["weight"], values["length_um"]
     blurred = add_blur(layout, length**2, context.pitch_um, 3 * float(length.detach()))
@@ -69,8 +71,8 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise the dose to a power: D = M_ref (M / M_ref)^p. Beforehand, 1 % of M_ref is added to M, so that the
-    slope at M = 0 stays finite.
+    """Raise the dose to a power: D = M_ref (M / M_ref)^p, where M_ref is the full height. Beforehand, 1 % of
+    M_ref is added to M, so that the slope at M = 0 stays finite.
     """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
@@ -91,11 +93,12 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     separating="pillars and pits of one width and several heights, from one slice to many",
 )
 def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Cure slices of height t separately: G*M becomes (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
+    """Cure slices of height t separately: the blurred layout G*M becomes
+    (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The difference is added to the height. The step is a logistic function about the threshold, scaled to map
-    0 to 0 and 1 to 1. A slice that is narrower than the spot is lost, and a gap narrower than the spot is
-    filled.
+    The difference between these two expressions is added to the height. The function ``step`` is a logistic
+    function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
+    spot is lost, and a gap that is narrower than the spot is filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
@@ -103,7 +106,9 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _exposed_slices(context: FieldContext) -> Tensor:
-    """Return the exposure of each slice, blurred by the spot, (slices, 1, y, x); 1 means fully exposed."""
+    """Return the exposure of each slice, blurred by the spot, where 1 means fully exposed. The result has
+    shape (slices, 1, ny, nx).
+    """
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
     # The dose changes the exposure, not the number of slices.

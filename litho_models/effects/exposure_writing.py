@@ -1,4 +1,6 @@
-"""Effects of the exposure that depend on position or order in the write field, or on the writing motion."""
+"""Effects of the exposure that depend on the position in the write field, the writing order or the motion of
+the beam.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# Frequency of the longest ripple. Longer ripples cannot be distinguished from smooth maps of the field.
+# Lowest frequency of a ripple. Slower ripples cannot be distinguished from smooth maps over the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
@@ -43,8 +45,8 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Change the height by focus and stage tilt over the field: H + 1[M > 0] (a x + b y + c r²), with
-    coordinates in units of R.
+    """Change the height of the print by the tilt and curvature of the focus surface over the write field:
+    H + 1[M > 0] (a x + b y + c r²). The coordinates are relative to R, half the width of the write field.
     """
     y, x = context.centred_um()
     radius = context.radius_um()
@@ -62,8 +64,8 @@ def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("order",),
 )
 def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the dose drift while fields are written: D = M (1 + ρ t), with t the position in the writing order,
-    -0.5 to 0.5.
+    """Let the dose drift from field to field: D = M (1 + ρ t), where t is the position of the field in the
+    writing order, from -0.5 to 0.5.
     """
     return layout * (1 + values["drift"] * context.order)
 
@@ -81,10 +83,11 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     separating="leave bare substrate in every field",
 )
 def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Remove the part that was written below the surface H_s of the substrate: max(H - z, H_s) where H > H_s.
+    """Remove the part of the print that was written below the surface H_s of the substrate: max(H - z, H_s)
+    where H > H_s.
 
-    The lost part, of height z, shrinks like the print: z = z0 (1 - k (1 - u)), where u is the mean nominal
-    height nearby as a fraction of the full height.
+    The lost part has height z and shrinks like the rest of the print: z = z0 (1 - k (1 - u)), where u is the
+    mean nominal height nearby as a fraction of the full height.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -102,8 +105,8 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the beam lag: filter the layout with a one-sided exponential of length l = v τ, whose mean delay is
-    removed.
+    """Let the beam lag behind its command: filter the layout along the written lines with a one-sided
+    exponential of length l = v τ. The mean delay of this filter is removed.
     """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
@@ -138,11 +141,11 @@ def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Te
     separating="scan each print at 0 and 90 degrees; scan a calibration grating",
 )
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), with x from the centre of a field of half width
-    r.
+    """Distort the written lines: M(x + c (r² / 3 - x²) / 2R), where x is measured from the centre of a
+    printed field of half width r.
 
-    Over a write field of half width R, the displacement is c x (1 - x / 2R). The part of it that registration
-    removes is left out.
+    Over a write field of half width R, the full displacement is c x (1 - x / 2R). The formula leaves out the
+    part of this displacement that registration removes.
     """
     lines_along_x = context.slow_axis == "y"
     y, x = context.scan_position()
@@ -165,8 +168,8 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
     separating="print the same layout with the writing order reversed",
 )
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0), with K_l one-sided along the slow
-    axis.
+    """Let earlier lines deplete the resist: D = max(M - e K_l * M, 0), where the kernel K_l is a one-sided
+    exponential of length l along the slow axis.
     """
     strength, length, direction = values["strength"], values["length_um"], values["direction"]
 
@@ -176,7 +179,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach_um = _TAIL_LENGTHS * float(length.detach())
     starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
-    # If another effect has made the dose negative, this dose is not changed.
+    # Where another effect has already made the dose negative, the dose is not reduced further.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 
@@ -197,8 +200,8 @@ def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """Add ripples at the hatching pitch p, which appear at their alias frequency f: H + 1[M > 0] (a cos 2π f
     y + b sin 2π f y).
 
-    For pixels of size dx, this frequency is f = |1/p - 1/dx|. The write field fixes the phase of the ripples,
-    which is the same in every print.
+    If the pixels have size dx, the alias frequency is f = |1/p - 1/dx|. The ripples have a fixed phase in the
+    write field, so they are the same in every print.
     """
     y, x = context.centred_um()
     phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)

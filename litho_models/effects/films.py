@@ -1,6 +1,6 @@
-"""Effects and laws of films: they move the edges of a written, developed or etched film, seen from above.
+"""Effects and laws of films, which move the edges of a written, developed or etched film seen from above.
 
-Lengths are in pixels of the layout. These pixels are fine enough for the resolution of the beam or lens.
+Lengths are in pixels of the layout. These pixels are fine enough to resolve the blur of the beam or lens.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp
 from litho_models.models.parts import etch
 
-# Standard deviations of the blur that defines the normals of a film's edges and of the blur that locates a
-# sharp rim, and the range of a diffusion.
+# Standard deviation of the blur from which the normals of a film's edges are computed, standard deviation of
+# the blur that locates a sharp rim, and range of the diffusion.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 1.0, 1.6, 50.0
-# Along a straight edge, no place is farther than this from the next crossing with the grid of pixels.
+# Along a straight edge, no point is farther than this from the nearest crossing of the edge with the grid of
+# pixels.
 _BESIDE_PX = 0.75
-# A film is flat farther than this from its edges.
+# A film is flat at all points that are farther than this from its edges.
 _FLAT_PX = 1.7
 
 _of_films = partial(entry, role="process", of_films=True)
@@ -61,7 +62,9 @@ def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) 
     separating="write necks and islands of five widths, at two baking times",
 )
 def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Blur the film by a Gaussian of variance s², and place its edge where the blurred film is one half."""
+    """Blur the film by a Gaussian of variance s², and place the new edge where the blurred film is
+    one half.
+    """
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
@@ -95,7 +98,8 @@ _AS_LAW: dict[str, Any] = {
 edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards by a constant", **_AS_LAW)
 
 
-# Over a longer length the mean is nearly the same at all edges of a field, and the law is a constant shift.
+# If the length were greater, the mean would be nearly the same at all edges of a field, and the law would be
+# a constant shift.
 _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
 
 
@@ -108,7 +112,9 @@ _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by the shift times 2 M̄ - 1, so that edges in sparse places move inwards."""
+    """Move edges outwards by the bias times 2 M̄ - 1. With a positive bias, edges with little film nearby
+    therefore move inwards.
+    """
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
     return _moved(height, values["bias_px"] * (2 * nearby[0, 0] - 1), context)
@@ -118,17 +124,19 @@ FILM_LAWS = {law.name: law for law in (edge_shift, edge_shift_by_density)}
 
 
 def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor:
-    """Move edges along their normals. Films or gaps that are narrower than twice the shift vanish."""
+    """Move the edges of a film outwards along their normals. Films or gaps narrower than twice the shift
+    vanish.
+    """
     share = height[0, 0].detach() / context.full_height_um
     reach_px = float(outwards_px.detach().abs().max()) + _FLAT_PX + 1
     distance, normal = map(torch.from_numpy, _from_edge(share.double().cpu().numpy(), reach_px))
     distance, normal = distance.to(height), normal.to(height)
     wanted = distance + outwards_px
-    # Beyond its rim a film is flat. The value of a pixel there is taken from no farther than needed, because
-    # there may be another edge.
+    # Beyond its rim, a film is flat. The value of a pixel there is looked up no farther away than needed,
+    # because there may be another edge.
     most = torch.where(wanted * distance > 0, distance.abs().clamp(min=_FLAT_PX), _FLAT_PX)
     flat, farthest = (wanted.abs() - _FLAT_PX).clamp(0, 1), torch.sign(wanted) * most
-    # Without a shift both limits are met. The derivative there is that of a shift outwards.
+    # At zero shift, both limits are reached. The derivative is then that of a shift outwards.
     nearer = wanted.clamp(min=-most)
     nearer = torch.where(nearer < most, nearer, most)
     inwards = nearer + flat * (farthest - nearer) - distance
@@ -136,12 +144,14 @@ def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor
 
 
 def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
-    """Return the distance of each pixel from the nearest edge of a film, of shape (ny, nx), in px, positive
-    on the film, and the unit vector along which it grows, of shape (2, ny, nx). At pixels that are farther
-    away, the distance is ``reach_px`` or its negative, and the vector is zero.
+    """Return the signed distance of each pixel from the nearest edge of a film, and the unit vector along
+    which this distance grows.
+
+    The distance is in px, positive on the film, and has shape (ny, nx). The vector has shape (2, ny, nx). For
+    pixels farther than ``reach_px`` from an edge, the distance is ±``reach_px`` and the vector is zero.
 
     Args:
-        share: fraction of each pixel that the film covers, of shape (ny, nx). Edges are where it is one half.
+        share: fraction of each pixel that the film covers, of shape (ny, nx). Edges lie where it is one half.
     """
     points, normals = _crossings(share)
     distance, normal = np.where(share > 0.5, reach_px, -reach_px), np.zeros((2, *share.shape))
@@ -161,8 +171,8 @@ def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
 
 
 def _crossings(share: Array) -> tuple[Array, Array]:
-    """Return the points, of shape (n, 2), in px, at which the edges of a film cross the lines of the grid of
-    pixels, and the unit normals there, which point to the film.
+    """Return the points at which the edges of a film cross the lines of the pixel grid, in px, and the unit
+    normals at these points, which point into the film. Both arrays have shape (n, 2).
     """
     slopes = np.stack(np.gradient(gaussian_filter(share, _NORMAL_PX)), -1)
     points, normals = [], []

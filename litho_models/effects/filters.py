@@ -1,4 +1,6 @@
-"""Linear filters, gradients and warps for effects; at zero strength each returns its input bit for bit."""
+"""Linear filters, gradients and warps for effects. At zero strength, each filter or warp returns its input
+bit for bit.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,16 @@ def add_filtered(
     pitch_um: float,
     reach_um: float,
 ) -> Tensor:
-    """Add to the field the field filtered with (T - 1), so that T = 1 returns the field bit for bit.
+    """Filter a field with the transfer function T. The field filtered with T - 1 is added to the original, so
+    that T = 1 returns the field bit for bit.
 
     Args:
-        field: (b, 1, y, x).
-        transfer_minus_one: function that returns T - 1 at the frequencies fy (y, 1) and fx (1, x/2 + 1), in
-            cycles/µm.
-        pitch_um: sampling, µm.
-        reach_um: half the support of the kernel. The field is continued by this length beyond its edges, as
-            in the base models.
+        field: tensor of shape (b, 1, ny, nx).
+        transfer_minus_one: function of the frequencies fy and fx, in cycles/µm, that returns T - 1. The
+            frequencies are those of the padded field and have shapes (rows, 1) and (1, columns/2 + 1).
+        pitch_um: lateral sampling, µm.
+        reach_um: half the support of the kernel, µm. As in the base models, the field is padded by this
+            length with its edge values.
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
@@ -45,7 +48,7 @@ def add_filtered(
 
 
 def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float) -> Tensor:
-    """Blur isotropically with a Gaussian of the given variance, µm²: T = exp(-2 π² s² f²)."""
+    """Blur a field isotropically with a Gaussian of variance s² (µm²): T = exp(-2 π² s² f²)."""
     return add_filtered(
         field,
         lambda fy, fx: torch.expm1(-2 * math.pi**2 * variance_um2 * (fy * fy + fx * fx)),
@@ -55,31 +58,35 @@ def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: flo
 
 
 def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
-    """Return the mean nominal height around each pixel, (1, 1, y, x), as a fraction of the full height. The
-    mean has Gaussian weights with the standard deviation ``length_um``.
+    """Return the mean nominal height around each pixel, as a fraction of the full height. The mean has
+    Gaussian weights with standard deviation ``length_um``. The result has shape (1, 1, ny, nx).
     """
     relative = context.layout_um / context.full_height_um
     return add_blur(relative, length_um**2, context.pitch_um, 3 * float(length_um.detach()))
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Return the transfer function of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential
-    tail of length l.
+    """Return the transfer function T of the filter y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx), which is a
+    one-sided exponential tail of length l.
 
-    The function is analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
+    The function is analytic in l, and T = 1 at l = 0. Its continuous form is 1 / (1 + i 2π f l).
     """
     difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
     return 1 / (1 + length_um / pitch_um * difference)
 
 
 def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Return ``trailing_response`` without its mean delay l, because registration removes a mean shift."""
+    """Return ``trailing_response`` with its mean delay l removed, because registration removes a
+    mean shift.
+    """
     advance = torch.exp(2j * math.pi * frequency * length_um)
     return trailing_response(frequency, length_um, pitch_um) * advance
 
 
 def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
-    """Return the central differences (d/dy, d/dx) with replicated edges, per µm."""
+    """Return the derivatives d/dy and d/dx of a field, per µm, by central differences with
+    replicated edges.
+    """
     padded = functional.pad(field, (1, 1, 1, 1), mode="replicate")
     along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * pitch_um)
     along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * pitch_um)
@@ -87,17 +94,19 @@ def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
 
 
 def rounded_power(squared_slope: Tensor, power: float | Tensor) -> Tensor:
-    """Return a power of the absolute slope, smoothed near zero to be differentiable."""
+    """Return a power of the absolute slope, given the squared slope. The result is smoothed near zero so that
+    it is differentiable there.
+    """
     return (squared_slope + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
 
 
 def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
-    """Sample the field at (y + shift_y, x + shift_x) by cubic interpolation; a zero shift returns the field
+    """Sample the field at (y + shift_y, x + shift_x) by cubic interpolation. A zero shift returns the field
     bit for bit.
 
     Args:
-        field: (1, 1, y, x).
-        shift_y_um, shift_x_um: maps (y, x) or numbers, µm.
+        field: tensor of shape (1, 1, ny, nx).
+        shift_y_um, shift_x_um: shifts in µm: maps of shape (ny, nx), or single numbers.
     """
     ny, nx = field.shape[-2:]
     y, x = (torch.arange(n, dtype=field.dtype, device=field.device) for n in (ny, nx))

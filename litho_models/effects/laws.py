@@ -1,9 +1,9 @@
 """Laws: short formulas of height, slopes, surroundings, position and order.
 
-A law is an effect with one strength and fitted shapes: a power, a length, a direction, a position. A law
-states how the height departs from the model, but not why. The same code screens, fits, judges and applies all
-laws. A table is an effect with many strengths. It can describe any dependence on its covariate but does not
-explain the dependence.
+A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
+direction or a position. A law states how the height departs from the model, but not why. The same code
+screens, fits, judges and applies all laws. A table is an effect with many strengths. It can describe any
+dependence on one covariate, such as the level or the position, but it does not explain this dependence.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch.nn import functional
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-# Over one micrometre, a wave whose frequency lies between two of these frequencies stays nearly in phase with
-# one of the two.
+# Frequencies of waves that screening tries. Over one micrometre, a wave of any frequency between two of them
+# stays nearly in phase with one of the two.
 _WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
 _FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
 _WORDS = ("x", "y", "r²")
@@ -42,7 +42,8 @@ _SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y
 class Surface:
     """Compute the quantities in the formula of a law from a field, its context and the parameters of the law.
 
-    ``h`` (b, 1, y, x), µm, is the height or, for a law of the exposure, the dose expressed as nominal height.
+    ``h`` is the height, µm, of shape (b, 1, ny, nx). For a law of the exposure, it is the dose, expressed as
+    a nominal height.
     """
 
     h: Tensor
@@ -50,8 +51,8 @@ class Surface:
     values: Values
 
     def along(self, axis: str, y: Tensor, x: Tensor) -> Tensor:
-        """Return the component of a vector along an axis. If the law has ``turn_deg``, the axis is rotated by
-        this angle from x towards y.
+        """Return the component of the vector (y, x) along an axis. If the law has a parameter ``turn_deg``,
+        the axis is rotated by this angle from x towards y.
         """
         angle = torch.deg2rad(self.values.get("turn_deg", self.h.new_zeros(())))
         sine, cosine = angle.sin(), angle.cos()
@@ -62,15 +63,15 @@ class Surface:
         return self.along(axis, *gradient(self.h if of is None else of, self.context.pitch_um))
 
     def size(self, *axes: str, power: float | Tensor = 1.0) -> Tensor:
-        """Return a power of the absolute slope along one axis, or of the steepness along two, smoothed near
-        zero.
+        """Return a power of the absolute slope along one axis, or of the steepness if two axes are given. The
+        result is smoothed near zero.
         """
         squared = torch.stack([self.slope(one) for one in axes]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return x, y, r² or ``rim`` at each pixel; ``rim`` is e^(-distance / length) for the distance to the
-        edge of the scan.
+        """Return the value of x, y, r² or ``rim`` at each pixel, where ``rim`` is e^(-d / length) and d is
+        the distance of the pixel from the edge of the scan.
         """
         y, x = self.context.scan_position()
         if word == "rim":
@@ -80,23 +81,23 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step along an axis of the scan: 0 before the position of the law and 1 beyond it, with a
-        linear rise over one pixel.
+        """Return a step along an axis of the scan. It is 0 before the position that the law states and 1
+        beyond it, and it rises linearly over one pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
         return ((at - self.values["position"]) * (size - 1) / 2 + 0.5).clamp(0, 1).to(self.h)
 
     def mean(self, of: Tensor | None = None) -> Tensor:
-        """Return the Gaussian-weighted mean of a map (by default the height); the length of the law is the
-        standard deviation.
+        """Return the Gaussian-weighted local mean of a map (by default the height). The standard deviation of
+        the Gaussian is the length of the law.
         """
         field, reach = self.h if of is None else of, self.values["length_um"]
         return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
     def trailing(self, *sides: str) -> Tensor:
-        """Return the mean height on one side or on both sides, with weights that decay exponentially over the
-        law's length.
+        """Return the mean height on one side of each pixel, or on two sides. The weights decay exponentially
+        with distance over the length of the law.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 
@@ -107,7 +108,7 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * float(length.detach()))
 
 
-# A function that computes the map (b, 1, y, x) that a strength multiplies.
+# A function that computes the map, of shape (b, 1, ny, nx), by which the strength of a law is multiplied.
 Column = Callable[[Surface], Tensor]
 _UNIT_OF_STRENGTH = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
@@ -120,7 +121,9 @@ def _law(
     shapes: Mapping[str, Parameter] = {},
     on: ActsOn = "height",
 ) -> Effect:
-    """Make a law from its name, its formula, and the column that its strength multiplies, with its unit."""
+    """Make a law from its name, its formula, and the function ``column``, which computes the map that its
+    strength multiplies. ``unit`` is the unit of this map.
+    """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
         return field + values["strength"] * column(Surface(field, context, values))
@@ -130,8 +133,9 @@ def _law(
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
-    """Make a wave law. A wave in the dose describes slices, and a wave in the height describes standing waves
-    of light. The wave is zero where the field is zero.
+    """Make a law that adds a sine wave of the field itself (height or dose) to the field. A wave in the dose
+    describes slices, and a wave in the height describes standing waves of light. The added wave is zero where
+    the field is zero.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -172,7 +176,7 @@ _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
 _TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0)), **_TURN}
-# If the position is known, one trial value of the length is close enough to start a fit.
+# For laws that state a position in the scan, one trial value of the length is close enough to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 
@@ -272,8 +276,8 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add a correction for each of seventeen heights of the layout, interpolated linearly between these
-    heights.
+    """Add a correction that depends on the nominal height of the layout. It is given at seventeen heights and
+    interpolated linearly between them.
     """
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)
@@ -285,8 +289,8 @@ def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor
 
 @_table("a response to the height nearby", _COPIES_UM, "1")
 def linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add a weighted sum of the differences between the heights at displaced positions and the height of the
-    pixel. The field is continued beyond its edge.
+    """Add to each pixel a weighted sum of the differences between the heights at displaced positions and the
+    height of this pixel. The field is padded with its edge values.
     """
     pitch, (ny, nx) = context.pitch_um, height.shape[-2:]
     edge = round(max(_STENCIL_UM) / pitch)

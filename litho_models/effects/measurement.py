@@ -1,4 +1,6 @@
-"""Effects of the measurement: tip, feedback and lateral scanner."""
+"""Effects of the measurement, caused by the tip, the feedback loop and the lateral scanner of the
+microscope.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from litho_models.effects.filters import add_blur, add_warp
 # Weights of cubic interpolation half-way between four neighbours.
 _MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
 _SHARPEST_UM = 1e-3
-# Relative radius along the sharper axis of an asymmetric tip.
+# Radius of an asymmetric tip along its sharper axis, relative to the radius along the other axis.
 _SHARPER = 0.25
 _BLUR_REACH_UM = 4.0
 
@@ -32,11 +34,12 @@ _BLUR_REACH_UM = 4.0
     needs=("probe",),
 )
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the probe lag along the fast axis: z += (H - z) / (1 + l / dx), without the mean delay.
+    """Let the probe lag along the fast axis: at each pixel, z += (H - z) / (1 + l / dx). The mean delay is
+    removed.
 
-    The length is l on falling edges, and ``rising`` × l on rising ones, where the surface pushes the probe.
-    If ``rising`` is 1, the probe acts as a linear filter. If it is below 1, the probe parachutes off falling
-    edges. The delay is a constant time, so smaller pixels make the length shorter.
+    The lag has length l on falling edges, and length ``rising`` × l on rising edges, where the surface pushes
+    the probe. If ``rising`` is 1, the probe acts as a linear filter. If it is below 1, the probe parachutes
+    off falling edges. The delay is a constant time, so smaller pixels make the length shorter.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -60,8 +63,8 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     reverses=("strength",),
 )
 def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the scanner run fast in the middle of a line: H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the
-    scan.
+    """Let the scanner move unevenly along a line: H(x + c L / 4 (1/3 - u²)), where L is the length of a line
+    and u runs from -1 to 1 along it.
 
     The displacement is c x (1 - x / L) minus its mean, because registration removes a mean shift.
     """
@@ -105,14 +108,15 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
     needs=("probe",),
 )
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Dilate the surface by a paraboloid tip: max over u of H(x - u) - u² / 2R; to first order H + R |grad
-    H|² / 2.
+    """Dilate the surface by a paraboloid tip of radius R: max over u of H(x - u) - u² / 2R. To first order,
+    this is H + R |grad H|² / 2.
 
-    A tip may be sharper along or across the scan lines: its radii in these directions are ``along`` × R and
+    A tip may be sharper along or across the scan lines. Its radii in these directions are ``along`` × R and
     ``across`` × R.
     """
     radius = values["radius_um"]
-    # The formula divides by the radius, so the change is scaled linearly to zero for very sharp tips.
+    # The formula divides by the radius. For very sharp tips, it is therefore evaluated at the smallest
+    # radius, and the change is scaled linearly to zero.
     blunt = radius.clamp(min=_SHARPEST_UM)
     # A paraboloid is the sum of two parabolas, so the maximum is taken along one axis after the other.
     across, along = blunt * values["across"], blunt * values["along"]
@@ -122,7 +126,8 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
-    """Dilate rows (..., x) by a parabola; the surface is linear between half pixels.
+    """Dilate rows of shape (..., nx) by a parabola. The surface consists of linear pieces that are half a
+    pixel long.
 
     The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point is not
     on the piece, the tip touches the end of the piece that is nearest to this point.
@@ -132,16 +137,16 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     # Slopes of the pieces to the right of each pixel, then of the pieces to the right of each mid-point.
     slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
     steepest = max(float(s.detach().abs().max()) for s in slopes)
-    # The tip cannot touch a point that is farther away than R s, or where its parabola lies below the lowest
-    # height.
+    # The tip cannot touch a point that is farther away than R s for the steepest slope s, nor one so far away
+    # that its parabola lies below the lowest height there.
     tops_um = torch.stack([height, middles]).detach()
     deepest_um = math.sqrt(2 * float(radius_um.detach() * (tops_um.max() - tops_um.min())))
     farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
     reach_px = min(math.ceil(farthest_um / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
     rises = [_continued(part, reach_px, "constant") for part in slopes]
-    # The gradient of the maximum is the gradient of the piece that the tip touches. The search itself runs
-    # without gradients, which would keep all pieces in memory.
+    # The gradient of the maximum is the gradient of the piece that the tip touches. The search for this piece
+    # runs without gradients, because with gradients it would keep all pieces in memory.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
         touches = [radius_um * slope for slope in rises]
@@ -164,7 +169,7 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
 
 
 def _middles(rows: Tensor) -> Tensor:
-    """Interpolate values (..., x) half a pixel to the right of each pixel, by a cubic through four
+    """Interpolate rows of shape (..., nx) half a pixel to the right of each pixel, by a cubic through four
     neighbours.
     """
     padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)

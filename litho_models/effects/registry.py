@@ -1,4 +1,6 @@
-"""The catalogue: all effects by name, in the order in which light, resist, developer and microscope act."""
+"""The catalogue of all effects by name, in the order in which they act: exposure, resist, development and
+measurement.
+"""
 
 from __future__ import annotations
 
@@ -83,14 +85,15 @@ EFFECTS = (
 )
 
 
-# Effects of the catalogue that are not visible in a residual map on the layout's grid.
+# Known effects that no residual map on the grid of the layout can show, each with the reason.
 UNTESTABLE = {
     "min-to-zero-datum": "it shifts each scan by the lowest height of the scan; datum-offset covers it",
     "quantisation": "the raw files are not in the store",
     "scars-and-spikes": "they are masked, not modelled; the loop looks for them among the outliers",
 }
 
-# Per-scan effects are not included here, because they are never part of a model.
+# The order in which effects act. The per-scan effects come first; their place has no meaning, because they
+# are never part of a model.
 _FORWARD_ORDER = (
     *EFFECTS,
     exposure_spot.layer_stacking,
@@ -127,17 +130,18 @@ _FORWARD_ORDER = (
 TIP = measurement.tip_dilation.name
 
 CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
-# Laws and tables, which are not registered and have no cause.
+# Laws and tables. They are not in the catalogue, because no cause of them is known.
 _NAMELESS = {**LAWS, **films.FILM_LAWS, **TABLES}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
-    """Add an effect to the catalogue as a candidate of the loop, and return it.
+    """Add an effect to the catalogue, so that the loop also tests it, and return it.
 
     Args:
         effect: the new effect. A per-scan effect (one whose ``apply`` is ``of_single_scans``) also needs a
             scan term; see ``litho_models.scan_terms.register_scan_term``.
-        after: the effect after which the new effect acts; by default the last effect of its stage.
+        after: name of the effect after which the new effect acts; by default, the new effect acts last in its
+            stage.
 
     Raises:
         InputError: the name is already taken, or there is no effect named ``after``.
@@ -154,10 +158,10 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
 
 
 def get_effect(name: str) -> Effect:
-    """Return the effect with this name.
+    """Return the effect, law or table with this name.
 
     Raises:
-        InputError: no such effect.
+        InputError: there is no effect, law or table with this name.
     """
     if name in _NAMELESS:
         return _NAMELESS[name]
@@ -166,10 +170,10 @@ def get_effect(name: str) -> Effect:
 
 
 def in_forward_order(names: Iterable[str]) -> list[str]:
-    """Sort names in the order in which the effects act, from exposure to microscope.
+    """Sort names of effects in the order in which the effects act, from the exposure to the measurement.
 
     Raises:
-        InputError: an unknown name.
+        InputError: there is no effect with one of these names.
     """
     # Laws and tables act on the finished print, before the microscope.
     known = [*CATALOGUE, *_NAMELESS]
@@ -177,11 +181,11 @@ def in_forward_order(names: Iterable[str]) -> list[str]:
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Return the effects that screening tests. Their parameters are common to all scans.
+    """Return the effects that screening tests: all effects of the catalogue except the per-scan effects.
 
     Args:
-        tip_radius_um: radius of the tip, or an upper bound for it, if the store states one. Screening also
-            tries this radius.
+        tip_radius_um: radius of the tip of the microscope, or an upper bound for this radius, if the store
+            states one. Screening then also tries this radius.
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:

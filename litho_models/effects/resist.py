@@ -1,4 +1,6 @@
-"""Effects of the resist: conversion of dose to height, shrinkage, and gains and losses in development."""
+"""Effects of the resist: conversion of dose to height, shrinkage, and height gained or lost in
+development.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,11 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Apply the normalised tanh projection about η, which changes nothing for α² -> 0 and becomes a step for
-    α² -> inf.
+    """Apply the normalised tanh projection with threshold η. It changes nothing for α² -> 0 and becomes a
+    step for α² -> inf.
 
-    With x = H / full height the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
-    equals the usual quotient of sums of tanh and is even and analytic in α.
+    With x = H / full height, the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
+    expression equals the usual quotient of sums of tanh, and it is even and analytic in α.
     """
     full, centre = context.full_height_um, values["centre"]
     relative = height / full
@@ -77,7 +79,7 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
     separating="a step standard for the microscope, then a printed staircase",
 )
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink the whole print: (1 - k) H."""
+    """Lower the whole print by a fraction of its height: (1 - k) H."""
     return (1 - values["fraction"]) * height
 
 
@@ -104,10 +106,11 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     separating="print the layout in fields of two sizes",
 )
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Shrink tops inwards more than bases: H(r + s H(r) / full r), with r from the centre of the field.
+    """Shrink the tops of the print inwards more than the bases: H(r + s H(r) / full r), where r is measured
+    from the centre of the field.
 
-    Shrinkage at the mean height is a change of magnification, which registration removes. A scan therefore
-    shows at x the point at r = x / (1 + s mean / full).
+    The shrinkage at the mean height is a change of magnification, which registration removes. A scan
+    therefore shows at position x the point r = x / (1 + s mean / full) of the print.
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -127,8 +130,8 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     separating="pillars of one height and five widths, dried in air and supercritically",
 )
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Lower features narrower than w by a share of their height above the surroundings: H - φ (H -
-    open_w(H)).
+    """Lower features narrower than w by a fraction φ of their height above the surroundings:
+    H - φ (H - open_w(H)).
     """
     return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
@@ -140,14 +143,15 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     separating="trenches of five widths, at two development times",
 )
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H); tops are unchanged."""
+    """Fill pits narrower than w partly with resist: H + ρ (close_w(H) - H). The tops are unchanged."""
     return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Close the height by a square (morphological closing), which fills pits narrower than the square.
+    """Apply a morphological closing by a square to the height, which fills pits narrower than the square.
 
-    Squares are an odd number of pixels wide; results for other widths are interpolated.
+    Squares are an odd number of pixels wide. For other widths, the results of the next narrower and the next
+    wider square are interpolated.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -156,14 +160,16 @@ def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
 
 
 def _closed_by(height: Tensor, half_px: int) -> Tensor:
-    """Close by a square of 2 half_px + 1 pixels; the field is continued beyond its edge."""
+    """Close the height by a square with a side of 2 half_px + 1 pixels. The field is padded with its edge
+    values.
+    """
     padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
     return -_largest(-_largest(padded, half_px), half_px)
 
 
 def _largest(field: Tensor, half_px: int) -> Tensor:
-    """Return the largest value in the square around each pixel, one axis after the other. Pixels whose square
-    extends beyond the field are left out.
+    """Return the largest value in the square around each pixel, computed along one axis after the other. The
+    result leaves out the pixels whose square extends beyond the field.
     """
     return _running_maximum(_running_maximum(field, half_px, -2), half_px, -1)
 
@@ -198,10 +204,10 @@ def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
 )
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), with rotated axes x',
-    y'.
+    """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), where x' and y' are
+    rotated axes.
 
-    With cx = cy = c, the loss is c |grad H|^p in any direction. With p = 1, each edge moves inwards by
+    If cx = cy = c, the loss is c |grad H|^p in any direction. If p = 1 too, each edge moves inwards by
     about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])

@@ -1,6 +1,6 @@
 """The smooth background that all scans of one microscope share.
 
-Levelling by planes leaves, for example, a bow in every scan. The part of the bow that is the same in every
+For example, levelling with planes leaves a bow in every scan. The part of the bow that is the same in every
 scan is learned from the training scans and added to predictions of *measured* maps. This background is not
 part of the printer and is not used in a design.
 """
@@ -19,16 +19,17 @@ from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scan_terms.policies import POLICIES
 from litho_models.scan_terms.term import FloatMap, smooth_shapes
 
-# Relative tolerance of the field size. A bow learned on a field 1 % larger or smaller is wrong by 2 %.
+# Relative tolerance for the size of a field. A bow that was learned on a field 1 % larger or smaller is wrong
+# by 2 %.
 _SAME_SIZE = 0.01
 
 
 class Background(Record):
-    """The coefficients of x, y, x², xy and y², in nm, averaged over the training scans. ``scans`` is the
-    number of these scans.
+    """The coefficients of a background with the terms x, y, x², xy and y², in nm, averaged over the training
+    scans. ``scans`` is the number of training scans.
 
-    x and y run from -1 to 1 over a field of ``field_um`` (y, x). Each term has zero mean, so a background
-    does not change the datum.
+    x and y run from -1 to 1 over a field whose size (y, x) is ``field_um``. Each term has zero mean, so a
+    background does not change the datum.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -46,7 +47,7 @@ class Background(Record):
         return is_of_size(scan, self.field_um)
 
     def map_um(self, shape: tuple[int, int]) -> FloatMap:
-        """Return the background on a field of ``shape`` (ny, nx), µm."""
+        """Return the background, µm, as a map of the given shape (ny, nx)."""
         coefficients = (self.x_nm, self.y_nm, self.xx_nm, self.xy_nm, self.yy_nm)
         return np.tensordot(coefficients, smooth_shapes(shape), axes=1) / NM_PER_UM
 
@@ -57,19 +58,19 @@ def field_um(scan: PrintedScan) -> tuple[float, float]:
 
 
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
-    """Return whether a scan's field has this size (y, x), µm."""
+    """Return whether a scan's field has the size (y, x) given in µm, within 1 %."""
     return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
 
 
 def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
-    """Learn the smooth background that scans share in addition to a model's predicted heights.
+    """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
     All terms of policy ``full``, including offset and gain, are fitted to the valid pixels of each scan. The
-    background is the mean of the five smooth terms over the scans.
+    background is the mean over the scans of the five smooth terms (tilt and bow).
 
     Args:
         scans: training scans, all of the same size.
-        predictions_um: heights (ny, nx) that the model predicts for these scans.
+        predictions_um: height that the model predicts for each scan, as a map of shape (ny, nx).
     """
     coefficients = [
         fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]

@@ -1,4 +1,4 @@
-"""Divide the pixels of a scan into those to which terms are fitted and those that are scored.
+"""Divide the pixels of a scan into pixels to which terms are fitted and pixels that are scored.
 
 Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
 to one half of a checkerboard and subtracted from the other half. The offset of a line is estimated from few
@@ -23,15 +23,16 @@ BoolMap = NDArray[np.bool_]
 
 
 class Blocks(NamedTuple):
-    """The geometry of the two halves. Every result records this geometry.
+    """The geometry by which the pixels of a scan are divided into fitted and scored pixels. Every result
+    records this geometry.
 
     Attributes:
         block_px: side of a block of the checkerboard.
-        buffer_px: all fitted pixels are farther than this distance from every scored pixel. The distance is
-            about one correlation length of the residuals of measured prints; at 5 px, their correlation is
-            0.5.
-        line_gap_px: distance along the line between fitted and scored pixels, for line offsets.
-        seed: moves the origin of the checkerboard.
+        buffer_px: distance that separates fitted from scored pixels. Every fitted pixel is farther than this
+            from every scored pixel. The distance is about one correlation length of the residuals of measured
+            prints; at 5 px, the correlation of these residuals is 0.5.
+        line_gap_px: for line offsets, distance along the line between fitted and scored pixels.
+        seed: seed of the random shift of the checkerboard's origin.
     """
 
     block_px: int = 32
@@ -41,8 +42,8 @@ class Blocks(NamedTuple):
 
 
 class Half(NamedTuple):
-    """One half of a scan. Terms are fitted on the pixels ``calibrate`` and applied to the pixels ``score``,
-    which are bool maps (ny, nx).
+    """One half of a scan, given by two bool maps of shape (ny, nx). Terms are fitted to the pixels of
+    ``calibrate`` and subtracted from the pixels of ``score``.
     """
 
     calibrate: BoolMap
@@ -50,8 +51,10 @@ class Half(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A part of the scan that is scored, and the pixels on the other side to which line offsets along each
-    axis are fitted.
+    """A part of the scan that is scored, and the pixels to which the line offsets for this part are fitted.
+
+    ``score`` is the mask of the scored part. For lines along an axis, ``other_side[axis]`` is the mask of the
+    pixels on the other side of the scan. Both masks have shape (ny, nx).
     """
 
     score: BoolMap
@@ -63,7 +66,7 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
     """Divide the scan into the two halves of a checkerboard of square blocks.
 
     Raises:
-        InputError: blocks that are too small for the buffer.
+        InputError: the blocks are too small for the buffer.
     """
     block_px, buffer_px = blocks.block_px, blocks.buffer_px
     if block_px <= 2 * buffer_px:
@@ -78,13 +81,14 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
-    """Cut the scan across its lines: into halves for lines along one axis, into quadrants for lines along
-    both.
+    """Cut the scan across its lines. If the lines run along one axis, the scan is cut into halves; if there
+    are lines along both axes, it is cut into quadrants.
 
     Args:
-        shape: (ny, nx).
+        shape: shape (ny, nx) of the scan.
         axes: axes along which the lines run; axis 1 is x.
-        gap_px: smallest distance along a line from a scored pixel to the pixels that determine its offset.
+        gap_px: smallest distance along a line between a scored pixel and the pixels that determine the offset
+            of this line.
     """
     axes, cells = sorted(set(axes)), []
     for sides in product((False, True), repeat=len(axes)):

@@ -1,7 +1,8 @@
-"""Remove the terms of a scan, after fitting them to pixels that are not scored.
+"""Subtract from a scan the terms that it adds to the height, after fitting them to pixels that are not
+scored.
 
-The datum or bow of a microscope contains no information about the printer, so errors may be stated without
-these terms. In this project, ``cross_fit`` computes all errors that are stated in this way.
+For example, the datum and the bow of a scan contain no information about the printer, so errors may be stated
+without them. In this project, ``cross_fit`` computes all errors that are stated in this way.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from litho_models.scan_terms.term import (
 
 @dataclass(frozen=True)
 class CrossFit:
-    """The residual of a scan without its terms.
+    """The residual of a scan after its terms have been subtracted.
 
     Attributes:
-        residual_um: measured height minus predicted height minus terms, (ny, nx) µm. It is NaN at pixels that
-            are not scored.
-        degrees_of_freedom: effective number of terms, averaged over the scored parts of the scan. A line
-            offset that is shrunk counts with its weight.
+        residual_um: measured height minus predicted height minus terms, µm, of shape (ny, nx). It is NaN at
+            pixels that are not scored.
+        degrees_of_freedom: effective number of fitted terms, averaged over the scored parts of the scan. Line
+            offsets are shrunk towards zero, and each of them counts with its shrinkage weight (0 to 1).
     """
 
     residual_um: FloatMap
@@ -47,20 +48,21 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Return the residual of a scan without its terms, which are fitted to pixels that are not scored.
+    """Fit terms to pixels of a scan that are not scored, and return the residual of the scored pixels without
+    these terms. Fitted and scored pixels then change places, so that every valid pixel is scored.
 
     Args:
-        height_um: measured height (ny, nx), µm. It may be NaN at pixels that are not valid.
-        prediction_um: the model's height (ny, nx), µm.
-        valid: bool (ny, nx), pixels that count.
-        terms: names in the catalogue; see ``POLICIES`` for the usual sets.
-        blocks: division of the pixels; by default the standard division.
-        scan_line: index of the scan line of each pixel, (ny, nx), counted from 0. If it is None, the rows of
-            the array are the scan lines.
+        height_um: measured height, µm, of shape (ny, nx). It may be NaN at pixels that are not valid.
+        prediction_um: height that the model predicts, µm, of shape (ny, nx).
+        valid: mask of the pixels to use, bool, of shape (ny, nx).
+        terms: names of terms in the catalogue ``SCAN_TERMS``; see ``POLICIES`` for the usual sets.
+        blocks: division into fitted and scored pixels; by default the standard division.
+        scan_line: index of the scan line of each pixel, counted from 0, of shape (ny, nx). If it is None, the
+            rows of the array are the scan lines.
 
     Raises:
-        InputError: an unknown term, shapes that differ, a prediction that is not finite, or a scan that is
-            too small for the terms.
+        InputError: a term is unknown, the shapes of the arrays differ, the prediction is not finite at a
+            valid pixel, or the scan is too small for the terms.
     """
     blocks = blocks or Blocks()
     chosen_terms(terms)
@@ -103,10 +105,11 @@ def fitted_terms(
     used: BoolMap,
     terms: Terms,
 ) -> tuple[FloatMap, FloatMap]:
-    """Fit smooth terms to all used pixels; return coefficients (k,) and the map of the terms, (ny, nx) µm.
+    """Fit smooth terms to all used pixels. Return their coefficients, of shape (k,), and the sum of the
+    fitted terms as a map of shape (ny, nx), µm.
 
-    Use the map for training, pictures and defects. Reported errors use the terms that ``cross_fit``
-    estimates.
+    Use this map for training, for pictures and for finding defects. Reported errors use the terms that
+    ``cross_fit`` estimates.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
@@ -115,15 +118,17 @@ def fitted_terms(
 
 
 def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
-    """Return the measured minus predicted height without ``fitted_terms``, (ny, nx) µm; 0 at unused
-    pixels.
+    """Return the measured minus the predicted height after the result of ``fitted_terms`` is subtracted, µm,
+    of shape (ny, nx). It is 0 at unused pixels.
     """
     _, own = fitted_terms(height_um, prediction_um, used, terms)
     return np.where(used, height_um - prediction_um - own, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Return the least-squares coefficients (k, …) of ``design`` (k, n) for ``target`` (n, …)."""
+    """Return the coefficients with which the rows of ``design`` fit ``target`` best in the sense of least
+    squares. ``design`` has shape (k, n), ``target`` (n, …), and the result (k, …).
+    """
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 
 

@@ -1,7 +1,9 @@
-"""Ridge regression over scans, for columns whose strengths are common to all scans or differ by group.
+"""Ridge regression over scans. The columns (regressors) have strengths that are common to all scans or differ
+between groups of scans.
 
-The regression needs only the inner products of residual and columns of each scan. From these products, it
-computes the strengths that fit any selection of scans, and the squared error of any other scans.
+The regression needs only the inner products between the residual and the columns of each scan. From these
+products, it computes the strengths that fit any selection of scans best, and the squared error that these
+strengths leave in any other scans.
 """
 
 from __future__ import annotations
@@ -24,7 +26,12 @@ _ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
-    """Return the label of a scan in a grouping; empty if it has none."""
+    """Return the label of a scan in a grouping (the name of its group). The label is empty if the scan
+    belongs to no group.
+
+    Args:
+        by: name of the grouping, as in the result of ``groupings``.
+    """
     if by == ALL:
         return ""
     if by in scan.groups:
@@ -38,7 +45,7 @@ def label_of(scan: PrintedScan, by: str) -> str:
     kind, _, value = by.partition(" ")
     if value and kind == _ORDER:
         last, first = map(int, value.split("-"))
-        # A scan between these two positions may lie before or after the change.
+        # For a scan between these two positions, it is not known whether it lies before or after the change.
         return "before" if scan.order <= last else "from there on" if scan.order >= first else ""
     if value and kind == _CHARACTER:
         return scan.id[int(value) - 1 : int(value)]
@@ -46,12 +53,14 @@ def label_of(scan: PrintedScan, by: str) -> str:
 
 
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
-    """Return the label of each scan in every grouping, with ``all`` first.
+    """Return all groupings of the scans by name, with ``all`` first. Each grouping is given as the labels of
+    the scans.
 
-    Groups are derived from the card (print, field, tip, direction and rotation of a scan) and from each
-    character that varies between the ids. With ``by_order``, they are also derived from the printing order.
-    The two groups are then the scans before and after a position at which something may have changed. A
-    grouping needs at least two labels, and at least half of the labels must have two or more scans. If two
+    Groupings are derived from the dataset card (print, tip, direction and rotation of a scan, and further
+    groups that the card states), and from every position in the scan ids at which the character varies. With
+    ``by_order``, groupings are also derived from the printing order. Such a grouping has two groups: the
+    scans before and the scans after a position at which something may have changed. Except for these, a
+    grouping needs at least two labels, and at least half of its labels must have two or more scans. If two
     groupings are identical, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
@@ -79,7 +88,7 @@ def _is_grouped(labels: Labels) -> bool:
 
 
 def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
-    """Return whether a grouping is identical to one of these, up to the names of its labels."""
+    """Return whether a grouping is identical to one of those found so far, up to the names of its labels."""
     return any(
         len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found.values()
     )
@@ -100,19 +109,21 @@ def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
     return orders[FEWEST_IN_GROUP : len(orders) - FEWEST_IN_GROUP + 1]
 
 
-# A small number added to a unit diagonal, so that the equations can be solved for equal columns.
+# A small number that is added to the unit diagonal of the scaled normal equations, so that they can be solved
+# even if columns are equal.
 _ALIKE = 1e-7
 
 
 @dataclass(frozen=True)
 class Block:
-    """Columns whose strengths are fitted jointly.
+    """Columns with a common grouping and a common prior.
 
     Attributes:
-        columns: indices of the columns in the inner products, counted from 1. The index 0 is the residual.
-        by: name of the grouping. Each label of the grouping has its own strengths.
-        shrinking: weight of the prior for zero strength, as a number of scans. With a weight of 0, there is
-            no prior.
+        columns: indices of the columns in the inner products, counted from 1, because index 0 is the
+        residual.
+        by: name of the grouping. Each label of the grouping has separate strengths.
+        shrinking: weight of the prior that the strengths are zero, as a number of scans. If the weight is 0,
+            there is no prior.
     """
 
     columns: tuple[int, ...]
@@ -122,10 +133,11 @@ class Block:
 
 @dataclass(frozen=True)
 class Products:
-    """The inner products of the scans, and their groups.
+    """The inner products of the residual and the m columns in each scan, and the groups of the scans.
 
     Attributes:
-        grams: inner products per pixel, (scans, 1 + m, 1 + m). The index 0 is the residual.
+        grams: inner products divided by the number of pixels, of shape (scans, 1 + m, 1 + m). Index 0 is the
+            residual.
         groups: label of each scan, for every grouping.
     """
 
@@ -134,12 +146,14 @@ class Products:
 
     @classmethod
     def ungrouped(cls, grams: np.ndarray) -> Products:
-        """Return inner products for columns with common strengths."""
+        """Return the products for scans without groups, in which every column has one strength for
+        all scans.
+        """
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the strengths (columns,) that fit the scans with these indices best, for every block and
-        label.
+        """Return the strengths that fit the scans with the given indices best. The result contains, for every
+        block, the strengths by label, of shape (columns,).
 
         Labels that do not occur among these scans are absent.
         """
@@ -150,8 +164,8 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Return the mean squared residual of each of these scans, (scans,), after its columns are subtracted
-        with the strengths of its groups.
+        """Return the mean squared residual of each scan with the given indices, of shape (scans,). Before
+        squaring, the columns of the blocks are subtracted with the strengths of the groups of the scan.
 
         A block is not subtracted from a scan whose label has no strengths.
         """
@@ -167,8 +181,11 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Return the mean squared residual of each scan, (scans,), with strengths that are fitted without the
-        fold of this scan.
+        """Return the mean squared residual of each scan, of shape (scans,), for strengths that are fitted to
+        the scans outside the fold of this scan.
+
+        Args:
+            fold_of: number of the fold of each scan, of shape (scans,).
         """
         left = np.empty(len(fold_of))
         for fold in np.unique(fold_of):
@@ -178,10 +195,11 @@ class Products:
         return left
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """Fit these blocks to all scans and project them out of the residual and the other columns.
+        """Fit the given blocks to all scans, and project them out of the residual and of the other columns.
 
-        The columns of the blocks become zero. A later fit of common strengths then gives the same result as a
-        joint fit. For strengths by group, this holds only if the projected part is the same in all groups.
+        The columns of the blocks become zero. If a later fit of other columns uses common strengths, it gives
+        the same result as a joint fit with the blocks. For strengths that differ by group, this holds only if
+        the part that was projected out is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -199,13 +217,14 @@ class Products:
 
 
 class _Expanded:
-    """Normal equations with one row for every strength and label.
+    """The normal equations of a regression. They have one row for every combination of a strength and a
+    label.
 
     Attributes:
-        columns: columns of all blocks.
-        rows: for each block, the rows of its strengths by label.
-        alike: sets of scans that are in the same groups, each with the rows of its strengths in the order of
-            ``columns``.
+        columns: indices of the columns of all blocks.
+        rows: for each block and label, the row numbers of its strengths.
+        alike: sets of scans that belong to the same groups. Each set is given as the indices of its scans and
+            the row numbers of their strengths, in the order of ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
@@ -227,8 +246,8 @@ class _Expanded:
             self.alike.append((members, np.concatenate([np.empty(0, int), *rows])))
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return the least-squares strengths (rows, targets) that fit each target. A target is the index of a
-        column, or 0 for the residual.
+        """Return the strengths that fit each target best in the sense of least squares, of shape (rows,
+        targets). A target is the index of a column, or 0 for the residual.
         """
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))

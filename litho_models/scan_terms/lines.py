@@ -1,4 +1,4 @@
-"""Find the scan line of each pixel, and the offset of each line."""
+"""Find the scan line to which each pixel belongs, and estimate the height offset of each line."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 def scan_line_index(
     shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
 ) -> LineIndex:
-    """Return the index of the scan line under each layout pixel, (ny, nx), counted from 0. A scan line has
-    constant y in the frame of the scan.
+    """Return the index of the scan line to which each pixel of the layout belongs, counted from 0. A scan
+    line has constant y in the frame of the scan. The result has shape (ny, nx).
 
     Args:
-        shape: (ny, nx) of the layout.
-        scan_to_layout: matrix (3, 3) that maps (x_um, y_um, 1) in the frame of the scan to the frame of the
-            layout.
-        pitch_um: layout pitch, which is also the distance between counted lines.
-        bend_um: bend of the scan, which ``scan_to_layout`` does not contain.
+        shape: shape (ny, nx) of the layout.
+        scan_to_layout: matrix of shape (3, 3) that maps (x_um, y_um, 1) from the frame of the scan to the
+            frame of the layout.
+        pitch_um: layout pitch, which is also taken as the distance between scan lines.
+        bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None for a scan without a bend.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
@@ -39,7 +39,9 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """Return the axis of the lines: 1 for lines along x, 0 for a scan rotated by 90 degrees."""
+    """Return the array axis along which the lines run: 1 for lines along x, and 0 for lines along y, as in a
+    scan that is rotated by 90 degrees.
+    """
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
 
@@ -47,21 +49,23 @@ def axis_along(line: LineIndex) -> int:
 def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
-    """Estimate line offsets as a variance component. The result is the best linear prediction of s_i ~ N(0,
-    v).
+    """Estimate the offset s_i of each line. The offsets are treated as random with s_i ~ N(0, v), and the
+    result is their best linear prediction.
 
-    The scatter of block means within a line gives the noise of the line's mean and includes correlation along
-    the line. The variance of the line means minus this noise is v. If all lines have the same number of
-    blocks, this moment estimate equals REML. A line without used pixels gets 0.
+    Each line is divided into blocks. The scatter of the block means within a line gives the noise of the mean
+    of this line, which includes correlation along the line. The variance of the line means minus the variance
+    of this noise is v. If all lines have the same number of blocks, this moment estimate equals the
+    restricted maximum likelihood estimate (REML). The offset of a line without used pixels is 0.
 
     Args:
-        residual_um: residual (ny, nx), µm.
-        used: mask of the pixels to use.
-        line: index of the line of each pixel.
+        residual_um: residual, µm, of shape (ny, nx).
+        used: mask of the pixels to use, of shape (ny, nx).
+        line: index of the line of each pixel, of shape (ny, nx).
         block_px: length of a block along the lines.
 
     Returns:
-        offsets (lines,) µm, their shrinkage weights (lines,) in 0 ... 1, and v in µm².
+        The offsets in µm, of shape (lines,); their shrinkage weights from 0 to 1, of shape (lines,); and the
+        variance v in µm².
     """
     line_count = int(line.max()) + 1
     axis = axis_along(line)

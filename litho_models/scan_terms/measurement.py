@@ -1,9 +1,9 @@
-"""The measurement model: changes by microscope, registration and levelling that scans share.
+"""The measurement model: the changes by microscope, registration and levelling that several scans share.
 
-In a scan, the print is displaced by an uneven scanner, multiplied by a gain, levelled, and added to a
-background. The parts that all scans, or all scans of a group, share are learned from training scans and
-applied to predictions of other scans. Nothing is fitted to a scored scan. The measurement model is not part
-of the printer and is not used in a design.
+In a scan, the image of the print is displaced by the uneven motion of the scanner, multiplied by a gain,
+levelled, and added to a background. The changes that all scans share, or that all scans of a group share, are
+learned from training scans and applied to predictions of other scans. Nothing is fitted to a scored scan. The
+measurement model is not part of the printer and is not used in a design.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that may have been fitted to whole files and subtracted. Each is given by the positions of its
-# terms in the list x, y, x², xy, y², counted from 1.
+# Surfaces that may have been fitted to whole scan files and subtracted from them. Each surface is given by
+# the numbers of its terms in the list of polynomials x, y, x², xy, y², counted from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -42,13 +42,13 @@ class SharedPart(Record):
     """One part of the measurement model.
 
     Attributes:
-        what: kind of the part. A background or a displacement is a sum of Legendre polynomials of x and y up
-            to the total ``degree``, where x and y run from -1 to 1 over the field. A gain is a single
-            relative number.
-        by: name of the grouping.
-        coefficients: coefficients for each label, in µm; the coefficient of a gain is relative. A part
-            without coefficients adds nothing.
-        shrinking: weight of the prior for zero coefficients in the fit, as a number of scans.
+        what: kind of the part. A background or a displacement is a sum of products of Legendre polynomials of
+            x and y up to the total ``degree``, where x and y run from -1 to 1 over the field. A gain is a
+            single number, the relative change of the height.
+        by: name of the grouping whose groups have separate coefficients.
+        coefficients: coefficients for each label of the grouping, in µm; the coefficient of a gain is
+            dimensionless. A part without coefficients changes nothing.
+        shrinking: weight, in the fit, of the prior that the coefficients are zero, as a number of scans.
     """
 
     what: Shared
@@ -63,23 +63,27 @@ class SharedPart(Record):
         return sum(len(own) for own in self.coefficients.values())
 
     def of(self, scan: PrintedScan) -> list[float]:
-        """Return the coefficients of the scan's group. The list is empty if the group has no coefficients."""
+        """Return the coefficients of the group to which the scan belongs. The list is empty if this group has
+        no coefficients.
+        """
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
-        """Return the sum of polynomials on the scan's field, (ny, nx) µm; a background has no constant."""
+        """Return the sum of polynomials on the field of the scan, µm, of shape (ny, nx). The sum of a
+        background has no constant term.
+        """
         own = self.of(scan)
         return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
 
 
 class MeasurementModel(Record):
-    """The changes by the measurement that scans share.
+    """The changes by the measurement that several scans share.
 
     Attributes:
-        levelling: kind of surface that was fitted to whole files and subtracted. Predictions are levelled in
-            the same way.
-        parts: further parts, in the order in which they were found.
-        field_um: size (y, x) of the training fields.
+        levelling: kind of surface that was fitted to whole scan files and subtracted from them. Predictions
+            are levelled in the same way.
+        parts: the other changes, in the order in which they were found.
+        field_um: size (y, x) of the fields of the training scans.
         scans: number of training scans.
     """
 
@@ -100,9 +104,10 @@ class MeasurementModel(Record):
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
-        """Return the map (ny, nx), µm, that the scan is expected to show for a predicted print (ny, nx), µm.
+        """Return the map that the scan is expected to show, given the predicted height of the print. Both
+        maps have shape (ny, nx) and are in µm.
 
-        For a field of another size, only the levelling is applied.
+        If the field of the scan does not have the size of the training fields, only the levelling is applied.
         """
         parts = self._parts(scan)
         seen = displaced(scan, prediction_um, parts)
@@ -112,15 +117,17 @@ class MeasurementModel(Record):
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
-        """Subtract from the scan the changes that this model makes to its predicted print (ny, nx), µm."""
+        """Subtract from the scan the changes that this model makes to the predicted height of the print,
+        which is a map of shape (ny, nx) in µm.
+        """
         added = self.expected_um(scan, prediction_um) - prediction_um
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """Return a model of the differences between groups, in which the mean over the labels is subtracted
-        from each part.
+        """Return a model that contains only the differences between groups: from the coefficients of each
+        part, the mean over its labels is subtracted.
 
-        Gains are left out, because differences between prints may come from the printer.
+        Gains are left out, because a difference in gain between prints may come from the printer.
         """
         kept = []
         for part in self.parts:
@@ -132,17 +139,19 @@ class MeasurementModel(Record):
         return self.model_copy(update={"parts": kept, "levelling": "none"})
 
     def background_um(self, scan: PrintedScan) -> FloatMap:
-        """Return the background on the scan's field, (ny, nx) µm."""
+        """Return the background on the field of the scan, µm, of shape (ny, nx)."""
         backgrounds = (part for part in self._parts(scan) if part.what == "background")
         return sum((part.map_um(scan) for part in backgrounds), np.zeros(scan.shape))
 
     def _parts(self, scan: PrintedScan) -> list[SharedPart]:
-        """Return the parts that apply to the scan."""
+        """Return the parts that apply to the scan; there are none if its field has another size."""
         return [part for part in self.parts if part.of(scan)] if self.fits(scan) else []
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted print by these displacement parts; all maps have shape (ny, nx) and are in µm."""
+    """Displace a predicted height by the displacements among the given parts. The height and the result have
+    shape (ny, nx) and are in µm.
+    """
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
     if not moves:
@@ -155,7 +164,9 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """Subtract the surface that fits a field best on the usable pixels, but keep the mean."""
+    """Subtract from a field the surface of the given kind that fits its usable pixels best. The mean of the
+    surface is kept.
+    """
     if levelling == "none":
         return field
     shapes = polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
@@ -166,7 +177,9 @@ def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Flo
 
 @lru_cache(maxsize=8)
 def polynomials(shape: tuple[int, ...], degree: int) -> FloatMap:
-    """Return the products of Legendre polynomials of y and x, ordered by total degree, (k, ny, nx)."""
+    """Return maps of all products of Legendre polynomials of y and x up to a total degree, ordered by total
+    degree. The result has shape (k, ny, nx).
+    """
     y, x = (legendre.legvander(np.linspace(-1, 1, n), degree).T for n in shape)
     maps = [np.outer(y[by_y], x[total - by_y]) for total in range(degree + 1) for by_y in range(total + 1)]
     found = np.stack(maps)

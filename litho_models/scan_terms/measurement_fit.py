@@ -1,4 +1,4 @@
-"""Learn the measurement model: find the parts that scans share, and the strengths of these parts.
+"""Learn the measurement model: choose the parts that scans share, and fit the coefficients of these parts.
 
 Parts are chosen by cross-validation within the given scans.
 """
@@ -29,8 +29,8 @@ from litho_models.scan_terms.measurement import (
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# The parts to try, starting with the most likely part. A background of degree 11 varies over 9 µm in a field
-# of 54 µm.
+# The parts to try, starting with the most likely part: kind, degree, and whether the coefficients differ by
+# group. In a field of 54 µm, a background of degree 11 varies over lengths down to 9 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -43,18 +43,19 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights, in scans, of the prior that groups do not differ: the variance within groups divided by the
-# variance between groups.
+# Weights to try for the prior that groups do not differ, as numbers of scans. Such a weight is the variance
+# within groups divided by the variance between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
-# A part is kept if the held-out squared error falls by this many standard errors and by this share.
+# A part is added only if the squared error on held-out scans falls by more than this many standard errors of
+# the decrease, and by more than this share.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
-# Displacements are linearised. The second round linearises them at the displaced print.
+# Displacements are linearised in each round. The second round linearises them at the displaced print.
 _ROUNDS = 2
 _INNER_FOLDS = 5
 
 
-# A pair is a scan with its predicted print (ny, nx).
+# A pair consists of a scan and the predicted height of its print, of shape (ny, nx).
 _Pair = tuple[PrintedScan, np.ndarray]
 
 
@@ -65,13 +66,18 @@ def learn_measurement(
     seed: int = 0,
     like: MeasurementModel | None = None,
 ) -> MeasurementModel:
-    """Choose and fit the parts that these scans share, in addition to the predicted prints (ny, nx), µm.
+    """Learn the measurement model of the given scans, relative to the predicted heights of their prints.
 
-    Parts are added one at a time while they significantly lower the cross-validated error. If fields differ
-    in size, only those of the most frequent size are used. For micrographs of films, the model is empty.
+    Parts are added one at a time as long as they significantly lower the cross-validated error. If the fields
+    differ in size, only the scans with the most frequent size are used. For electron micrographs of films,
+    the model is empty.
 
     Args:
-        like: a model whose levelling and parts are reused, with newly fitted strengths.
+        scans: the scans from which the model is learned.
+        predictions_um: predicted height of the print of each scan, µm, of shape (ny, nx).
+        seed: seed that assigns the scans to the folds of the cross-validation.
+        like: a model whose levelling and parts are used instead of choosing them. Only the coefficients are
+            fitted again.
     """
     usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
     model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
@@ -92,7 +98,9 @@ def learn_measurement(
 
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
-    """Return the inner products of all parts that may be tried, computed at the current measurement model."""
+    """Return the inner products of the columns of all parts that may be tried. The columns are linearised at
+    the current measurement model.
+    """
     grams = []
     for scan, prediction in pairs:
         rows = _rows(scan, prediction, model)
@@ -101,7 +109,9 @@ def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
 
 
 def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
-    """Choose the parts to add. ``fold_of`` contains the fold of each scan, (scans,)."""
+    """Choose the parts to add. ``fold_of`` contains the number of the fold of each scan and has
+    shape (scans,).
+    """
     chosen: list[SharedPart] = []
     if len(fold_of) < 2:
         return chosen
@@ -130,7 +140,7 @@ def _offers(groups: Iterable[str], chosen: Sequence[SharedPart]) -> list[SharedP
 
 
 def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart]:
-    """Fit the strengths of the chosen parts."""
+    """Fit the coefficients of the chosen parts."""
     fitted = products.strengths([*map(_block, chosen)], np.arange(len(products.grams)))
     return [
         part.model_copy(update={"coefficients": {label: own.tolist() for label, own in strengths.items()}})
@@ -139,11 +149,11 @@ def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Return the residual and the columns, (1 + m, n), at a thinned set of pixels. The mean of each row is
-    subtracted.
+    """Return the residual and the m columns of all parts at a thinned set of n pixels. The mean of each row
+    is subtracted. The result has shape (1 + m, n).
 
     The contribution of the current parts is added back to the residual, to first order. Each round therefore
-    fits the full strengths, and the strengths are shrunk only once, regardless of the number of rounds.
+    fits the full coefficients, and the prior shrinks them only once, regardless of the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
@@ -151,7 +161,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     count, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     rows = np.empty((count + 2 * lateral + 1, len(at)))
     np.take(polynomials(scan.shape, _HIGHEST).reshape(count, -1), at, 1, out=rows[:count], mode="clip")
-    # A background is added after levelling, so it is not levelled.
+    # The background is added after levelling, so the columns of the background are not levelled.
     surface, moved = rows[[0, *LEVELLED[model.levelling]]], rows[count:]
     np.multiply(rows[:lateral], slope_x, out=moved[:lateral])
     np.multiply(rows[:lateral], slope_y, out=moved[lateral:-1])
@@ -166,7 +176,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
 
 
 def _block(part: SharedPart) -> Block:
-    """Return the columns of a part in the result of ``_rows``, with its groups and its prior."""
+    """Return the block of a part: its columns in the result of ``_rows``, its grouping and its prior."""
     surface, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     starts = {
         "background": 1,
@@ -193,12 +203,13 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
             surface = shapes[[0, *own]]
             seen = expected - least_squares(surface, expected) @ surface
             rests[levelling].append(least_squares(shapes, height - seen))
-    # Legendre polynomials are nearly orthogonal over a field, so their spread gives the squared error.
+    # Legendre polynomials are nearly orthogonal over a field, so the squared error that a levelling leaves is
+    # a weighted sum of the variances of their coefficients.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
     return min(LEVELLED, key=lambda one: float((np.var(rests[one], axis=0) * weights)[1:].sum()))
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Return the inner fold of each scan, chosen by a hash of its id."""
+    """Return the number of the inner fold of each scan, which is assigned by a hash of the scan id."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])

@@ -1,4 +1,4 @@
-"""The usual sets of scan terms for scores and for training, and the record of how a score was made."""
+"""The usual sets of scan terms for scoring and for training, and the record of how a score was computed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def policy_terms(policy: str) -> Terms:
     """Return the terms of a policy.
 
     Raises:
-        InputError: no such policy.
+        InputError: there is no policy with this name.
     """
     for known, terms in POLICIES.items():
         if policy == known:
@@ -40,23 +40,24 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """Return the default policy. For films, no zero height is fitted."""
+    """Return the default policy. It fits the datum of each scan, except for films, which have no datum."""
     return "none" if film else "offset"
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """Return the default background of predictions."""
+    """Return the background that is added to predictions by default; for films, none is added."""
     return "none" if film else "training"
 
 
 class NuisanceProtocol(Record):
-    """The terms that are removed from scans before scoring, and the pixels to which they are fitted.
+    """The terms that are subtracted from scans before scoring, and the pixels to which they are fitted.
 
     ``k`` is the number of smooth terms per scan. It does not include the line offsets of ``full+rows``,
-    because their effective number depends on the prediction (``PolicyError.k``). ``background`` is
-    ``training`` if predictions include the smooth background of the training scans, and ``shared`` if they
-    include the whole measurement model. No part of the background is fitted to the scored scan. ``border_px``
-    is the number of pixels that are left out at the edge of a scan, which is always zero.
+    because their effective number depends on the prediction and is stated in ``PolicyError.k``.
+    ``background`` is ``training`` if predictions include the smooth background of the training scans,
+    ``shared`` if they include the whole measurement model, and ``none`` if they include neither. No part of
+    the background is fitted to the scored scan. ``border_px`` is the number of pixels that are left out at
+    the edge of a scan; it is always zero. The other fields are those of ``Blocks``.
     """
 
     policy: Policy = "offset"
@@ -80,21 +81,23 @@ class NuisanceProtocol(Record):
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# The mean of these terms over the scans belongs to the process, not to single scans.
+# Terms whose mean over the scans belongs to the process, not to single scans. This mean is kept in the
+# process model.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
 def training_terms(policy: Policy) -> Terms:
-    """Return the terms of a policy that are fitted together with a model: all except the gain.
+    """Return the terms of a policy that are fitted to each scan while a model is trained: all except the
+    gain.
 
-    Part of a scan's gain is a long-range effect of the layout. A model cannot learn this effect if every scan
-    has a free gain.
+    Part of the gain of a scan is a long-range effect of the layout. A model cannot learn this effect if the
+    gain of every scan is free.
     """
     return policy_terms(policy) - {"gain"}
 
 
 def smooth_training_terms(policy: Policy) -> Terms:
-    """Return the terms of ``training_terms`` without line offsets, which average out over a scan and hardly
+    """Return ``training_terms`` without the line offsets. Line offsets average out over a scan and hardly
     change a small model.
     """
     terms = training_terms(policy)
@@ -104,10 +107,10 @@ def smooth_training_terms(policy: Policy) -> Terms:
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
-    """Estimate the terms that each scan adds to the height of the model, from all valid pixels of the scan.
-    Return a float32 map (ny, nx), µm, for each scan.
+    """Estimate the terms that each scan adds to the height predicted by a model, from all valid pixels of the
+    scan. Return for each scan the sum of its terms, µm, as a float32 map of shape (ny, nx).
 
-    Use these terms only for training. Reported errors use the terms that ``cross_fit`` estimates.
+    Use these maps only for training. Reported errors use the terms that ``cross_fit`` estimates.
     """
     coefficients = np.array(
         [
@@ -115,7 +118,7 @@ def estimate_scan_terms(
             for scan, prediction in zip(scans, predictions_um, strict=True)
         ]
     )
-    # Offset and gain come first in the catalogue, with one map each.
+    # Offset and gain are the first terms of the catalogue and have one map each.
     pinned = len(PINNED & terms)
     coefficients[:, :pinned] -= coefficients[:, :pinned].mean(axis=0)
     maps = []

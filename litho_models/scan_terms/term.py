@@ -1,7 +1,8 @@
-"""The catalogue of terms that a scan may add to the height.
+"""The catalogue of terms that a scan may add to the height of a print.
 
-A term is a set of smooth maps over the scan (datum, gain, bow, ...), or one offset for every line. Benchmark,
-training, noise and loop all use this catalogue. ``register_scan_term`` adds a term.
+A term is a set of smooth maps over the scan (datum, gain, bow, ...), or a set of offsets, one for every line.
+The benchmark, the training, the noise estimate and the loop all use this catalogue. ``register_scan_term``
+adds a term to it.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ class TermPixels:
     """The predicted height of a scan, and the pixels at which terms are evaluated.
 
     Attributes:
-        prediction_um: predicted height (ny, nx), µm.
-        line: index of the scan line under each pixel, (ny, nx). If it is None, the rows of the array are the
-            scan lines.
-        at: flat indices of the pixels. If it is None, all pixels are used in order.
+        prediction_um: predicted height, µm, of shape (ny, nx).
+        line: index of the scan line of each pixel, of shape (ny, nx). If it is None, the rows of the array
+            are the scan lines.
+        at: flat indices of the n pixels at which terms are evaluated. If it is None, terms are evaluated at
+            all pixels, in order.
     """
 
     prediction_um: np.ndarray
@@ -38,25 +40,29 @@ class TermPixels:
 
     @cached_property
     def height(self) -> FloatMap:
-        """Return the predicted height at the pixels minus its mean over the whole scan, (n,) µm."""
+        """Return the predicted height at the pixels minus its mean over the whole scan, µm, of shape (n,)."""
         prediction = np.asarray(self.prediction_um, np.float64)
         return self._taken(prediction) - float(prediction.mean())
 
     @cached_property
     def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Return the change of the predicted height per pixel along y and along x, two arrays (n,) in µm."""
+        """Return the change of the predicted height per pixel along y and along x, µm, as two arrays of shape
+        (n,).
+        """
         slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
         return self._taken(slopes[0]), self._taken(slopes[1])
 
     @cached_property
     def smooth(self) -> FloatMap:
-        """Return ``smooth_shapes`` at the pixels, (5, n)."""
+        """Return the five maps of ``smooth_shapes`` at the pixels, of shape (5, n)."""
         shapes = smooth_shapes(self.prediction_um.shape)
         return np.stack([self._taken(shape) for shape in shapes])
 
     @cached_property
     def time(self) -> FloatMap:
-        """Return the relative time of each pixel, from 0 in the first line to 1 in the last, (n,)."""
+        """Return the relative time at which each pixel was scanned, from 0 in the first scan line to 1 in the
+        last. The result has shape (n,).
+        """
         line = row_index(self.prediction_um.shape) if self.line is None else self.line
         return self._taken(line) / max(int(line.max()), 1)
 
@@ -71,15 +77,15 @@ class ScanTerm:
 
     Attributes:
         name: name of the term in sets of terms.
-        effect: the effect that the term represents, or None for a control. Several terms may represent the
-            same effect.
+        effect: name of the effect that the term represents, or None for a term that serves only as a control.
+            Several terms may represent the same effect.
         unit: unit of the coefficients, which is ``µm`` for a height, ``px`` for a displacement, or ``1``.
-        labels: description of each map; line offsets have one description.
-        maps: function that returns the smooth maps (k, n) at the pixels. All maps except the datum have zero
-            mean over the scan.
-        lines: for line offsets, function that returns the line index of each pixel, given the shape of the
-            scan and the index of the scan lines.
-        frame: for line offsets, the name of the lines that the offsets follow.
+        labels: description of each of the k maps. A term of line offsets has a single description.
+        maps: function that returns the smooth maps at given pixels, of shape (k, n). All maps except the
+            datum have zero mean over the scan. None for line offsets.
+        lines: for line offsets, function ``lines(shape, scan_line)`` that returns the line index of each
+            pixel, given the shape of the scan and the index of the scan line of each pixel (or None).
+        frame: for line offsets, the lines that the offsets follow, in words.
     """
 
     name: str
@@ -92,14 +98,18 @@ class ScanTerm:
 
 
 def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
-    """Return the smooth maps of some terms, in the order of the catalogue, (k, n)."""
+    """Return the smooth maps of the named terms at the given pixels, in the order of the catalogue. The
+    result has shape (k, n).
+    """
     chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
     count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
     return np.concatenate([np.empty((0, count)), *chosen])
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
-    """Return the names of the coefficients of ``term_maps``, with their usual units."""
+    """Return the names of the coefficients that belong to the maps of ``term_maps``, with the units in which
+    they are reported.
+    """
     shown = {"µm": " (nm)", "px": " (px)", "1": ""}
     return [
         label + shown[term.unit]
@@ -113,7 +123,7 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
     """Return the terms with these names, in the order of the catalogue.
 
     Raises:
-        InputError: a name that is not in the catalogue.
+        InputError: a name is not in the catalogue.
     """
     wanted = set(names)
     for name in sorted(wanted - SCAN_TERMS.keys()):
@@ -122,12 +132,14 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def line_terms(names: Iterable[str]) -> list[ScanTerm]:
-    """Return the line offsets among these terms."""
+    """Return those of the named terms that are line offsets."""
     return [term for term in chosen_terms(names) if term.lines is not None]
 
 
 def terms_of_effect(effect: str) -> Terms:
-    """Return the terms of an effect; empty if it is not a per-scan effect."""
+    """Return the names of the terms that represent an effect. The set is empty if it is not a
+    per-scan effect.
+    """
     return frozenset(term.name for term in SCAN_TERMS.values() if term.effect == effect)
 
 
@@ -135,7 +147,7 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
     """Add a term to the catalogue and return it.
 
     Raises:
-        InputError: a name that is taken, both maps and lines, or neither.
+        InputError: the name is already taken, or the term has both ``maps`` and ``lines``, or neither.
     """
     if term.name in SCAN_TERMS:
         raise InputError("scan term", got=f"{term.name}, which exists", wanted="a new name")
@@ -148,8 +160,8 @@ def register_scan_term(term: ScanTerm) -> ScanTerm:
 
 @lru_cache(maxsize=8)
 def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
-    """Return maps of x, y, x², xy and y² over a scan, (5, ny, nx), where x and y run from -1 to 1. The mean
-    of each map is subtracted. The array is read-only.
+    """Return maps of x, y, x², xy and y² over a scan, where x and y run from -1 to 1. The mean of each map is
+    subtracted. The result has shape (5, ny, nx) and is read-only.
     """
     ny, nx = shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
@@ -159,35 +171,36 @@ def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
 
 
 def row_index(shape: tuple[int, ...]) -> LineIndex:
-    """Return the row number of each pixel, (ny, nx)."""
+    """Return the row number of each pixel, as an array of shape (ny, nx)."""
     return np.broadcast_to(np.arange(shape[0], dtype=np.intp)[:, None], shape)
 
 
 def _drift(pixels: TermPixels) -> FloatMap:
-    """Return the exponential creep after the scan starts; slower creep is part of the bow."""
+    """Return maps of exponential creep after the start of the scan, one for each decay time."""
     time = pixels.time
     ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
     return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
 
 
 def _warp(pixels: TermPixels) -> FloatMap:
-    """Return the changes that an affine error of the registration causes."""
+    """Return maps of the height changes that an affine error of the registration causes."""
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (np.ones_like(x), y, x)])
 
 
 def _distortion(pixels: TermPixels) -> FloatMap:
-    """Return the changes that a quadratic error of the registration causes. They are centred, so that a
-    common distortion causes no shift.
+    """Return maps of the height changes that a quadratic error of the registration causes. The quadratic
+    terms are centred, so that a distortion that all scans share causes no mean shift.
     """
     x, y = pixels.smooth[:2]
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
 
 
-# Decay times of the two parts of a creep, in scan times; slower creep is part of the bow.
+# Decay times of the two parts of a creep, relative to the duration of a scan. Slower creep is part of the
+# bow.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
-# These are listed in the order in which they are tested.
+# The terms are listed in the order in which the loop tests them.
 _BUILT_IN = (
     ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
     ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None]),
