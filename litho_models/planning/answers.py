@@ -1,4 +1,6 @@
-"""For each open question of a plan, state the difference of the rivals, the power and all outcomes."""
+"""For each open question of a plan, compute how much the rivals (competing explanations) differ and the power
+of the planned prints to decide the question, and list all possible outcomes.
+"""
 
 from __future__ import annotations
 
@@ -17,24 +19,30 @@ from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Questi
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
 
-# Threshold, in standard deviations, for the largest allowed probability of naming a wrong cause.
+# A difference of this many standard deviations decides between two rivals. It corresponds to the largest
+# allowed probability of naming a wrong cause.
 Z_DECIDED = float(norm.isf(CONFIRM_P))
-# If the printer is the cause, this share of a per-scan term's variance is variance between prints.
+# If the printer is the cause of a per-scan term, this share of the variance of the term is assumed to be
+# variance between prints.
 PRINT_SHARE = 0.9
+# Power at which the prints count as enough to decide a question.
 ENOUGH = 0.95
-# Below this power, the rivals count as not separated by any allowed experiment.
+# At this power or below, the planned prints count as unable to separate the rivals, unless a larger number of
+# prints is enough.
 HOPELESS = 0.2
+# Largest number of prints for which the power is computed.
 MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Return the power of an experiment with ``prints`` prints, which are assumed to be like those of the
-    contrast.
+    """Return the power of an experiment to decide between two rivals with the given number of prints, which
+    are assumed to be like the prints of the contrast.
 
-    The mean of the difference between two squared errors is the squared distance. The variance of this
-    difference has two sources. One is the noise along the distance. The other is the distance itself, which
-    varies between prints by ``question.spread``. As in the decision, the part of the difference that
-    ``form_nm`` may explain is subtracted.
+    The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
+    of the squared errors is the squared distance between the two predictions. The variance of this difference
+    has two sources. One is the noise along the difference of the predictions. The other is the distance
+    itself, whose relative spread between prints is ``question.spread``. As in the decision, the part of the
+    difference that an error of ``form_nm`` in the form of the model may explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -44,12 +52,12 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
 
 
 def of_repeats(prints: int, scans: int) -> float:
-    """Return the power of an experiment with remounted and rescanned prints, which attributes a per-scan term
-    to the printer or to the microscope.
+    """Return the power of an experiment that attributes a per-scan term to the printer or to the microscope.
+    In this experiment, every print is remounted and scanned several times.
 
-    The test is the F test of an analysis of variance. The printer is the cause if scans of one print agree
-    more than chance allows (p <= 0.005). The microscope is the cause if they agree less than an effect of the
-    printer allows (p <= 0.005). The smaller of the two powers is returned.
+    The test is the F test of an analysis of variance. The printer is the cause if the scans of one print
+    agree better than chance allows (p <= 0.005). The microscope is the cause if they agree less well than an
+    effect of the printer allows (p <= 0.005). The smaller of the powers of these two tests is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -61,9 +69,10 @@ def of_repeats(prints: int, scans: int) -> float:
 
 
 def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
-    """Return the power to distinguish lines made by the printer from lines made by the microscope.
+    """Return the power to decide whether line offsets with standard deviation ``sd_um`` come from the printer
+    or from the microscope.
 
-    The scan is rotated, so the two kinds of lines run along different axes.
+    The scan is rotated, so the lines of the printer and those of the microscope run along different axes.
     """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
@@ -74,42 +83,45 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 
 def prints_needed(powers: Sequence[float]) -> int | None:
-    """Return the smallest number of prints with enough power; None if no tested number is enough."""
+    """Return the smallest number of prints whose power is enough; None if no number that was tried is enough.
+    ``powers`` contains the powers for 1, 2, 3, … prints.
+    """
     return next((prints for prints, power in enumerate(powers, start=1) if power >= ENOUGH), None)
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Return how far a gain exceeds the allowance for the model's own error, in standard deviations of the
-    noise.
+    """Return by how many standard deviations of the noise a gain exceeds the allowance for the error of the
+    model itself. The sign of the result is the sign of the gain.
 
-    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose A is
-    true except for noise n and an error e of the form that both rivals share. Prints then show y = A + e + n,
-    and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> - 2<D, n>. The noise
-    averages out over prints, but e recurs in every print of similar texture. The angle between e and D is
-    unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference up to 2 |D| |e| is inconclusive, and no
-    number of prints separates rivals with |D| below 2 |e|. The new prints show part of e, because the gain
-    would be |D|² without e and without noise. A deviation of the gain from |D|² that is larger than noise
-    therefore also counts as an error. The larger of the two allowances is used.
+    Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
+    A is true except for noise n and an error e in the form of the model, which both rivals share. Prints then
+    show y = A + e + n, and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> -
+    2<D, n>. The noise averages out over prints, but e recurs in every print of similar texture. The angle
+    between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference of up to 2 |D| |e|
+    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. The new prints show part
+    of e, because without e and without noise, the gain would be |D|². A deviation of the gain from |D|² that
+    exceeds the noise therefore also counts as an error of the model. The larger of these two allowances is
+    used.
 
     Args:
         gain: |y - B|² - |y - A|². A positive gain favours A, and a negative gain favours B.
-        difference: |D|², squared difference of their predictions.
-        sd: standard deviation of the gain by noise.
-        form: |e|², squared error of the form; 0 if it is unknown. All four arguments are sums over the same
-            pixels, in the same unit.
+        difference: |D|², the squared difference of the two predictions.
+        sd: standard deviation that noise causes in the gain.
+        form: |e|², the squared error of the form of the model; 0 if it is unknown. All four arguments are
+            sums over the same pixels, in the same unit.
     """
     if sd <= 0:
         return 0.0
     unknown = 2 * math.sqrt(difference * form)
     seen = abs(abs(gain) - difference) - Z_DECIDED * sd
-    # A gain above the expected one raises no doubt; a gain below half of it does.
+    # A gain that exceeds the expected gain |D|² raises no doubt; a gain below half of it does.
     against = max(unknown, seen if abs(gain) < difference else 0.0)
     return float(np.copysign(max(abs(gain) - against, 0.0) / sd, gain))
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
-# Number of random draws of the rivals' parameters within their uncertainty. The power is averaged over the
-# draws, because the difference of two rivals may depend on a parameter.
+# Number of random draws of the rivals' parameters within their uncertainty. The power is averaged over these
+# draws, because the difference between two rivals may depend on a parameter.
 DRAWS = 8
 _HOPELESS: Status = "no experiment separates"
 
@@ -121,8 +133,16 @@ def of_rivals(
     random: Sequence[PlannedPrint],
     prints: int,
 ) -> PlannedQuestion:
-    """Plan a question whose rivals are models; compute its power for the planned prints and, as a control,
-    for equally many random layouts.
+    """Plan the answer to a question whose rivals are models. The power to decide it is computed for the
+    planned prints and, as a control, for the same number of prints with random layouts.
+
+    Args:
+        rivalry: the rivals of the question.
+        tried: separation of the two most similar rivals, in standard deviations, for each way to print and
+            scan that was tried.
+        planned: planned prints on which the rivals are compared.
+        random: the same prints with random layouts.
+        prints: number of prints in the plan.
     """
     question = rivalry.question
     pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
@@ -130,12 +150,12 @@ def of_rivals(
     names = [rival.name for rival in question.rivals]
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
     why = [
-        "the two most similar rivals differ on one random print by this number of standard deviations: "
-        f"{ways}"
+        "number of standard deviations by which the two most similar rivals (competing explanations) differ "
+        f"on one random print, for each way to scan or print it: {ways}"
     ]
     if question.spread:
         why.append(
-            f"in addition to noise, the evidence varies by {100 * question.spread:.0f} % between prints"
+            f"in addition to the noise, the evidence varies between prints by {100 * question.spread:.0f} %"
         )
     if question.form_nm is not None:
         why.append(
@@ -151,8 +171,9 @@ def of_rivals(
         "; ".join(why),
         [
             *(f"if {name} fits the scans better than every other rival, it is the cause" for name in names),
-            "if two rivals fit equally well, both remain possible, and the others are excluded",
-            "if the residuals of all rivals exceed the noise, none of them is the cause",
+            "if two rivals fit equally well and better than the others, both remain possible, and the others "
+            "are excluded",
+            "if the residuals of all rivals exceed the noise, none of the rivals is the cause",
         ],
         rivals=names,
         pairs=pairs,
@@ -164,8 +185,8 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Return the pairs of rivals. Of the two directions of a pair, the one with the smaller power is used.
-    The power is averaged over the draws.
+    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one, and the
+    case with the smaller power is used. The power is averaged over the draws of the rivals' parameters.
     """
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
@@ -191,7 +212,16 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
 def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
-    """Plan a question that depends on how prints are scanned, whatever is printed."""
+    """Plan the answer to a question whose answer depends only on how prints are scanned or on a missing fact,
+    not on the layouts.
+
+    Args:
+        question: the question.
+        open_: the open questions, which contain the noise.
+        prints: number of prints in the plan.
+        scans: number of scans of each print.
+        size_px: side length of a print in pixels.
+    """
     if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
         return _planned(
@@ -200,8 +230,8 @@ def of_others(
             prints,
             "in a rotated scan, scan lines and written lines run along different axes of the layout",
             [
-                "if the offsets follow the layout's rows even in rotated scans, they come from the printer",
-                "if they follow the scan lines, they come from the microscope",
+                "if the line offsets follow the layout's rows even in rotated scans, the printer causes them",
+                "if the line offsets follow the scan lines, the microscope causes them",
             ],
         )
     if question.kind == "per-scan":
@@ -209,13 +239,14 @@ def of_others(
             question,
             [of_repeats(n, scans) for n in _COUNTS],
             prints,
-            "every print is remounted and scanned again, so the printer's part of the term repeats",
+            "every print is remounted and scanned again, and a term that the printer causes is then the same",
             [
                 "if scans of one print agree, the term comes from the printer and differs between prints",
-                "if they agree no better than scans of different prints, it comes from the microscope",
+                "if scans of one print agree no better than scans of different prints, the term comes from "
+                "the microscope",
             ],
         )
-    told = [f"when the card states the missing fact, the loop can test {question.name}"]
+    told = [f"when the dataset card states the missing fact, the loop can test {question.name}"]
     return _planned(question, [0.0 for _ in _COUNTS], prints, question.experiment, told)
 
 

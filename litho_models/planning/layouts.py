@@ -1,8 +1,9 @@
-"""Choose the scans of each print, and optimise layouts for which the predictions of the rivals differ most.
+"""Choose how each print is scanned, and optimise layouts so that the predictions of the rivals (competing
+explanations) differ as much as possible.
 
-A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and follows the
-gradient of the rivals' separation. The tile is low-passed and clipped in every step, so it stays similar to
-the layouts that the models know.
+A layout is built from tiles. Each tile starts as a calibration pattern or a random layout, and is changed by
+gradient ascent to increase the separation of the rivals. In every step, the tile is low-pass filtered and
+clipped, so it stays similar to the layouts to which the models were fitted.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Levels that cover less than this share of earlier prints are unknown to the models.
+# Levels that cover less than this share of earlier prints count as unknown to the models.
 _RARE = 1e-3
-# The levels' mean and spread may differ from those of earlier prints by this sum without a penalty.
+# The mean and the spread of the levels may differ from those of earlier prints. There is no penalty as long
+# as the sum of these two differences, in levels, does not exceed this value.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 TURNED = Way(turned_deg=90)
@@ -45,19 +47,21 @@ WORDS = {
 _MOST_EXTRAS = 2
 # A further scan is planned if it increases the separation of the rivals by at least this factor.
 _WORTH = 1.3
-# A lower dose keeps every exposure in the range that the models know, unlike a higher dose.
+# Relative dose of the second print. A dose below 1 keeps every exposure in the range to which the models were
+# fitted; a higher dose would not.
 SECOND_DOSE = 0.8
-# Below this separation, in standard deviations, a layout does not show the difference.
+# If the separation of the rivals is below this value, in standard deviations, the layout does not show their
+# difference.
 _NOTHING = 0.3
-# Registration refuses layouts whose self-similarity exceeds 0.9. The limit here is lower, because prints are
-# less clear than layouts.
+# Registration rejects layouts whose self-similarity exceeds 0.9. The limit here is lower, because prints have
+# less contrast than layouts.
 _MOST_REPEATING = 0.7
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of planned layouts: lowest and highest level, cut-off frequency (cycles/µm), and mean and
-    spread of the levels in earlier prints.
+    """Limits for planned layouts: the lowest and highest level, the highest spatial frequency (cycles/µm),
+    and the mean and standard deviation of the levels in earlier prints.
     """
 
     lowest: int
@@ -80,25 +84,27 @@ class Limits:
         return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
-        """Low-pass unrestricted values and clip them to soft levels (y, x) that can be printed."""
+        """Low-pass filter unrestricted values and clip them to the range of the levels. The result contains
+        soft (not yet rounded) levels and has shape (ny, nx).
+        """
         y, x = (torch.fft.fftfreq(n, self.pitch_um).abs() <= self.cutoff_per_um for n in free.shape)
         smooth = torch.fft.ifft2(torch.fft.fft2(free) * (y[:, None] & x)).real
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
-        """Round to the levels that the printer can print."""
+        """Round soft levels to the whole levels that the printer can print."""
         span = self.highest - self.lowest
         above = quantise((soft - self.lowest) / span, span + 1)
         return above.astype(np.min_scalar_type(self.highest)) + self.lowest
 
     def price(self, soft: Tensor) -> Tensor:
-        """Return a penalty for levels whose mean or spread is far from that of earlier prints."""
+        """Return a penalty for levels whose mean or standard deviation is far from that of earlier prints."""
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
-        """Make a random layout with whole levels (size, size). ``finest`` is its cut-off frequency as a
-        fraction of the largest allowed one.
+        """Make a random layout with whole levels, of shape (size_px, size_px). ``finest`` is its cut-off
+        frequency as a fraction of the highest allowed frequency.
         """
         level = random_layout(
             (size_px, size_px),
@@ -112,10 +118,11 @@ class Limits:
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the names and levels (size, size) of the layouts from which an optimisation may start.
+    """Yield the layouts from which an optimisation may start, each as its name and its levels of shape
+    (size_px, size_px).
 
-    Patterns get a random frame, a fifth of the side wide, because scans of periodic patterns cannot be
-    registered.
+    Periodic patterns get a frame with a random layout, because scans of periodic patterns cannot be
+    registered. The frame is a fifth of the side wide.
     """
     for number, finest in enumerate((1.0, 0.5, 0.8)):
         yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
@@ -141,9 +148,8 @@ def score(
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
 ) -> float:
-    """Return the separation of the nearest pair of rivals, in standard deviations.
-
-    One print of the layout is made at each dose.
+    """Return the separation of the two most similar rivals, in standard deviations, if one print of the
+    layout is made at each dose.
     """
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
@@ -158,7 +164,9 @@ def climb(
     place: Place = "centre",
     steps: int = STEPS,
 ) -> np.ndarray:
-    """Return the soft levels (y, x) after gradient ascent from ``start``."""
+    """Increase the separation of the rivals by gradient ascent from the layout ``start``. Return the best
+    soft (not rounded) levels, of shape (ny, nx).
+    """
     free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
@@ -168,10 +176,11 @@ def climb(
         if fresh:
             refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
         apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
-        # The separation is exact only if the rivals have been refitted to this layout.
+        # The separation is exact only at steps in which the rivals were refitted to the current layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
-        # This is a soft minimum over pairs. With a hard minimum, the ascent would alternate between pairs.
+        # The negative log-sum-exp is a soft minimum over the pairs of rivals. With a hard minimum, the ascent
+        # would alternate between pairs.
         climber.zero_grad()
         (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()
@@ -179,7 +188,9 @@ def climb(
 
 
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
-    """Assemble the tiles into whole levels (size, size), in a different order for each print."""
+    """Assemble the tiles of a print into a layout with whole levels, of shape (size_px, size_px). The order
+    of the tiles differs between prints; ``number`` is the number of the print.
+    """
     side = -(-size_px // tiles[0].shape[0])
     order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
     whole = np.block([order[row * side : (row + 1) * side] for row in range(side)])[:size_px, :size_px]
@@ -192,11 +203,11 @@ def as_tensor(level: np.ndarray) -> Tensor:
 
 
 class Chosen(NamedTuple):
-    """How prints are made and scanned for one question or for all questions.
+    """How prints are made and scanned to decide one question, or all questions.
 
-    ``ways`` lists how each print is scanned. Successive prints cycle through the ``places`` in the write
-    field and through the ``doses``. ``tried`` contains separations in standard deviations: the separation
-    with one plain scan, and the separations with other ways in addition to the plain scan.
+    ``ways`` lists the scans of each print. Successive prints cycle through the ``places`` in the write field
+    and through the ``doses``. ``tried`` contains the separations of the rivals in standard deviations, for
+    one plain scan and for each other way to scan or print in addition to it.
     """
 
     ways: tuple[Way, ...]
@@ -217,7 +228,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
-        # The report shows the separation with one plain scan and this way only, so earlier values are kept.
+        # The report states the separation for the plain scan plus a single other scan. Values that were found
+        # in the first round are therefore kept.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
@@ -234,8 +246,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 
 def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
-    """Combine the choices for all questions. ``asked`` contains the ways to scan that are needed for
-    questions without a layout.
+    """Combine the choices that were made for the single questions into one for all questions. ``asked``
+    contains the ways to scan that are needed for questions that do not depend on a layout.
     """
     ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
     places = max((one.places for one in choices), key=len, default=("centre",))
@@ -258,10 +270,19 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> list[np.ndarray]:
-    """Optimise tiles for one question after the other. Return the soft levels of the tiles.
+    """Optimise ``count`` tiles, for each question in turn. Return the soft (not rounded) levels of each tile.
 
     Args:
-        kept: folder of finished tiles; tiles of an interrupted run are reused.
+        rivalries: the rivals of each question.
+        chosen: the ways to print and scan.
+        limits: limits for the layouts.
+        tile_px: side length of a tile in pixels.
+        count: number of tiles.
+        seed: seed of the random layouts from which the optimisation starts.
+        steps: number of ascent steps for each tile.
+        kept: folder in which finished tiles are saved. Tiles that an interrupted run has saved there are
+        reused.
+        report: function that receives the progress messages.
     """
     kept.mkdir(parents=True, exist_ok=True)
     report(f"{sum(1 for _ in kept.glob('[0-9]*.npy'))} of {count} tiles are kept from an earlier run")
@@ -284,9 +305,9 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return how closely a layout repeats itself, as registration measures it.
+    """Return the self-similarity of a layout, as registration measures it.
 
-    At a value of 1, the layout fits equally well at another shift.
+    If the value is 1, the layout fits itself equally well at another shift.
     """
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

@@ -1,8 +1,9 @@
-"""List the open questions of a closed loop, with everything that is needed to plan an experiment.
+"""List the open questions of a closed loop, with all information that is needed to plan an experiment.
 
-Effects that look the same become rivals: each of them in turn is added to the corrected model, which is
-refitted to all scans. If it is unknown whether the printer or the microscope causes an effect, the effect
-becomes two rivals. One of them rotates with the print, and the other rotates with the scan.
+Effects that look the same become rivals (competing explanations). For each rival, the effect is added to the
+corrected model, and the model is refitted to all scans. If it is unknown whether the printer or the
+microscope causes an effect, the effect becomes two rivals: in one of them, the effect rotates with the print,
+and in the other it rotates with the scan.
 """
 
 from __future__ import annotations
@@ -40,15 +41,19 @@ from litho_models.planning.questions import (
 from litho_models.scan_terms import line_terms, terms_of_effect
 from litho_models.scan_terms.grouped import ALL
 
-# Largest number of rivals. It is limited because every pair is compared on every layout.
+# Largest number of effects that may become rivals in one question. It is limited because every pair of rivals
+# is compared on every layout.
 _MOST_MEMBERS = 3
-# Smallest layout whose spectrum is measured, and the share of power below the cut-off.
+# Smallest side of a layout whose spectrum is measured, and the share of the spectral power that lies below
+# the cut-off frequency.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
 def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
-    """Return all open questions with fitted rivals, the most valuable question first."""
+    """Return all open questions with their fitted rivals: first the questions about causes, then those about
+    unconfirmed effects, per-scan terms and missing facts.
+    """
     asking = _Asking(closed)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = closed.study.stored
@@ -67,7 +72,7 @@ def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
 
 
 def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
-    """Return the frequency below which most of the power of the layouts lies, cycles/µm."""
+    """Return the frequency, cycles/µm, below which 95 % of the spectral power of the layouts lies."""
     first, layouts = scans[0], [scan.mask_level for scan in scans]
     if min(first.shape) < _SMALLEST_PX:
         return 0.05 / first.pitch_um
@@ -86,14 +91,15 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """Return the question about a cause: which effect of a set is present, or which owner an effect has.
-        Return None if neither is open.
+        """Return the open question about a cause: which effect of a set of similar effects is present, or
+        whether the printer or the microscope causes the effect. Return None if neither is open.
         """
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values()[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
-        # A rival that replaces another starts from the model before any of them was found.
+        # A rival effect that replaces the cause starts from the values that screening found before any cause
+        # was added.
         first = {**self.closed.lawful.first, **self.closed.named.first}
         twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
         return _question(
@@ -120,8 +126,8 @@ class _Asking:
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
         rivals = self._rivals(names, [_with(self.twin, one) for one in standing])
-        # The loop estimated the error of the model's form without these effects. Here it is estimated with
-        # each of them.
+        # The loop estimated the error in the form of the model without these effects. Here it is estimated
+        # with each of these effects in the model.
         learner = Learner(self.study, self.maps)
         maps = ([*map(rival.twin(self.twin).height, self.study.scans)] for rival in rivals)
         form_nm = min(learner.rest(one).most_nm for one in maps)
@@ -152,12 +158,13 @@ class _Asking:
         return rivals
 
     def _spread(self, name: str) -> float:
-        """Return the spread of the evidence for an effect over scans, after the spread due to noise is
-        subtracted. The result is relative to the mean of the evidence.
+        """Return how much the evidence for an effect varies over scans: the standard deviation relative to
+        the mean, after the variation that noise causes is subtracted.
 
-        Let a be the multiple of the change d that fits a scan best. The difference of the scan's squared
-        errors is |d|² (2 a - 1) plus noise, so it varies by twice the spread of a. Differences between groups
-        are part of d, so they do not contribute to this spread.
+        Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that
+        fits the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a -
+        1) plus noise, so the relative spread of this difference is twice the spread of a. Differences between
+        groups of scans are part of d, so they do not contribute to this spread.
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
@@ -167,7 +174,7 @@ class _Asking:
             if size:
                 multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
                 own.append(self.noise.along(change) ** 2 / size)
-        # The spread is robust, because a scan may have a defect.
+        # A robust estimate of the spread is used, because a scan may have a defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
@@ -177,19 +184,21 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible owners of an effect: the printer and the microscope, or None for the owner stated
-    in the catalogue.
+    """Return the possible sources of an effect. If scans of one orientation cannot show whether the printer
+    or the microscope causes the effect, the list contains both. Otherwise, it contains only None, which
+    stands for the source that the catalogue states.
 
-    Both are possible if scans of one orientation cannot distinguish them.
-
-    A tip that is sharper along one axis looks like a print with wider flanks along that axis.
+    The tip is a source of doubt too: a tip that is sharper along one axis looks like a print with wider
+    flanks along that axis.
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
 
 
 def _of_single_scans(result: CloseLoop) -> list[Question]:
-    """Return the questions about line offsets and about per-scan terms whose owner is unknown."""
+    """Return the questions about line offsets and per-scan terms for which it is unknown whether the printer
+    or the microscope causes them.
+    """
     return [
         _question(
             "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
@@ -202,10 +211,12 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
-    """Return a question about effects, with its text."""
+    """Make a question about the named effects, with its text. A question of kind ``fact`` is about one
+    effect, and ``text`` then states which fact is missing.
+    """
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":
-        text = "whether line offsets come from the printer or the microscope"
+        text = "whether the line offsets come from the printer or from the microscope"
     elif kind == "fact":
         text = f"{first}: {text}"
     elif others:
@@ -217,8 +228,8 @@ def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) ->
 
 
 def _missing_facts(closed: Closed) -> dict[str, str]:
-    """Return the effects that could not be tested because a fact about the prints is missing, with
-    reasons.
+    """Return the effects that could not be tested because a fact about the prints is missing, each with the
+    reason.
     """
     known = "field_um" in (closed.study.scans[0].stored.write or {})
     unplaced = "the position of the prints in the write field is not known"

@@ -1,8 +1,10 @@
-"""The open questions of a closed loop, ``open_questions.json``, from which experiments are planned.
+"""The record ``open_questions.json`` with the open questions of a closed loop, from which experiments are
+planned.
 
-Rivals are fitted from the same starting points, because the base has more than one optimum. For example, an
-almost straight projection and a steep projection are different optima. If two equivalent effects were fitted
-from different starts, they would differ by several nm² on new layouts.
+The possible answers to a question are called rivals (competing explanations). All rivals are fitted from the
+same starting points, because the fit of the base model has more than one optimum. For example, an almost
+straight projection and a steep projection are different optima. If two equivalent effects were fitted from
+different starting points, their predictions on new layouts could differ by several nm² for this reason alone.
 """
 
 from __future__ import annotations
@@ -34,20 +36,21 @@ _TILE_PX = 64
 class NoiseSpectrum(Record):
     """The power spectrum of the noise, nm², averaged over tiles of the residuals.
 
-    ``power_nm2`` has the shape (n, n) and the frequencies of ``np.fft.fft2`` for a tile. Its mean is the
-    variance of a pixel.
+    ``power_nm2`` has shape (n, n), for tiles with a side of n pixels. Its frequencies are in the order of
+    ``np.fft.fft2``, and its mean is the variance of a pixel.
     """
 
     power_nm2: list[list[float]]
 
     def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the power at the frequencies of ``np.fft.fft2`` for a map of this shape, nm²."""
+        """Return the power, nm², at the frequencies of ``np.fft.fft2`` for a map of the given shape."""
         power = np.array(self.power_nm2)
         at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
         return map_coordinates(power, at, order=1, mode="grid-wrap")
 
     def along(self, change: np.ndarray) -> float:
-        """Return the standard deviation of the noise projected onto a change (y, x) of the height, nm.
+        """Return the standard deviation, nm, of the noise projected onto a change of the height of shape (ny,
+        nx).
 
         The projection is the sum over pixels of noise times change, divided by the norm of the change.
         """
@@ -56,8 +59,8 @@ class NoiseSpectrum(Record):
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Return measured minus predicted heights (y, x), nm, away from the edge and without the scan's free
-    terms.
+    """Return the measured minus the predicted height of a scan, nm, after its free terms have been fitted and
+    subtracted. The map has shape (ny, nx) and leaves out the edge of the scan.
 
     Pixels that were not measured are NaN.
     """
@@ -69,7 +72,9 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 
 
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
-    """Compute the noise spectrum of maps of ``left_nm`` from fully measured tiles."""
+    """Compute the noise spectrum from the residual maps that ``left_nm`` returns. Only tiles without missing
+    pixels are used; if there are none, the spectrum is that of white noise.
+    """
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
     window /= np.sqrt((window**2).mean())
@@ -91,15 +96,18 @@ Owner = Literal["printer", "microscope"]
 
 
 class Rival(Record):
-    """One answer to a question. The model is the base with these effects at common strengths, and it is
-    fitted to earlier prints.
+    """One possible answer to a question (a competing explanation). It is a model fitted to earlier prints:
+    the base with effects whose strengths are the same in all scans.
 
     Attributes:
-        effect: the assumed effect.
-        owner: the assumed owner of the effect, if the question is about the owner.
-        vector: all fitted parameters, (p,). The parameters of the base come first.
-        information: normal matrix of the fit over all pixels, (p, p), µm².
-        covariance: cluster-robust covariance of the parameters, (p, p). The clusters are prints or scans.
+        effect: name of the effect that this answer assumes.
+        owner: source of the effect (printer or microscope) that this answer assumes, if the question is about
+            the source.
+        effects: parameter values of all effects in the model, by the name of the effect.
+        vector: the p fitted parameters. The parameters of the base come first.
+        information: normal matrix of the fit over all pixels, µm², of shape (p, p).
+        covariance: cluster-robust covariance of the parameters, of shape (p, p). The clusters are prints or
+            scans.
     """
 
     effect: str
@@ -115,8 +123,9 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, base: Twin) -> Twin:
-        """Return the model of this answer: a base, whose effects are replaced. If the owner is known, the
-        effect rotates with the print (printer) or with the scan (microscope).
+        """Return the model of this answer, which has the base model of ``base`` and the effects of this
+        answer. If a source of the effect is assumed, the effect rotates with the print (printer) or with the
+        scan (microscope).
         """
         effects = {name: Added(ALL, {"": values}) for name, values in self.effects.items()}
         frames: dict[str, Frame] = {"microscope": "scan", "printer": "print"}
@@ -128,11 +137,18 @@ class Question(Record):
     """An open question of a loop.
 
     Attributes:
-        spread: spread of the evidence for the effect between prints, after the spread due to noise is
-            subtracted. It is relative to the mean of the evidence.
-        form_nm: upper bound on the rms error of the form of the model; None if it is unknown. The bound is
+        kind: what the question asks. ``set``: which effect of an indistinguishable set is present;
+            ``suspects``: which of several unconfirmed effects is present; ``role``: whether the printer or
+            the microscope causes an effect; ``per-scan`` and ``lines``: the same for a per-scan term and for
+            line offsets; ``fact``: a fact that is missing in the dataset card.
+        text: the question in words.
+        experiment: experiments that would answer the question, in words.
+        rivals: the possible answers.
+        spread: how much the evidence for the effect varies between prints: the standard deviation relative to
+            the mean, after the variation that noise causes is subtracted.
+        form_nm: upper bound on the rms error in the form of the model; None if it is unknown. The bound is
             derived from the part of the residual of the best answer that could still be learned.
-        sizes: sizes of per-scan terms, by name and unit.
+        sizes: standard deviations over scans of the parameters of a per-scan term, by parameter.
     """
 
     name: str
@@ -146,11 +162,12 @@ class Question(Record):
 
 
 class OpenQuestions(Result):
-    """The record ``open_questions.json``, which contains the open questions and the noise that limits their
-    decision.
+    """The record ``open_questions.json``, which contains the open questions and the noise that limits how
+    well they can be decided.
 
-    ``level_share`` is the share of each level in earlier layouts, and ``cutoff_per_um`` is the frequency of
-    their finest structure, cycles/µm.
+    ``level_share`` is the share of each level in earlier layouts, ``cutoff_per_um`` is the spatial frequency
+    of their finest structures, cycles/µm, and ``write_field_um`` is the width of the write field, if it is
+    known.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
@@ -165,8 +182,8 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each twin from its own values, and again from the base values of the best twin. Keep the better of
-    the two fits.
+    """Fit each model first from its current values, and then with the base parameters of the best of these
+    fits as the starting point. For each model, keep the better of the two fits.
     """
 
     def fitted(twin: Twin) -> LeastSquaresFit:

@@ -15,8 +15,8 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One planned scan. ``field_x_um`` and ``field_y_um`` are the position of the scan in the write field,
-    and ``dose`` is the dose of the print.
+    """One planned scan. ``field_x_um`` and ``field_y_um`` are the position of its print in the write field,
+    and ``dose`` is the relative dose of this print. ``print`` is 0 for the references.
     """
 
     id: str
@@ -34,10 +34,11 @@ class PlannedScan(Record):
 
 
 class PlannedPair(Record):
-    """Two rivals.
+    """Two rivals (competing explanations), compared on the planned prints.
 
-    ``difference_nm`` is the rms difference between their refitted predictions on the planned prints, and
-    ``noise_nm`` is the rms noise of this difference.
+    ``difference_nm`` is the rms difference between the predictions of the two rivals, after one of them was
+    refitted to the other. ``noise_nm`` is the standard deviation per pixel of the noise along this
+    difference. ``power`` contains the probability of a right decision with 1, 2, 3, … prints.
     """
 
     rivals: tuple[str, str]
@@ -47,12 +48,13 @@ class PlannedPair(Record):
 
 
 class PlannedQuestion(Record):
-    """An open question and how the plan answers it.
+    """An open question, and how the plan answers it.
 
-    ``power`` is the probability of a right decision with 1, 2, 3, … prints. ``random_power`` is the same
-    probability for random layouts that are scanned in the same way. ``random_difference_nm`` is the
-    difference between the two most similar rivals on these random layouts. ``prints_needed`` is the number of
-    prints for a power of 0.95. ``form_nm`` is an upper bound on the error of the model's form, or None if
+    ``power`` contains the probability of a right decision with 1, 2, 3, … prints. ``random_power`` contains
+    the same probability for random layouts that are scanned in the same way. ``difference_nm`` is the rms
+    difference between the two most similar rivals on the planned prints, and ``random_difference_nm`` on the
+    random layouts. ``prints_needed`` is the number of prints for a power of 0.95, or None if no number that
+    was tried is enough. ``form_nm`` is an upper bound on the error in the form of the model, or None if it is
     unknown.
     """
 
@@ -74,9 +76,10 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan, which contains the prints, the scans, and the questions that the prints and scans decide.
+    """A plan: the prints, their scans, and the questions that the prints and scans are meant to decide.
 
-    ``settings`` contains the settings that the user gave.
+    ``settings`` contains the settings with which the user made the plan. ``levels`` contains the lowest and
+    the highest level of the layouts, and ``cutoff_per_um`` their highest spatial frequency, cycles/µm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"

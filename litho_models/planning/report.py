@@ -1,4 +1,6 @@
-"""Draw the report of a plan: open questions, planned prints, predicted differences and power."""
+"""Write the report of a plan: the open questions, the planned prints, the predicted differences between the
+rivals (competing explanations), and the power to decide between them.
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,11 @@ _COLUMNS = (
 def write_report(
     folder: Path, plan: NextPrint, rivalries: Sequence[Rivalry], planned: Sequence[PlannedPrint]
 ) -> Path:
-    """Write ``report.html`` and ``questions.csv``."""
+    """Write ``report.html`` and its tables ``questions.csv`` and ``order.csv``."""
     page = Page(
         f"What to print next: {plan.dataset.name}",
-        f"{plan.prints} print{'s' * (plan.prints > 1)} of {plan.field_um:g} µm in {len(plan.scans)} scans, "
-        "including four reference scans.",
+        f"{plan.prints} print{'s' * (plan.prints > 1)} with a side of {plan.field_um:g} µm, and "
+        f"{len(plan.scans)} scans, including four reference scans.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
         words=Path(__file__).with_name("words.toml"),
@@ -49,13 +51,20 @@ def write_report(
     first = {f"print {at}": one.level.numpy() for at, one in enumerate(planned[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
         layouts_figure(first, plan.levels),
-        "Levels of the first prints. Every print has the same tiles in a different order.",
+        "Levels of the first prints. All prints consist of the same tiles, in a different order in each "
+        "print.",
     )
     at = plan.prints - 1
     rows = [
         q.model_dump() | {"power": q.power[at], "random_power": q.random_power[at]} for q in plan.questions
     ]
-    page.table(rows, "Open questions, and whether the plan decides them.", "questions.csv", columns=_COLUMNS)
+    page.table(
+        rows,
+        "Open questions, and whether the plan decides them. The competing explanations of a question are "
+        "called rivals.",
+        "questions.csv",
+        columns=_COLUMNS,
+    )
     pictured = {rivalry.question.name: rivalry for rivalry in rivalries}
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
@@ -64,8 +73,8 @@ def write_report(
         if question.name in pictured:
             page.figure(
                 prints_figure(pictured[question.name], planned[0]),
-                "Prediction of each rival for the last scan of the first print, and its difference from the "
-                "first rival, nm.",
+                "Height that each rival predicts for the last scan of the first print (top row), and the "
+                "difference of this prediction from that of the first rival (bottom row).",
             )
     page.heading("Scans", folded=True)
     page.table(plan.scans, "All scans in the order in which they must be made.", "order.csv")
@@ -81,12 +90,14 @@ def _verdict(plan: NextPrint) -> str:
     wanting = f" No print settles {facts}: add the missing fact to the card." if facts else ""
     return (
         f"With a probability of {ENOUGH} or more, these prints decide: {decided or 'nothing'}. "
-        f"Questions asked: {len(asked)}.{wanting}"
+        f"Number of open questions: {len(asked)}.{wanting}"
     )
 
 
 def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
-    """Draw each rival's prediction for the last scan of a print, and the differences between rivals."""
+    """Draw the height that each rival predicts for the last scan of a print, and the difference of each
+    prediction from that of the first rival.
+    """
     maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
     figure = new_figure(11, 5.5)
     changes = [NM_PER_UM * (own - maps[0] - (own - maps[0]).mean()) for own in maps]

@@ -1,10 +1,11 @@
-"""Compute the separation of rivals on planned scans: their difference after a refit, relative to the noise.
+"""Compute the separation of rivals (competing explanations) on planned scans: the difference that remains
+between two of them after one is refitted to the other, relative to the noise.
 
 The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
-the nearest prediction of the other. Neither model is known to be true, so the smaller distance of the two
-directions counts (a simple form of the symmetric criterion of Harman and Müller, arXiv:1709.10320). Every
-scan has its own datum, tilt, bow, gain and affine registration. The refitted model must stay consistent with
-earlier prints and within the ranges of its parameters.
+the nearest prediction that the other model can make. It is not known which of the two models is true, so the
+distance is computed in both directions, and the smaller one counts (a simple form of the symmetric criterion
+of Harman and Müller, arXiv:1709.10320). Datum, tilt, bow, gain and affine registration are free in every
+scan. The refitted model must stay consistent with earlier prints and within the ranges of its parameters.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made. The fields of this class are columns in the table of the plan.
+    """How one scan is made. The fields of this class are also columns in the table of planned scans.
 
-    ``turned_deg`` is the angle of the print under the microscope. ``direction`` is -1 for the retrace, and
-    ``tip`` is 2 for a second, sharp tip. ``pixel_size`` is the size of a pixel relative to earlier scans,
-    with the same time per pixel.
+    ``turned_deg`` is the angle by which the print is rotated under the microscope. ``direction`` is 1 for the
+    trace and -1 for the retrace. ``tip`` is 1 for the tip of earlier scans and 2 for a new, sharp tip.
+    ``pixel_size`` is the size of a pixel relative to earlier scans, with the same time per pixel.
     """
 
     turned_deg: int = 0
@@ -52,10 +53,11 @@ class Way:
 
 @dataclass(frozen=True)
 class PlannedPrint:
-    """One printed field and its scans.
+    """One planned print (a printed field) and its scans.
 
-    ``level`` contains whole or soft levels (y, x). ``place`` is the position in the write field, ``order``
-    runs from -0.5 (first) to 0.5 (last), and ``dose`` is relative to earlier prints.
+    ``level`` contains the levels of the layout, whole or not rounded, and has shape (ny, nx). ``ways`` lists
+    the scans. ``place`` is the position in the write field. ``order`` is the position in the writing order,
+    from -0.5 (first) to 0.5 (last). ``dose`` is relative to earlier prints.
     """
 
     level: Tensor
@@ -67,8 +69,8 @@ class PlannedPrint:
 
 @dataclass(frozen=True)
 class Printing:
-    """The settings that all prints share: pitch, level height, highest level, and width of the write field
-    (µm, or None).
+    """The settings that all planned prints share: the lateral pitch, the height of a level, the highest
+    level, and the width of the write field (None if it is unknown). Lengths are in µm.
     """
 
     pitch_um: float
@@ -77,15 +79,16 @@ class Printing:
     write_field_um: float | None = None
 
     def reach_um(self, printed: PlannedPrint) -> float:
-        """Return the largest distance from the centre of a print to the centre of the write field, along both
-        axes.
+        """Return the distance, along each axis, from the centre of the write field to the centre of a print
+        at its place, µm. It is 0 for a print at the centre. A print at the edge lies in a corner of the write
+        field.
         """
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
         return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
 
     def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
-        """Return the context of a planned scan, for effects."""
+        """Return the context of a planned scan, which effects need."""
         reach_um = self.reach_um(printed)
         return FieldContext(
             layout_um,
@@ -103,18 +106,20 @@ class Printing:
         )
 
     def predict(self, chain: EffectChain, printed: PlannedPrint, way: Way) -> Tensor:
-        """Predict the height (y, x), µm, that this scan would show."""
+        """Predict the height that a planned scan would show, µm, of shape (ny, nx)."""
         layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
         return chain(layout_um, self.context(layout_um, printed, way))[0, 0]
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """A directed pair of rivals on some prints; each quantity has shape (prints,).
+    """The difference between two rivals on some prints: the prediction of a rival that is assumed to be true,
+    and that of another rival refitted to it. Each attribute has one value for each print and has shape
+    (prints,).
 
-    ``squares_um2`` is the squared distance, summed over all pixels and scans. ``sd_um2`` is the standard
-    deviation that noise causes in the difference of the two squared errors. ``pixels`` is the number of
-    pixels of all scans.
+    ``squares_um2`` is the squared distance between the two predictions, summed over all pixels and scans of a
+    print. ``sd_um2`` is the standard deviation that noise causes in the difference of the squared errors of
+    the two rivals. ``pixels`` is the number of pixels in all scans of a print.
     """
 
     squares_um2: Tensor
@@ -123,30 +128,32 @@ class Contrast:
 
     @property
     def rms_nm(self) -> float:
-        """Return the rms distance over pixels, nm."""
+        """Return the rms difference between the two predictions over all pixels, nm."""
         return NM_PER_UM * float((self.squares_um2.sum() / self.pixels.sum()).sqrt())
 
     @property
     def noise_nm(self) -> float:
-        """Return the standard deviation of the noise along the difference, per pixel."""
+        """Return the standard deviation per pixel of the noise along the difference of the
+        predictions, nm.
+        """
         return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
 
     def separation(self, spread: float) -> Tensor:
-        """Return the distance in standard deviations, which is differentiable. ``spread`` is the spread that
-        the question states.
+        """Return the squared distance in units of its standard deviation. The result is differentiable.
+        ``spread`` is the field ``spread`` of the question, by which the distance varies between prints.
         """
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
 
 
 class Rivalry:
-    """The rivals of one question, and what they predict for planned prints.
+    """The rivals of one question, and their predictions for planned prints.
 
     Args:
         question: a question with at least two rivals.
-        base: the simulator whose parameters come first in the rivals' vectors.
-        printing: pitch and levels.
-        noise: spectrum of the residual of earlier prints.
+        base: the base model of all rivals. Its parameters come first in the field ``vector`` of a rival.
+        printing: settings that all prints share.
+        noise: spectrum of the noise, measured on the residuals of earlier prints.
     """
 
     def __init__(self, question: Question, base: Simulator, printing: Printing, noise: NoiseSpectrum):
@@ -154,16 +161,20 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # Each of these models is assumed to be true in turn; refits start from ``twins``.
+        # Each of the models in ``true`` is in turn assumed to be true. Refits start from ``twins``.
         self.true = self.chains = [*map(_chain, self.twins)]
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Return the directed pairs: the model assumed to be true, and the model refitted to it."""
+        """Return all ordered pairs of rivals, as indices: first the model that is assumed to be true, then
+        the model that is refitted to it.
+        """
         return list(permutations(range(len(self.twins)), 2))
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
-        """Draw the rivals' true parameters within the uncertainty that remains after earlier prints."""
+        """Return a copy in which the parameters of the models that are assumed to be true are drawn at
+        random, within the uncertainty that remains after earlier prints.
+        """
         other = copy.copy(self)
         other.true = []
         for twin, rival in zip(self.twins, self.question.rivals, strict=True):
@@ -178,12 +189,13 @@ class Rivalry:
         rounds: int = 1,
         first: Sequence[list[Linearised]] | None = None,
     ) -> list[EffectChain]:
-        """For each directed pair, fit the second model to the prediction of the first.
+        """For each ordered pair, fit the second model to the prediction of the first. Return the fitted
+        models.
 
         Args:
             prints: planned prints. The fit is not differentiable in the levels of these prints.
-            rounds: number of Gauss-Newton steps. With one step, the refit is linearised.
-            first: the result of ``linearised`` on these prints, if known.
+            rounds: number of Gauss-Newton steps. With a single step, the refit is linear.
+            first: the result of ``linearised`` for these prints, if it has already been computed.
         """
         predicted = [self._predict(chain, prints) for chain in self.true]
         first = first or self.linearised(prints)
@@ -204,11 +216,13 @@ class Rivalry:
         return found
 
     def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
-        """Linearise all models at the start of a refit."""
+        """Linearise all models at the parameters from which a refit starts."""
         return [self._linearise(twin, prints) for twin in self.twins]
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
-        """Return the contrast of every directed pair on these prints, differentiable in the levels."""
+        """Return the contrast of every ordered pair on the given prints. It is differentiable in
+        the levels.
+        """
         true = [self._predict(chain, prints) for chain in self.true]
         return [
             self._contrast(true[first], self._predict(partner, prints), prints)
@@ -216,24 +230,24 @@ class Rivalry:
         ]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Return the separation of each directed pair, (pairs,), in standard deviations. It is differentiable
-        in the levels.
+        """Return the separation of each ordered pair in standard deviations, of shape (pairs,). It is
+        differentiable in the levels.
         """
         return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
     ) -> Contrast:
-        """Compare two models. The differences are added over the scans of a print, because all of these scans
-        show the same roughness.
+        """Compare two models on the given prints. To compute the noise, the difference maps of the scans of a
+        print are added, because all of these scans show the same roughness.
         """
         found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
             squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
             for _ in printed.ways:
                 right, refitted = next(scans)
-                # The scan terms are those of the refitted model. With the gain term of the true model, the
-                # refitted prediction could shrink to zero.
+                # The scan terms are computed from the refitted prediction. If the gain term were computed
+                # from the true prediction, the refitted prediction could shrink to zero.
                 basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
                 inner = _inner(right - refitted)
                 flat = inner.reshape(-1)
@@ -249,7 +263,9 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
-        """Linearise a twin on each scan of the prints. The residual is zero minus the predicted height."""
+        """Linearise a model on each scan of the prints. The residual is minus the predicted height, to which
+        the caller adds the target of the fit.
+        """
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)
         moved = [twin.at(twin.vector + one) for one in np.diag(steps)]
@@ -269,7 +285,7 @@ def _chain(twin: Twin) -> EffectChain:
 
 
 def _inner(field: Tensor) -> Tensor:
-    """Cut off the edge, where part of the neighbourhood that a model uses is missing."""
+    """Cut off the edge of a field, where part of the neighbourhood that a model uses is missing."""
     border = sample_border_px(min(field.shape))
     return field[border:-border, border:-border]
 
@@ -279,5 +295,5 @@ def _flat(field: Tensor) -> np.ndarray:
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Return the orthonormal basis (n, k) of a scan's free terms on the inner pixels."""
+    """Return an orthonormal basis of the free terms of a scan on its n inner pixels, of shape (n, k)."""
     return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)

@@ -1,11 +1,12 @@
-"""Run a loop, write its open questions, and decide them with later prints of the same printer.
+"""Run a loop, write its open questions, and decide these questions with later prints of the same printer.
 
-Every rival is fitted to all prints, old and new, and judged only on the new prints. The difference of two
-squared errors, minus an allowance for the model's own error, is compared with its standard deviation. The
-standard deviation comes from blocks of pixels and, as in the plan, from the spread between prints. Scans of
-one print share its roughness, so their blocks are added first. A rival is excluded if another rival fits
-better. The difference must have p <= 0.005, and it must be at least 1 % of the squared error of the better
-rival. If only one rival remains, it is the answer.
+Every rival (competing explanation) is fitted to all prints, old and new, and judged only on the new prints.
+For each pair of rivals, the difference of their squared errors, minus an allowance for the error of the model
+itself, is compared with its standard deviation. The standard deviation is estimated from the scatter over
+blocks of pixels and, as in the plan, from the spread between prints. The scans of one print share its
+roughness, so the values of their blocks are first added up. A rival is excluded if another rival fits better
+with p <= 0.005 and the difference is at least 1 % of the squared error of the better rival. If only one rival
+remains, it is the answer.
 """
 
 from __future__ import annotations
@@ -54,16 +55,19 @@ def close_loop(
     new_prints: Sequence[str | Path] = (),
     **settings: Any,
 ) -> CloseLoop:
-    """Close the loop on a store by ``loop.run.close_loop``, and write its open questions with the result.
+    """Close the loop on a store with ``loop.run.close_loop``, and write its open questions next to the
+    result.
 
     Args:
-        new_prints: further stores of the same printer. They decide the open questions (see ``decide``) and
-            change nothing that was found on the first store.
-        settings: settings of ``loop.run.close_loop``.
+        store: store on which the loop is closed.
+        out: folder of the result.
+        new_prints: further stores with prints of the same printer. They are used to decide the open questions
+            (see ``decide``). The search for effects uses only the first store.
+        settings: further arguments of ``loop.run.close_loop``.
 
     Raises:
-        InputError: as in ``loop.run.close_loop``; also if a further store is of another printer, or if a scan
-            is rotated but its card does not say so.
+        InputError: as in ``loop.run.close_loop``. The error is also raised if a further store is of another
+            printer, or if a scan is rotated but its dataset card does not say so.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
@@ -79,11 +83,12 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Return the scans of a further store, after checking that it is of the same printer and that the scans
-    have the orientation stated in the card.
+    """Return the scans of a further store. Before, check that the store is of the same printer as the first
+    store, and that the scans have the orientation that the dataset card states.
 
     Raises:
-        InputError: the store is of another printer, or a scan has another orientation than its card states.
+        InputError: the store is of another printer, it was planned for another dataset, or a scan has another
+            orientation than its card states.
     """
     for name in ("pitch_um", "level_height_um", "levels"):
         if getattr(store, name) != getattr(first, name):
@@ -103,22 +108,24 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
     scans = store.scans()
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
-        # The sign of a rotation is a convention, but registration shows whether a print was rotated.
+        # The sign of a rotation is a convention, but registration shows whether a print was rotated by 90°.
         if (stated - scan.quarter_turns) % 2:
             raise InputError(
                 f"scan {scan.id} of {store.path}",
                 got=f"rotated by {90 * scan.quarter_turns}° on its layout, but {90 * stated}° in its card",
-                wanted="the rotation of the scan in the card",
-                hint="enter it in the column turned_deg of the card's table, and build the store again",
+                wanted="the same rotation in the card",
+                hint="correct the column turned_deg of the card's table, and build the store again",
             )
     return scans
 
 
 def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> list[Decision]:
-    """Return the decision on every declared question that scans can answer.
+    """Return the decision on every open question, except for questions about missing facts, which scans
+    cannot answer.
 
     Args:
-        closed: the loop that asked the questions.
+        closed: the loop whose questions these are.
+        open_: the open questions of this loop.
         new: scans that this loop did not use.
     """
     judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
@@ -133,12 +140,12 @@ def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> 
 
 @dataclass(frozen=True)
 class Judge:
-    """New scans, together with the scans to which a model was fitted.
+    """Decide open questions on new scans.
 
     Attributes:
-        twin: the corrected model with common strengths.
-        study: the study to which this model was fitted.
-        new: scans that were not used in the fits of the study.
+        twin: the corrected model, with strengths that are the same in all scans.
+        study: the scans to which this model was fitted.
+        new: scans that were not used in these fits.
     """
 
     twin: Twin
@@ -146,7 +153,9 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Fit every rival, and a model without rivals, to all scans, and judge the fits on the new scans."""
+        """Fit every rival, and a model without the effect in question, to the old and new scans. Judge these
+        fits on the new scans.
+        """
         twins = [rival.twin(self.twin) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
@@ -159,7 +168,9 @@ class Judge:
         return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
-        """Compare the variance of a per-scan term between prints with its variance between repeats."""
+        """Compare the variance of a per-scan term between prints with its variance between the
+        scans of one print.
+        """
         own = terms_of_effect(question.name)
         scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
         by_print: dict[str, list[np.ndarray]] = {}
@@ -174,15 +185,15 @@ class Judge:
         law = f_distribution(count - 1, total - count)
         expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
         told = (
-            "the ratio of the variance between prints to the variance between repeats is "
+            "the ratio of the variance between prints to the variance between scans of one print is "
             f"F({count - 1}, {total - count}) = {ratio:.2f}"
         )
         left = _left(law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P)
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
-        """In rotated scans, compare the offsets along the rows of the layout with the offsets along the scan
-        lines.
+        """In the rotated scans, compare the variance of offsets of the layout's rows with the variance of
+        offsets of the scan lines.
         """
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
@@ -204,8 +215,9 @@ class Judge:
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """Add the decisions to the result. If an effect is the only remaining answer, its verdict becomes
-    ``explained``, and its role is set to that of its owner.
+    """Add the decisions to the result. If a decision leaves one effect as the only possible answer, the
+    verdict on this effect becomes ``explained``, and its role becomes that of its source (printer or
+    microscope).
     """
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
@@ -226,9 +238,17 @@ def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Deci
 def compared(
     question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
 ) -> Decision:
-    """Judge the answers to a question by their residuals on the new scans, maps (y, x) in nm."""
+    """Judge the answers to a question by their residuals on the new scans.
+
+    Args:
+        question: the question.
+        new: the new scans.
+        left_nm: for each answer, and for the model without the effect, its residual on each new scan as a map
+            of shape (ny, nx), nm.
+    """
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
-    # A smaller gain does not count, as in the loop: it may come from effects that are not among the rivals.
+    # As in the loop, a difference smaller than this share of the squared error does not count, because it may
+    # come from effects that are not among the rivals.
     least = {
         name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
         for name, own in left_nm.items()
@@ -259,8 +279,8 @@ def _compare(
 ) -> Comparison:
     """Compare the squared errors of two rivals.
 
-    The errors are summed over blocks, and their difference is compared with its spread within and between
-    prints.
+    The squared errors are summed over blocks of pixels. Their difference is compared with its spread over the
+    blocks of a print and with its spread between prints.
     """
     by_print: dict[str, np.ndarray] = {}
     pixels, difference = 0, 0.0
@@ -270,7 +290,8 @@ def _compare(
         name = scan.stored.print_id
         by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
-    # The mean over blocks is the result of a print; the spread about this mean is noise.
+    # The mean over the blocks of a print is the result of this print. The scatter of the blocks about this
+    # mean is noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
     sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
     form = pixels * (question.form_nm or 0.0) ** 2
@@ -289,7 +310,9 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
-    """Return the owners that remain possible after the test."""
+    """Return the sources (printer, microscope) that remain possible after a test. ``printer`` and
+    ``microscope`` say whether the test points to this source.
+    """
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
 
@@ -300,7 +323,15 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """Return the decision on a question. By default, the question is decided if only one answer remains."""
+    """Make the decision on a question. By default, the question counts as decided if only one answer remains.
+
+    Args:
+        question: the question.
+        scans: the scans on which it was decided.
+        left: the answers that remain possible.
+        evidence: the evidence, in words.
+        verdict: the verdict, if it does not follow from the number of remaining answers.
+    """
     return Decision(
         question=question.name,
         kind=question.kind,

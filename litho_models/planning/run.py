@@ -1,6 +1,7 @@
 """Plan the next prints from a closed loop.
 
-The plan is a folder: a dataset without its scans, and instruction sheets for printer and microscope.
+The plan is a folder that contains a dataset whose scans are still missing, and instruction sheets for the
+people who operate the printer and the microscope.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ from litho_models.planning.record import NextPrint, PlannedScan
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
 
-# Number of prints for the final comparison of rivals; further prints repeat the same tiles.
+# Number of planned prints on which the rivals are finally compared. Further prints would repeat the same
+# tiles.
 _JUDGED = 2
 _FEWEST_PRINTS, _TILES = 2, 4
 _SMALLEST_PX = 64
@@ -65,18 +67,18 @@ _COLUMNS = (
     *("turned_deg", "direction", "tip", "pixel_size"),
 )
 _REFERENCES = {
-    "substrate": "zero, tilt and bow without a print",
-    "flat": "the noise floor",
-    "steps": "height against level; the microscope's gain on a step standard",
-    "grating": "scales and unevenness of the scanner, and the tip",
+    "substrate": "shows zero, tilt and bow without a print",
+    "flat": "shows the noise floor",
+    "steps": "shows the height of each level; on a step standard, the gain of the microscope",
+    "grating": "shows the lateral scales and the uneven motion of the scanner, and the tip",
 }
-# Descriptions of the references on the printer's sheet.
+# Descriptions of the reference layouts on the sheet for the printer.
 _USES = {
-    "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
-    "flat": "one level everywhere: the noise floor",
-    "steps": "a stair: height against level",
+    "substrate": "bare substrate, nothing printed: shows zero, tilt and bow of the microscope",
+    "flat": "one level everywhere: shows the noise floor",
+    "steps": "a staircase of levels: shows the height of each level",
 }
-# Periods of commercial gratings, µm, and the smallest number of periods that a field must contain.
+# Periods of commercial gratings, µm, and the smallest number of periods that a scan must contain.
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 _TREAD_PX = 30
 _LADDER_PX = 5 * _TREAD_PX
@@ -93,22 +95,22 @@ def next_print(
     layouts: Literal["optimised", "random"] = "optimised",
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
-    """Plan prints and scans that decide the open questions of a closed loop; return None if no question is
+    """Plan prints and scans that decide the open questions of a closed loop. Return None if no question is
     open.
 
     Args:
-        loop: folder of a closed loop.
+        loop: folder with the result of a closed loop.
         out: folder of the plan, which appears only when the plan is complete.
         prints: largest number of prints.
         field_um: side length of each print.
         seed: seed of the random layouts.
-        steps: number of ascent steps for each tile.
-        layouts: ``random`` plans the same scans with random layouts, as a control.
+        steps: number of gradient-ascent steps by which each tile is optimised.
+        layouts: ``optimised``, or ``random`` to plan the same scans with random layouts, as a control.
         report: function that receives the progress messages.
 
     Raises:
-        InputError: there is no closed loop, the prints have an impossible size, or the folder contains a plan
-            with other settings.
+        InputError: ``loop`` contains no closed loop, there is no print or the prints are too small, or
+            ``out`` contains a plan with other settings.
     """
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():
@@ -138,7 +140,7 @@ def next_print(
         tile_px = min(TILE_PX, size_px)
         can_move = open_.write_field_um is not None and open_.write_field_um > field_um
         choices = [choose(rivalry, limits.random(tile_px, seed), can_move) for rivalry in rivalries]
-        # A scan rotated by 90 degrees is also a repeat, because the print was remounted.
+        # A scan rotated by 90 degrees is also a repeated scan, because the print is remounted for it.
         turned = (TURNED,) if any(one.kind in ("lines", "per-scan") for one in open_.questions) else ()
         chosen = together(choices, turned)
         count = _TILES if size_px > tile_px else prints
@@ -175,7 +177,7 @@ def next_print(
             for one in open_.questions
         ]
         needed = [q.prints_needed or prints for q in questions if q.status in ("decides", "may decide")]
-        # A single print may have a defect.
+        # At least two prints are planned, because a single print may have a defect.
         planned = planned[: max([_FEWEST_PRINTS, *needed])]
         scans, maps = schedule(planned, limits, printing, seed)
         plan = NextPrint(
@@ -198,9 +200,11 @@ def next_print(
 def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
-    """Return the planned scans, which are the rows of the table, and the layout of each scan."""
+    """Return the planned scans, which are the rows of the table ``scans.csv``, and the level map of each
+    scan. The scans of the four references come first.
+    """
     size_px = len(planned[0].level)
-    # A stair looks the same when shifted, so it gets a frame if there is room.
+    # A staircase looks the same when it is shifted, so it gets a random frame if there is room.
     ladder = limits.random(size_px, seed + 13)
     if size_px >= _LADDER_PX:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
@@ -238,7 +242,8 @@ def schedule(
 
 
 def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
-    """Write the card, the table, the layouts and the sheets.
+    """Write the files of a plan: the dataset card, the table of scans, the layouts, the record, and the
+    sheets for printer and microscope.
 
     ``layouts`` contains the level map of each scan.
     """
