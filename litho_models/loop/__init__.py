@@ -1,1 +1,3 @@
-"""Find causes and laws in the residual of a model on measured prints, and correct the model."""
+"""Find causes and empirical laws in the residual of a model on measured prints, and correct the
+model with them.
+"""

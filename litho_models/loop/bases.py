@@ -1,4 +1,6 @@
-"""Choose the base models that the loop may correct: the requested one, or several small ones."""
+"""Make the base models that the loop may correct: the model that the user asked for, or several
+small models.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,10 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# A function that trains a model; it is sent to other processes.
+# A function that trains a model on the given scans. It must be possible to send it to other processes.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
-# Base models that compete by default. The first has the same form as the paper's Physics model.
+# Base models from which the loop chooses one by default. The first has the same form as the Physics model of
+# the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
@@ -37,20 +40,20 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
 ) -> dict[str, nn.Module]:
-    """Return the models that may be corrected, by name. For each fold, a network is trained again without the
-    scans of this fold.
+    """Return the base models that the loop may correct, by name. If the base is a network, it is trained once
+    for each fold, without the scans of this fold.
 
     Args:
-        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which returns several
-            small models, from which the loop chooses one.
+        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto`` for several small
+            models, from which the loop chooses one.
         study: the scans with their folds, the seed and the workers.
-        steps: number of optimiser steps of a network; None uses the number in its recipe.
-        cache: folder that keeps trained networks.
+        steps: number of optimiser steps for a network; None for the number in its recipe.
+        cache: folder in which trained networks are kept.
         fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
-        InputError: the base is unknown, its pitch differs from that of the scans, or settings are given
-            for a base that is not a small model.
+        InputError: the base is unknown, its pitch differs from that of the scans, or settings are given for a
+            base that is not a small model.
     """
     scans = study.stored
     named = _built(base, scans[0], fields) if base in MODELS else None
@@ -94,7 +97,14 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
 def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
-    """Train one model per fold on the scans outside the fold, and one model on all scans."""
+    """Train one model for each fold on the scans outside this fold, and one model on all scans.
+
+    Args:
+        scans: the scans.
+        fold_of: number of the fold of each scan, of shape (scans,).
+        trainer: function that trains a model on the scans that it receives.
+        workers: pool of processes.
+    """
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
     # The last model is trained on all scans.
     last = max(fold.values()) + 1

@@ -1,8 +1,8 @@
-"""Check whether a cause is named correctly, in a model that contains all other effects.
+"""Check whether an effect that was found is the true cause, in a model that contains all other effects.
 
-If the name is right, the residual no longer depends on the change that the cause makes. If the named effect
-only resembles the true cause, the residual contains variants of this change: scaled with height or position,
-blurred, displaced or squared.
+If it is the true cause, the residual no longer depends on the change that the effect makes. If it only
+resembles the true cause, the residual contains variants of this change: the change scaled with height or
+position, blurred, displaced or squared.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Seca
 from litho_models.loop.search import Cause, describe, with_table
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-# A name is refused if variants of the cause's change would add more than this share to its gain. In trials on
-# the virtual fab, variants of true causes add less than 1 % (layer-stacking: 10 %). Variants of effects that
-# only resemble the true cause add 20 % or more.
+# An effect is rejected as the cause if variants of the change that it makes would add more than this share to
+# its gain. In trials on the virtual fab, variants of true causes add less than 1 % (layer-stacking: 10 %).
+# Variants of effects that only resemble the true cause add 20 % or more.
 FORM_SHARE = 0.15
 
 
 @dataclass(frozen=True)
 class Check:
-    """Check the causes of one model against everything that could replace them.
+    """Check the causes in a model against all laws and tables that could replace them.
 
     Attributes:
-        state: the model.
-        others: causes and laws in the model.
-        laws, tables: all candidates that could replace a cause.
-        left_nm2: part of the model's squared residual that features of layout and position can explain.
+        state: the model, with all its effects.
+        others: the causes and laws in the model.
+        laws, tables: all laws and tables that could replace a cause.
+        left_nm2: the part of the squared residual of the model that features of layout and position can
+        explain.
         secants: changes that the laws would make to the predicted scans.
     """
 
@@ -48,7 +49,9 @@ class Check:
     secants: Secants
 
     def of(self, cause: Cause) -> Cause:
-        """Judge one cause in the model that contains all other effects."""
+        """Check one cause in the model that contains all other effects. If the cause is rejected, the result
+        states the reason.
+        """
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         laws = ", ".join(one.name for one in self.others if get_effect(one.name).knowledge == "law")
         cause = replace(cause, judgement=judge_states(without, self.state))
@@ -57,7 +60,7 @@ class Check:
         unneeded, reason = cause.judgement.reason(cause.by), ""
         larger = "" if unneeded else self._larger(cause, without)
         if unneeded:
-            reason = f"not needed when the other effects are in the model: {unneeded}"
+            reason = f"it is not needed when the other effects are in the model: {unneeded}"
         elif larger:
             reason = f"it may merely correct an error in the formula of {larger}"
         elif laws and cause.judgement.gain_nm2 < 0.5 * alone_nm2:
@@ -66,8 +69,9 @@ class Check:
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
             reason = f"its best-fitting strength exceeds the largest possible value: {exhausted}"
-        # If a cause is still missing from the model, variants of any other cause explain some of it. A gain
-        # that is small relative to the unexplained error therefore proves nothing.
+        # If the model still lacks a cause, variants of the change of any other cause explain part of what is
+        # missing. A gain of such variants that is small relative to the unexplained error therefore proves
+        # nothing.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             added = (
                 "variants of its change (scaled, blurred or displaced) would add "
@@ -77,13 +81,12 @@ class Check:
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Return the name of a law or cause that gains much more and may explain this cause; empty if there
+        """Return the name of another law or cause whose formula this cause may merely correct; empty if there
         is none.
 
-        If this cause gains less than a tenth of what another effect gains, it may merely correct the formula
-        of that effect. If the other effect is a law, it is always returned, because every law is approximate.
-        If the other effect is a cause, it is returned if its variants gain at least half as much as this
-        cause.
+        Such an effect must gain more than ten times as much as this cause. If it is a law, this is enough,
+        because every law is approximate. If it is a cause, variants of the change that it makes must also
+        gain at least half as much as this cause.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -96,9 +99,9 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Refuse the name of a cause if short laws fit better, even if it passed all other checks.
+        """Reject a cause that passed all other checks if short laws in its place fit better.
 
-        At most two laws are tried. Together they have no more parameters than the cause.
+        At most two laws are tried. Together, they have no more parameters than the cause.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -108,14 +111,14 @@ class Check:
             numbers -= law.numbers
             laws.append(law.name)
             if not judge_states(self.state, state).reason():
-                return replace(cause, reason=f"short laws fit better than it: {', '.join(laws)}")
+                return replace(cause, reason=f"short laws fit better than this cause: {', '.join(laws)}")
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Refuse the name of a cause if a table explains more, even if it passed all other checks.
+        """Reject a cause that passed all other checks if a table explains more.
 
-        The name is refused if two conditions hold: a table that replaces the cause gains more than twice as
-        much, and adding the cause to the table gains nothing.
+        The cause is rejected if two conditions hold: a table in its place gains more than twice as much as
+        the cause, and adding the cause to the model with this table gains nothing.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -123,11 +126,15 @@ class Check:
                 both = with_table(self.state, table)
                 judged = judge_states(both.without(cause.name), both)
                 if reason := judged.reason(cause.by):
-                    return replace(cause, reason=f"not needed when {table.name} is in the model: {reason}")
+                    return replace(
+                        cause, reason=f"it is not needed when {table.name} is in the model: {reason}"
+                    )
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """Return the law with the largest predicted gain; None if all laws gain much less than the cause."""
+        """Return the law with the largest predicted gain among those with at most ``numbers`` parameters;
+        None if all of them gain much less than the cause.
+        """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
         promising = (
@@ -140,8 +147,8 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Return how much the squared error on held-out scans, nm², falls if variants of the change that a cause
-    makes are added to the model.
+    """Return by how much the squared error on held-out scans falls, nm², if variants of the change that a
+    cause makes are added to the model.
 
     Args:
         without: model without the cause.
@@ -153,8 +160,8 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    # The last number of the block is the weight, in scans, of the prior that no variant is present. Without
-    # this prior, so many parameters would fit the noise of a few scans.
+    # The last argument of the block is the weight of the prior that no variant is present, as a number of
+    # scans. Without this prior, the many parameters would fit the noise of the few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
@@ -163,10 +170,17 @@ def reshaped_gain(without: State, state: State) -> float:
 
 
 def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:
-    """Return a change of the prediction (y, x), µm, and its variants."""
+    """Return a change of the prediction and its variants, as maps of shape (ny, nx), µm.
+
+    Args:
+        change: the change that a cause makes to the prediction.
+        prediction: the prediction with this cause.
+        window: the scan.
+    """
     pitch = window.context.pitch_um
     layout = np.asarray(window.stored.layout_um, np.float64)
-    # Widths are in pixels, so that they are small relative to the resolution of any process, including films.
+    # The widths of these blurs are in pixels, so that they suit the resolution of any process, including
+    # films.
     near, far = gaussian_filter(layout, 6), gaussian_filter(layout, 20)
     relative, slopes = prediction - prediction.mean(), np.gradient(change, pitch)
     soft = [gaussian_filter(change, sigma_px) for sigma_px in (2, 6, 16)]

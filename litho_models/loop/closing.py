@@ -1,7 +1,7 @@
 """Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search for causes is run with each base model. The base models are then compared, each with the causes
-that were found for it.
+The search for causes is run with each base model. The base models are then compared, each together with the
+causes that its search has found.
 
 ``close`` is an estimator: it makes all choices and fits on the given scans, and its result can predict any
 other scan. To judge its choices on held-out scans, call ``close`` without these scans.
@@ -31,25 +31,28 @@ from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
-# Duration of a loop divided by that of its first fits. In four datasets this ratio was between 11 and 33.
+# Assumed ratio of the duration of a whole loop to that of its first fits. For four datasets, this ratio was
+# between 11 and 33.
 _OVER_FIRST_FITS = 20
 
 
 @dataclass(frozen=True)
 class Closed:
-    """The choices and fits that the loop makes on some of the scans.
+    """The result of a loop: all choices and fits that it made on the given scans.
 
     Attributes:
         base_name: name of the chosen base.
-        rivals: results of the same search with the other bases.
+        rivals: results of the search for causes with the other bases, by the name of the base.
         plain: the base fitted to the original scans.
-        base: the base fitted to the scans without the measurement errors that the scans of a group share.
+        base: the base fitted to the scans from which the measurement errors that the scans of a group share
+            were subtracted.
         named: result of the search for causes.
-        lawful: result of the search for short laws in addition to the causes.
-        described: tables over a covariate that describe the remaining error. These tables act last in the
-            model.
-        rests: for each stage, the part of the residual that features of layout and position still explain.
-        untestable: effects that could not be tested, with reasons.
+        lawful: result of the search for short laws, which were added to the model with the causes.
+        described: result of the search for tables, which describe the remaining error as a function of one
+            variable, such as level or position. Tables act last in the process, before the microscope.
+        rests: for each stage of the loop, the part of the residual that features of layout and position still
+            explain.
+        untestable: effects that the scans could not test, each with the reason.
     """
 
     base_name: str
@@ -69,7 +72,9 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the scans without the measurement errors that the scans of a group share."""
+        """Return the scans from which the measurement errors that the scans of a group share were
+        subtracted.
+        """
         return self.base.study
 
     @property
@@ -79,18 +84,18 @@ class Closed:
 
     @property
     def traced(self) -> list[Cause]:
-        """Return causes and laws."""
+        """Return the causes and the laws that were found."""
         return [*self.named.causes, *self.lawful.causes]
 
     @property
     def found(self) -> list[Cause]:
-        """Return all findings that the report lists."""
+        """Return all effects that were added to the model: causes, laws and tables."""
         return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether the search finds the cause with every other base too.
+        """Return whether the search has found the cause with every other base, too.
 
-        Bases with more parameters are ignored, because they may have absorbed the cause.
+        Bases with more parameters than the chosen base are ignored, because they may have absorbed the cause.
         """
         base = self.plain.twin.own
         small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
@@ -101,8 +106,9 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     """Find the effects that a base model lacks on these scans.
 
     Args:
-        study: development scans.
-        bases: base models by name. Base models with few parameters are refitted.
+        study: the scans for development, with their folds.
+        bases: base models by name, from which the loop chooses one. Base models with few parameters are
+            refitted.
     """
     plain, began_s = {}, time.monotonic()
     for name, base in bases.items():
@@ -123,7 +129,8 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     searches: dict[str, Found] = {}
     for name, state in starts.items():
         study.report(f"searching for effects that {name} lacks")
-        # The other bases probably lack the same causes as the first, so their searches start from its causes.
+        # The other bases probably lack the same causes as the first base, so their searches start from the
+        # causes that were found with the first base.
         searches[name] = search(state, candidates, seed=next(iter(searches.values()), None))
     chosen = _simplest(searches)
     start, named = starts[chosen], searches.pop(chosen)
@@ -143,7 +150,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         named=named,
         lawful=lawful,
         described=described,
-        # A stage that changes nothing has the model of the stage before it.
+        # A stage that changes nothing has the same model as the stage before it and is not listed.
         rests={
             name: rest(state)
             for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
@@ -156,8 +163,8 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def freed_scans(state: State) -> list[PrintedScan]:
     """Subtract from each scan the measurement errors that the scans of its group share.
 
-    An error that all scans share is not subtracted, because a cause may explain it. The subtracted part is
-    learned from scans outside the scan's fold.
+    A measurement error that all scans share is not subtracted, because a cause may explain it. What is
+    subtracted from a scan is learned from the scans outside its fold.
     """
     study = state.study
     maps, scans, freed = state.maps_um(study.scans), study.stored, study.stored
@@ -172,7 +179,9 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
-    """Return the names of the bases with which a search found the cause, or an effect that looks the same."""
+    """Return the names of the bases with which the search has found the cause, or an effect that
+    looks the same.
+    """
     alike = {cause.name, *cause.alike}
     return [
         name
@@ -200,14 +209,16 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
-    """Search for laws and then for tables, both in addition to the causes. Then check each cause in the model
-    that contains the laws and tables.
+    """Search for laws and then for tables that the model with the causes still lacks. Then check each cause
+    in the model that also contains the laws and, if it gains much, a table.
 
-    A cause that fails its check is removed, and the search for laws is repeated without it.
+    A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
+    the results of the searches for laws and for tables.
 
     Args:
-        start: the base.
-        named: causes found with this base; causes that are refused are removed from it.
+        start: the fitted base.
+        named: result of the search for causes with this base. Causes that are rejected are removed from it.
+        rest: function that returns the part of a model's residual that can still be explained.
     """
     study = start.study
     # Tables describe heights, not films.
@@ -216,7 +227,7 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
-        # A law with the same formula as a named cause would only rename the cause.
+        # A law with the same formula as a cause in the model would only rename this cause.
         formulas = {get_effect(name).apply for name in named.names}
         laws = [law for law in all_laws if law.apply not in formulas]
         lawful = search(named.state, laws, 4, secants)
@@ -232,8 +243,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # Causes that may only correct another formula are removed first. The other formula is then judged
-        # without them.
+        # Causes that may only correct the formula of another effect are removed first. The other effect is
+        # then judged without them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -243,7 +254,9 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """Add to the model every table that is still confirmed when it is fitted with all other parts."""
+    """Add to the model every table that held-out scans still confirm when it is fitted together with all
+    other parts of the model.
+    """
     found = Found(state)
     for table in described:
         fitted = with_table(found.state, table)
@@ -255,9 +268,10 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
 
 
 def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """Add the table with the largest gain to the model if it gains more than all causes together.
+    """Add the table with the largest gain to the model if this gain exceeds ``named_nm2``, the gain of all
+    causes together.
 
-    A table fits almost anything, so a larger gain than that of a single cause is not enough.
+    A table fits almost anything, so a gain larger than that of a single cause would not be enough.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

@@ -1,4 +1,6 @@
-"""Compute the errors of a loop's models on held-out scans, each model with its own measurement model."""
+"""Compute the errors of the models of a loop on held-out scans. A measurement model is fitted together with
+each of these models.
+"""
 
 from __future__ import annotations
 
@@ -31,29 +33,31 @@ Maps = list[np.ndarray]
 
 
 class Fit(NamedTuple):
-    """A printer and a measurement model fitted to the same scans."""
+    """A model of the printer and a measurement model, fitted to the same scans."""
 
     twin: Twin
     measurement: MeasurementModel
 
     @property
     def numbers(self) -> tuple[int, int]:
-        """Return the numbers of fitted parameters of the printer and of the measurement."""
+        """Return the number of fitted parameters of the printer model, and that of the measurement model."""
         return len(self.twin.vector), self.measurement.numbers
 
     def expected_um(self, scan: PreparedScan) -> np.ndarray:
-        """Return the map (y, x) that a scan is expected to show."""
+        """Return the map that a scan is expected to show, µm, of shape (ny, nx)."""
         return self.measurement.expected_um(scan.stored, self.twin.height(scan))
 
 
 def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, refit: bool = True) -> Fit:
-    """Fit the measurement model, then the printer, and then the strengths of the measurement model again, all
-    to the same scans.
+    """Fit a measurement model, then the model of the printer, and then the coefficients of the measurement
+    model again, all to the same scans.
 
     Args:
-        twin: starting model for the fit of the printer.
-        scans: original scans.
-        refit: whether to fit the printer again once the measurement model is known.
+        twin: the model of the printer from which its fit starts.
+        scans: the original scans.
+        seed: seed for learning the measurement model.
+        refit: whether to fit the model of the printer after the first fit of the measurement model. If not,
+            the measurement model is fitted only once.
     """
     stored = [scan.stored for scan in scans]
     maps = [*map(twin.height, scans)]
@@ -74,11 +78,16 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Return the errors of predicted maps (y, x), µm, under each reported policy; films get no offset.
+    """Return the errors of predicted maps under each reported policy. For films, only the policy without
+    fitted terms is reported.
 
     Args:
-        numbers: numbers of fitted parameters of the printer and of the measurement model.
-        terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``, if not the usual ones.
+        scans: the scans.
+        maps_um: map that each scan is expected to show, µm, of shape (ny, nx).
+        numbers: numbers of fitted parameters of the printer model and of the measurement model.
+        seed: seed of the calibration blocks.
+        terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``. The last two have
+            defaults.
     """
     rows, ids = [], [scan.id for scan in scans]
     films = scans[0].seen_by == "sem"
@@ -109,10 +118,11 @@ def error_rows(
 
 
 class HeldOut:
-    """The models of a loop, fitted together with their measurement models to scans that are not scored.
+    """The errors of the models of a loop on scans to which they were not fitted. For these errors, each model
+    is fitted together with a measurement model.
 
     Args:
-        closed: result of ``close``.
+        closed: the loop, as returned by ``close``.
     """
 
     def __init__(self, closed: Closed):
@@ -123,15 +133,15 @@ class HeldOut:
 
     @property
     def ends(self) -> dict[Stage, State]:
-        """Return the base and the corrected model."""
+        """Return the models at both ends of the loop: the base and the corrected model."""
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Return the errors of all models.
+        """Return the errors of the base, the base with the causes, and the corrected model.
 
-        Each scan is predicted by a fit to the scans outside its fold. The base and the final model are also
-        scored on scans whose whole print was left out of the fit. The model with only the causes is listed
-        between the base and the final model if it differs from both.
+        Each scan is predicted by a fit to the scans outside its fold. If the base is refitted and prints were
+        scanned several times, the base and the corrected model are also scored with fits that leave out the
+        whole print of a scan. The model with only the causes is listed if it differs from both other models.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
@@ -154,14 +164,14 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """Predict each scan (y, x), µm, by a printer and a measurement model fitted without the fold of the
-        scan.
+        """Predict the map that each scan shows, µm, of shape (ny, nx). The models of printer and measurement
+        are fitted without the scans of the same fold.
         """
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """Return by how much the error (k = 1), nm, grows when a cause or law is removed and the model is
-        refitted.
+        """Return for each effect of the corrected model by how much the error (k = 1) grows, nm, when the
+        effect is removed and the model is refitted.
 
         After this refit, the measurement model is fitted again, with the parameters of the printer held
         fixed.
@@ -179,9 +189,8 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return the residual maps (y, x), nm, of all scans before and after the correction.
-
-        The offset of each scan is removed.
+        """Return for each scan its id and its residual maps before and after the correction, nm, of shape
+        (ny, nx). The median of each map is subtracted.
         """
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
@@ -203,13 +212,13 @@ class HeldOut:
     def _without_parts(
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
-        """Predict each scan by a fit to the scans of all other parts.
-
-        Also return the largest number of parameters of these fits.
+        """Predict each scan by a fit to the scans of all other parts (folds or prints). Return the predicted
+        maps and the numbers of parameters of the fit with the most parameters.
 
         Args:
-            starts: for each part, the starting model of the fit that leaves this part out.
+            starts: for each part, the model from which the fit without this part starts.
             part_of: part to which each scan belongs.
+            refit: whether the model of the printer is fitted again.
         """
         scans, jobs = self.study.scans, []
         for part, twin in starts.items():
@@ -221,7 +230,9 @@ class HeldOut:
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, maps: Maps) -> Maps:
-        """Add the smooth background of the training scans to the maps, as in the published protocol."""
+        """Add to each predicted map the smooth background of the training scans, as the published
+        protocol does.
+        """
         found = list(maps)
         for twin, (rest, own) in zip(self.closed.plain.per_fold, self.study.folds, strict=True):
             heights = [twin.height(self.study.scans[i]) for i in rest]
@@ -241,9 +252,14 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Return the errors of models on scans that were not used to choose them.
+    """Return the errors of the base and the corrected model on scans that were not used to choose or fit
+    them.
 
-    Each pair in ``found`` contains the models of one loop and the scans that this loop did not use.
+    Args:
+        found: pairs of the models of a loop and the scans that this loop did not use.
+        scans: all scans of these pairs, in the order in which they are reported.
+        held_out: what was held out, as in ``ErrorRow.held_out``.
+        seed: seed of the calibration blocks.
     """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))

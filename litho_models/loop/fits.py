@@ -1,7 +1,8 @@
 """Fit a model of the printer to all scans. Then, for each fold, refit the model to the scans of all other
-folds and predict the scans of this fold.
+folds, and predict the scans of this fold.
 
-Per-scan terms are projected out, so that they do not bias the parameters of the printer.
+Per-scan terms are projected out of the residuals and derivatives, so that they do not bias the parameters of
+the printer.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# Terms that are free for each scan in a fit. The gain is not free, because long-range effects also change it.
+# Terms that are free in each scan when a model is fitted. The gain is not free, because long-range effects of
+# the printer change it, too.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
-# Terms that are free for each scan when errors are compared.
+# Terms that are free in each scan when the errors of models are compared.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
 
@@ -48,11 +50,11 @@ class Study:
     """Scans with their folds, and the settings by which findings are judged.
 
     Attributes:
-        scans: prepared scans.
-        fold_of: (scans,) number of the fold of each scan.
-        seed: seed of folds, calibration blocks and permutations.
-        workers: pool for independent fits.
-        report: function that receives progress messages.
+        scans: the prepared scans.
+        fold_of: number of the fold of each scan, of shape (scans,).
+        seed: seed of the folds, the calibration blocks and the permutations.
+        workers: pool of processes for independent fits.
+        report: function that receives the progress messages.
     """
 
     scans: Sequence[PreparedScan]
@@ -70,19 +72,21 @@ class Study:
         workers: Workers = HERE,
         report: Callable[[str], None] = _silent,
     ) -> Study:
-        """Divide the scans of a store into at most ``folds`` folds."""
+        """Prepare scans and divide them into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
         lists = grouped_folds(ids, min(folds, len(ids)), seed)
         fold = {one: number for number, members in enumerate(lists) for one in members}
         return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
 
     def __getstate__(self) -> dict[str, object]:
-        """Drop workers and progress messages, which cannot be sent to another process."""
+        """Leave out the workers and the function for progress messages, which cannot be sent to
+        another process.
+        """
         return {**self.__dict__, "workers": HERE, "report": _silent}
 
     @property
     def folds(self) -> list[tuple[list[int], list[int]]]:
-        """Return, for each fold, the indices of the scans outside it and of those inside it."""
+        """Return for each fold the indices of the scans outside the fold and those of the scans inside it."""
         own = (self.fold_of == fold for fold in range(int(self.fold_of.max()) + 1))
         return [(np.flatnonzero(~one).tolist(), np.flatnonzero(one).tolist()) for one in own]
 
@@ -97,17 +101,17 @@ class Study:
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Return the tip radius, or an upper bound for it, from the first scan that states one; None if no
-        scan does.
+        """Return the radius of the tip of the microscope, or an upper bound for it, as the first scan with
+        this information states it; None if no scan states it.
         """
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
 
     @property
     def of_films(self) -> bool:
-        """Return whether the scans are micrographs of a film.
+        """Return whether the scans are electron micrographs of a film.
 
-        The edges of such scans are scored, and their heights do not drift.
+        For films, the positions of edges are scored, and there are no per-scan height errors such as drift.
         """
         return self.scans[0].stored.seen_by == "sem"
 
@@ -124,9 +128,9 @@ class State:
     Attributes:
         twin: the model fitted to all scans.
         per_fold: for each fold, the model fitted without the scans of this fold.
-        linear: residual, derivatives and free terms of each window at ``twin``.
-        held_out_um: residual (n,) of each window, for the model that was fitted without the fold of the
-            window.
+        linear: residual, derivatives and free terms of each window at the parameters of ``twin``.
+        held_out_um: residual of each window at its n sampled pixels, µm, of shape (n,), for the model that
+            was fitted without the fold of this window.
         freed_um: ``held_out_um`` after the free terms of each scan are projected out.
     """
 
@@ -136,12 +140,13 @@ class State:
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_um: list[np.ndarray]
-    # Cached models without one effect, because several steps need the same model.
+    # Models without one effect, by the name of this effect. They are cached because several steps need the
+    # same model.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def freed_nm2(self) -> np.ndarray:
-        """Return the mean square of ``freed_um`` for each scan, (scans,), nm²."""
+        """Return the mean square of ``freed_um`` for each scan, nm², of shape (scans,)."""
         return np.array([NM_PER_UM**2 * np.mean(left**2) for left in self.freed_um])
 
     @property
@@ -149,32 +154,34 @@ class State:
         return float(self.freed_nm2.mean())
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the scans out when a state is sent to another process."""
+        """Leave out the study with its scans when a state is sent to another process."""
         return {**self.__dict__, "study": None}
 
     def without(self, name: str) -> State:
-        """Remove one effect and refit the model from its current values."""
+        """Return the model without the named effect, refitted from the current parameters."""
         if name not in self._without:
             self._without[name] = fit_state(self.twin.without(name), self.study, from_here=True)
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predict the print (y, x) of each scan, or of its window, by the model fitted without the fold of
-        the scan.
+        """Predict the height of the print in each scan (or window), µm, of shape (ny, nx), by the model that
+        was fitted without the fold of this scan.
         """
         folds = zip(self.study.fold_of, scans, strict=True)
         return [self.per_fold[fold].height(scan) for fold, scan in folds]
 
 
 class TwinProblem:
-    """The least-squares problem of a model on windows of scans; derivatives are difference quotients."""
+    """The least-squares problem of fitting a model to windows of scans. Derivatives are computed as
+    difference quotients.
+    """
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
         self._twin = twin
         self._windows = windows
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
-        """Return the residuals, derivatives and free terms of all windows."""
+        """Return the residuals, the derivatives and the free terms of all windows at the given parameters."""
         here = self._twin.at(vector)
         steps = here.steps()
         moved = [here.at(vector + one) for one in np.diag(steps)]
@@ -189,29 +196,33 @@ class TwinProblem:
         rows = np.zeros((len(steps), len(window.sample)))
         for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
             if slot is None or twin.is_of(slot, window):
-                # Only the changed effect and the effects after it are computed again.
+                # With cached fields, only the effect whose parameter changed and the effects after it are
+                # computed again.
                 there = other.height(window, known=ChainMap({}, fields))
                 rows[at] = (window.at_sample(there) - value) / steps[at]
         return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
-        """Return the measured minus predicted heights of all windows, µm."""
+        """Return the measured minus the predicted heights of all windows at the given parameters, µm."""
         twin = self._twin.at(vector)
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest and largest allowed steps. These steps keep the effects within their ranges and
-        change the base parameters by small amounts.
+        """Return the lowest and the highest allowed step of each parameter. Such steps keep the effects
+        within their ranges and change the parameters of the base only by small amounts.
         """
         return self._twin.at(vector).room()
 
 
 def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
-    """Fit a model to all windows of a study, then once per fold without the windows of that fold.
+    """Fit a model to all windows of a study, and then once for each fold without the windows of this fold.
 
     Args:
-        from_here: start at the current values. Otherwise, try these values and the base's default values,
-            and use the start that leads to the smaller error.
+        twin: the model.
+        study: the scans.
+        from_here: whether to start from the current parameters of the model. Otherwise, two starts are tried:
+            the current parameters, and the default parameters of the base. The start that leads to the
+            smaller error is used.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -233,12 +244,13 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Return the better start of a fit: the current values or the base's default values.
+    """Return the better start of a fit: the current parameters, or the same with the default parameters of
+    the base.
 
     The better start is the one from which a fit to some of the scans reaches the smaller error.
 
-    A base that was fitted without an effect has absorbed part of it. When the effect is added, a fit from
-    the current values may therefore be stuck in a local optimum.
+    Two starts are tried because a base that was fitted without an effect has absorbed part of this effect.
+    When the effect is added, a fit from the current parameters may therefore get stuck in a local optimum.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
@@ -252,31 +264,37 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Project the free terms of a scan out of columns (n, m) at its sampled pixels.
+    """Project the free terms of a scan out of the given columns.
 
-    The terms are computed from the prediction (y, x), µm, of the scan.
+    Args:
+        columns: m columns of values at the n sampled pixels of the scan, of shape (n, m).
+        window: the scan.
+        prediction_um: predicted height from which the terms are computed, µm, of shape (ny, nx).
+        terms: names of the free terms.
     """
     basis = window.free_basis(prediction_um, terms)
     return columns - basis @ (basis.T @ columns)
 
 
 def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Sequence[PreparedScan]) -> Twin:
-    """Fit the model to some of the windows, using the derivatives of the common fit.
+    """Fit the model to the windows outside a fold, using the derivatives of the common fit.
 
-    The fit starts from the common fit, which used all windows. It must therefore be iterated to convergence.
+    The fit starts from the parameters of the common fit, which used all windows. It must therefore be
+    iterated to convergence, so that no information about the fold remains.
     """
     twin = common.of_fold(fold)
     problem, vector = TwinProblem(twin, windows), twin.vector
     if not len(vector):
         return twin
     if twin is not common:
-        # The common fit used every fold, so its predictions are not held out.
+        # The residuals of the common fit are those of other base models, so they are computed again with the
+        # base of this fold.
         linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(6):
         step = solve_damped(normal, right, 1e-6, twin.at(vector).room())
         trial = vector + step
-        # For such a small step the linear model is exact enough.
+        # If the predicted gain of a step is this small, the linear model is exact enough.
         if promised_gain(normal, right, step) <= 1e-4 * total:
             vector = trial
             break

@@ -1,8 +1,9 @@
 """Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-First, the change must have the right sign. In a scan that contains the effect, the change has a positive
-inner product with the residual before the change. A sign-flip test checks this. Second, the change at its
-common strength must lower the error: the confidence interval of the gain must lie above zero.
+First, the change must have the right sign: in a scan that contains the effect, the change of the prediction
+has a positive inner product with the residual before the change. A sign-flip test over the scans checks this.
+Second, the change must lower the error when it has the same strength in all scans (or in all scans of a
+group): the confidence interval of the gain must lie above zero.
 """
 
 from __future__ import annotations
@@ -17,29 +18,32 @@ from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
-# Largest accepted p value of a grouping. It is small because every candidate is tried with every grouping.
+# Largest accepted p value of a grouping. The limit is small because every candidate is tried with every
+# grouping.
 EXCHANGED_P = 0.01
-# Seven scans agree by chance with a probability of 1/128, which is too high, so eight scans are needed.
+# Largest accepted p value of the sign-flip test. Seven scans all have the right sign by chance with a
+# probability of 1/128, which is above this limit, so at least eight scans are needed.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# A strength by group has already passed the test with permuted labels, so this limit is looser: up to half
-# of the scans may gain nothing.
+# The same limit for a strength that differs by group. Such a strength has already passed the test with
+# permuted labels, so this limit is looser: up to half of the scans may gain nothing.
 GROUPED_P = 0.05
-# Smallest share of the squared error that justifies a strength by group, or a search. A change of the model
-# must reduce the squared error by twice this share (the rms error by 1 %), because every formula is slightly
-# wrong.
+# Smallest share of the squared error that counts. Strengths that differ by group must gain at least this
+# share more than a common strength. A change of the model must reduce the squared error by twice this share,
+# which is 1 % of the rms error, because every formula is slightly wrong.
 SMALLEST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The gain of a change (reduction of the squared error) on held-out scans.
+    """The gain of a change of the model, which is the reduction of the squared error on held-out scans.
 
     Attributes:
-        before_nm2, gain_nm2: mean squared error before the change, and its decrease.
-        gains_nm2: (scans,) gain of each scan.
-        p: one-sided p value of a sign-flip test on the evidence of the scans.
-        low_nm2: lower end of the confidence interval of the gain.
+        before_nm2: mean squared error before the change.
+        gain_nm2: mean decrease of the squared error.
+        gains_nm2: decrease of the squared error of each scan, of shape (scans,).
+        p: one-sided p value of the sign-flip test on the evidence of the scans.
+        low_nm2: lower end of the confidence interval of the mean gain.
     """
 
     before_nm2: float
@@ -50,13 +54,13 @@ class Judgement:
 
     @property
     def improved(self) -> tuple[int, int]:
-        """Return the number of scans that improve, and the number of all scans."""
+        """Return the number of scans whose error falls, and the number of all scans."""
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
     def reason(self, by: str = ALL) -> str:
-        """Return why the change is not confirmed; empty if it is confirmed.
+        """Return the reason why the scans do not confirm the change; empty if they confirm it.
 
-        ``by`` is the grouping by which its strength differs.
+        ``by`` is the grouping by which the strength of the change differs.
         """
         better, count = self.improved
         if count < FEWEST_SCANS:
@@ -73,11 +77,13 @@ class Judgement:
 def judge(
     before_nm2: np.ndarray, after_nm2: np.ndarray, study: Study, evidence_nm2: np.ndarray | None = None
 ) -> Judgement:
-    """Judge a change by the squared error (scans,) before and after, nm².
+    """Judge a change of the model on held-out scans.
 
     Args:
-        evidence_nm2: (scans,) mean product of the change and the residual before the change; by default the
-            gains.
+        before_nm2, after_nm2: mean squared error of each scan before and after the change, of shape (scans,).
+        study: the study, which provides the seed.
+        evidence_nm2: mean product of the change and the residual before the change in each scan, of shape
+            (scans,); by default the gains.
     """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)
@@ -92,13 +98,23 @@ def judge_states(before: State, after: State) -> Judgement:
 
 
 def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
-    """Return the mean product of a change and the residual before the change, ignoring unmeasured pixels."""
+    """Return the mean product of a change and the residual before this change. Pixels that were not measured
+    are ignored.
+
+    Args:
+        before_um, after_um: residual before and after the change.
+    """
     return NM_PER_UM**2 * float(np.nanmean(before_um * (before_um - after_um)))
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Return whether a rival is clearly worse than the best change: it must be worse in nearly every scan,
-    and its gain must be smaller by at least a quarter of the best gain.
+    """Return whether another change of the model is clearly worse than the best change. It must be worse in
+    nearly every scan, and its gain must be smaller by at least a quarter of the best gain.
+
+    Args:
+        before_nm2, best_nm2, other_nm2: mean squared error of each scan before the change, after the best
+            change and after the other change, of shape (scans,).
+        study: the study, which provides the seed.
     """
     lost = judge(other_nm2, best_nm2, study)
     return lost.p <= CONFIRM_P and lost.gain_nm2 >= 0.25 * float((before_nm2 - best_nm2).mean())

@@ -1,7 +1,7 @@
-"""Estimate how much of a residual could still be learned, by a cross-validated ridge regression.
+"""Estimate by a cross-validated ridge regression how much of a residual could still be learned.
 
-The ridge uses features of layout and position. It names no cause and is part of no model. It shows whether
-the residual has structure, and how large this structure is compared with the gain of a named cause.
+The ridge regression uses features of layout and position. It names no cause and is part of no model. It shows
+whether the residual has structure, and how large this structure is compared with the gain of a cause.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from litho_models.models.features import Features, FeaturesConfig, RandomFeature
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# Memory limit for the feature rows; with more scans, fewer pixels of each scan are used.
+# Memory limit for the values of the features. If there are many scans, fewer pixels of each scan are used.
 _KEPT_BYTES = 512 * 2**20
-# Features whose strength may depend on order or dose: height, |∂y| and |∂x| at 0.3 µm, and surroundings of
-# 1.6 µm.
+# Indices of the features whose strength may depend on the writing order or the dose: the height, |∂y| and
+# |∂x| of the layout blurred with σ = 0.3 µm, and the layout blurred with σ = 1.6 µm (the surroundings).
 _VARYING = (18, 21, 22, 7)
 
 
 @dataclass(frozen=True)
 class Rest:
-    """The part of a residual that the ridge explains on held-out scans.
+    """The part of a residual that the ridge regression explains on held-out scans.
 
     Attributes:
-        gains_nm2: (scans,) squared error that the ridge removes from each held-out scan.
-        squares_nm2: (scans,) squared error without the ridge. The free terms of the scans are excluded from
-            both arrays.
+        gains_nm2: squared error that the ridge regression removes from each held-out scan, of shape (scans,).
+        squares_nm2: squared error of each scan without the ridge regression, of shape (scans,). For both
+            arrays, the free terms of the scans are first projected out.
     """
 
     gains_nm2: np.ndarray
@@ -50,37 +50,40 @@ class Rest:
 
     @property
     def share(self) -> float:
-        """Return the explained share of the squared error."""
+        """Return the share of the squared error that the ridge regression explains."""
         return self.mean_nm2 / max(float(self.squares_nm2.mean()), np.finfo(float).tiny)
 
     @cached_property
     def ci95_nm2(self) -> tuple[float, float] | None:
-        """Return the confidence interval of the mean gain over scans; None for fewer than six scans."""
+        """Return the 95 % confidence interval of the mean gain over scans; None if there are fewer
+        than six scans.
+        """
         return interval(self.gains_nm2.tolist())
 
     @property
     def most_nm(self) -> float:
-        """Return an upper bound on the rms error caused by the form of the model: the square root of the
-        upper end of ``ci95_nm2``.
+        """Return an upper bound on the rms error that a wrong form of the model causes, nm. It is the square
+        root of the upper end of ``ci95_nm2``.
         """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
-        """Return whether the residual can be learned: the share exceeds 1 %, and the interval is above
-        zero.
+        """Return whether part of the residual can be learned: the explained share exceeds 1 %, and the
+        confidence interval of the gain lies above zero.
         """
         low, _ = self.ci95_nm2 or (0.0, None)
         return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
-    """The features of a study's scans, computed once for any number of residuals.
+    """The features of the scans of a study. They are computed once and are used for any number of residuals.
 
     Args:
-        study: scans and folds.
-        predictions: (y, x) µm, one per scan; the free gain of a scan multiplies its prediction.
+        study: the scans with their folds.
+        predictions: predicted height of each scan, µm, of shape (ny, nx), from which the free terms (such as
+            the gain) are computed.
     """
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
@@ -88,8 +91,9 @@ class Learner:
         model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
-        # These are the writing order and the deviation of the dose from nominal. A dependence on either can
-        # be learned only if the scans have at least three different values of it.
+        # The facts about each scan are its position in the writing order and the deviation of its dose from
+        # nominal. A dependence on one of these facts can be learned only if the scans have at least three
+        # different values of it.
         facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
@@ -105,11 +109,12 @@ class Learner:
         )
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
-        """Explain the residual of each scan (measured minus predicted heights) by a ridge fitted to scans of
-        other folds.
+        """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
+        fitted to the scans of other folds.
 
         Args:
-            predictions: held-out predictions (y, x) µm, one per scan.
+            predictions: predicted height of each scan, µm, of shape (ny, nx), by a model that was fitted
+                without the fold of this scan.
         """
         scans, count = self._study.scans, self._grams.shape[1]
         grams = np.zeros((len(scans), 1 + count, 1 + count))
@@ -125,13 +130,14 @@ class Learner:
         return Rest(squares - left, squares)
 
     def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
-        """Return the features of layout and position, and products of some features with order and dose, (m,
-        n).
+        """Return the m features at n pixels, of shape (m, n): the features of layout and position, some of
+        their products, and products of some features with the writing order and the dose.
         """
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
-        # Height, ∂y and ∂x represent a gain and a displacement whose strength may depend on position.
+        # Products of the height, ∂y and ∂x with the position represent a gain and a displacement that depend
+        # on the position.
         placed = (18, 19, 20)
         columns = [of_layout, of_place, *(of_place * of_layout[one] for one in placed)]
         for value in varied:
@@ -145,19 +151,20 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Return the mean squared residual (scans,). The ridge for each scan is fitted and regularised without
-    the fold of the scan.
+    """Return the mean squared residual that the ridge regression leaves in each scan, of shape (scans,). For
+    each scan, the regression is fitted, and its regularisation is chosen, without the scans of the same fold.
     """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
-    # Strength of regularisation, in scans.
+    # The last argument of a block is the strength of the regularisation, as a number of scans.
     blocks = [Block(columns, ALL, shrinking) for shrinking in (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # With a single scan, no strength can be cross-validated, so the strongest regularisation is used.
+        # If only one scan is left, the regularisation cannot be cross-validated, so the strongest one is
+        # used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
@@ -166,7 +173,9 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
 
 
 def _all_features(scan: PreparedScan) -> Features:
-    """Return the layout features of the zoo's models for scans like this one, except the random features."""
+    """Return the layout features that the models of the zoo use for scans like this one, except the
+    random features.
+    """
     first = scan.stored
     config = RandomFeaturesConfig.of_variant(
         pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
@@ -175,15 +184,18 @@ def _all_features(scan: PreparedScan) -> Features:
 
 
 def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
-    """Return the products of splines along y and x at flat indices of a scan, shape (25, n)."""
+    """Return the products of splines along y and splines along x at the given flat indices of a
+    scan, of shape (25, n).
+    """
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
     return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
 
 
 def _splines(size: int) -> np.ndarray:
-    """Return the cubic splines (5, size) over the sampled part of an axis; they add up to 1.
+    """Return five cubic splines over the sampled part of an axis, which add up to 1, as an array of shape (5,
+    size).
 
-    They are constant outside the sampled part, where no measured pixel would determine them.
+    The splines are constant outside the sampled part, because no measured pixel would determine them there.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])

@@ -1,7 +1,7 @@
-"""Find marks directly in single scans, without a model: rounding, scars, short lines, bends.
+"""Find marks in single scans: rounded heights, scars, short lines and bends.
 
-Marks are reported with evidence but enter no model, because a model of them would not lower errors on
-held-out scans.
+Marks are reported with the evidence for them. No model contains them, because a model of them would not lower
+the errors on held-out scans.
 """
 
 from __future__ import annotations
@@ -19,20 +19,23 @@ from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
-# These lags are longer than the resolution of tip and spot, and shorter than a line-shaped feature.
+# Range of distances between pixels, in which the residuals of line-shaped roughness are correlated. They are
+# longer than the resolution of tip and spot, and shorter than a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
-# Smaller rms heights occur but do not matter.
+# Marks with a smaller rms height occur but do not matter.
 _SMALLEST_RMS_NM = 0.5
 
 
 def marks(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], rounding_um: Mapping[str, float] | None
 ) -> list[ScanFinding]:
-    """Return all marks of the scans.
+    """Return the findings about all marks.
 
     Args:
-        scans: original scans; ``maps_um``: their expected maps (y, x).
-        rounding_um: step of the heights in each scan's raw file, by id; None without raw files.
+        scans: the original scans.
+        maps_um: map that each scan is expected to show, µm, of shape (ny, nx).
+        rounding_um: step to which the heights in the raw file of each scan are rounded, by scan id; None if
+            there are no raw files.
     """
     residuals = [
         freed_um(scan.stored.height_um, own, scan.usable, POLICIES["full"])
@@ -43,11 +46,13 @@ def marks(
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
-    """Merge terms and marks by name; a name counts as seen if either list contains it as seen."""
+    """Merge the findings about per-scan terms and about marks. If both lists contain the same name, the
+    effect counts as seen if one of them has seen it.
+    """
     found: dict[str, list[ScanFinding]] = {}
     for one in (*findings, *seen):
         found.setdefault(one.name, []).append(one)
-    # Of two findings with the same name, the one that was seen is kept.
+    # Of two findings with the same name, the one that was seen is kept, together with the evidence of both.
     ordered = [sorted(own, key=lambda one: not one.seen) for own in found.values()]
     return [
         first.model_copy(update={"evidence": "; ".join(one.evidence for one in (first, *others))})
@@ -56,12 +61,12 @@ def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> 
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Return the step of which all heights of a raw scan are multiples, up to one offset; 0 if there is
-    none.
+    """Return the step to which the heights of a raw scan are rounded: apart from a common offset, all heights
+    are multiples of this step. Return 0 if there is no such step.
     """
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
-    # Smaller differences come from rounding in single precision.
+    # Smaller differences between heights come from storing them in single precision.
     steps = steps[steps > 1e-6 * np.ptp(heights)] if len(heights) > 2 else steps[:0]
     if not len(steps):
         return 0.0
@@ -71,8 +76,8 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
 
 
 def _rounding(steps_um: Sequence[float]) -> ScanFinding:
-    """Report the rounding of the raw files. The rms of the uniform noise that it adds is the step divided by
-    √12.
+    """Report the rounding of the heights in the raw files. It adds uniform noise, whose rms is the
+    step divided by √12.
     """
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
@@ -87,7 +92,9 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
-    """Test for scars: more outliers must be elongated along the scan lines than across them."""
+    """Test whether there are scars. If so, more outliers are elongated along the scan lines than
+    across them.
+    """
     along, across = np.array([*map(_drawn_out, scans, residuals)]).T
     p = one_sided_flip_p((along - across).astype(float))
     text = (
@@ -98,8 +105,8 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
-    """Count the outliers that are elongated along the scan lines, and those that are elongated across
-    them.
+    """Return the number of outliers that are elongated along the scan lines, and the number of those
+    elongated across them. An outlier is a connected patch of pixels with large residuals.
     """
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
@@ -117,10 +124,10 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
 def _short_lines(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
 ) -> ScanFinding:
-    """Test for short lines: on flat areas, the residuals of nearby pixels must agree more along the scan
-    lines than across them.
+    """Test whether the surface has short line-shaped features along the scan lines. If so, the residuals of
+    nearby pixels agree better along the scan lines than across them.
 
-    Slopes are excluded, because the residuals there contain errors of the model.
+    Only flat areas are used, because the residuals on slopes contain errors of the model.
     """
     along, across = np.array([*map(_shared_nm2, scans, maps_um, residuals)]).T
     p = one_sided_flip_p(along - across)
@@ -135,14 +142,15 @@ def _short_lines(
 
 
 def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
-    """Return the mean product, nm², of residuals at distances within ``_LINE_LAGS_UM``, first along and then
-    across the scan lines.
+    """Return the mean product, nm², of the residuals of two pixels at distances within ``_LINE_LAGS_UM``:
+    first for pairs of pixels along the scan lines, then for pairs across them.
     """
     slope = np.hypot(*np.gradient(prediction))
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
     for line in (scan.line, row_index(flat.shape)):
-        # The mean of every line is subtracted. An error in this mean can only lower the product along lines.
+        # The mean of every line is subtracted. An error of this mean can only lower the mean product along
+        # the lines.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )
@@ -163,7 +171,7 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Report which scans the registration straightened. All other steps use the straightened scans."""
+    """Report how many scans the registration straightened. All other steps use the straightened scans."""
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"the registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:

@@ -1,4 +1,6 @@
-"""The twin: a base model with effects whose strengths are the same for all scans or differ by group."""
+"""The twin of a machine: a base model with effects. The strength of an effect is the same in all scans or
+differs between groups of scans.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,19 @@ from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = Mapping[str, Mapping[str, float]]
-# Relative distance from a bound below which a fitted value counts as on the bound.
+# If the relative distance of a fitted value from a bound is smaller than this, the value counts as on the
+# bound.
 _AT_BOUND = 1e-6
 
 
 class FoldedBase(nn.Module):
-    """One trained model per fold; each scan is predicted by the model that was trained without it.
+    """A base with one trained model for each fold. Each scan is predicted by the model that was trained
+    without the scans of its fold.
 
     Args:
-        models: one per fold; ``fold_of``: fold of each scan id; ``common``: model for scans in no fold.
+        models: the model of each fold, which was trained without the scans of this fold.
+        fold_of: number of the fold of each scan, by scan id.
+        common: model for scans that belong to no fold.
     """
 
     def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
@@ -38,22 +44,24 @@ class FoldedBase(nn.Module):
         self.models = nn.ModuleList(models)
         self.common = common
         self.fold_of = dict(fold_of)
-        # Weights stay as trained, because freezing would change their rounding.
+        # The trained weights are used unchanged, because freezing the model would change their rounding.
         self.eval()
 
     def of_fold(self, fold: int) -> nn.Module:
-        """Return the model trained without this fold."""
+        """Return the model that was trained without the scans of this fold."""
         return self.models[fold]
 
     def of_scan(self, scan_id: str) -> nn.Module:
-        """Return the model trained without this scan."""
+        """Return the model that was trained without this scan. A scan in no fold gets the common model."""
         fold = self.fold_of.get(scan_id)
         return self.common if fold is None else self.models[fold]
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One fitted parameter of an effect; ``label`` is its group of scans, or None for all scans."""
+    """One fitted parameter of an effect. ``label`` is the label of the group of scans to which it applies, or
+    None if it applies to all scans.
+    """
 
     effect: str
     parameter: str
@@ -67,18 +75,19 @@ class Slot:
 
 @dataclass(frozen=True)
 class Added:
-    """An effect in a model.
+    """The parameters of an effect in a model.
 
-    ``by`` is the grouping in which its amplitudes differ, or ``all`` for one strength. ``values`` contains
-    its parameters by label, with ``""`` for all scans.
+    ``by`` is the grouping by which the amplitudes of the effect differ, or ``all`` if they are the same in
+    all scans. ``values`` contains the parameters of each group by the label of the group; the label is ``""``
+    if ``by`` is ``all``.
     """
 
     by: str
     values: Values
 
     def of(self, label: str | None) -> dict[str, float]:
-        """Return the parameters of a group; for a group that was never fitted, return the mean over the
-        fitted groups.
+        """Return the parameters of the group with this label. For a group that was not fitted, return the
+        mean over the fitted groups.
         """
         if label is not None and label in self.values:
             return dict(self.values[label])
@@ -88,14 +97,14 @@ class Added:
 
 @dataclass(frozen=True)
 class Twin:
-    """A base model and effects with their parameters. Fits change only ``vector``.
+    """A base model and effects with their parameters. A fit changes only the numbers in ``vector``.
 
     Attributes:
-        base: the model of the printer; its parameters are refitted if they are few.
-        numbers: fitted parameters of the base.
-        effects: the effects by name, in the order in which they were added.
-        frames: for each effect that does not use its default frame, the frame with which it rotates; see
-            ``EffectChain``.
+        base: the base model of the printer. Its parameters are refitted if there are few of them.
+        numbers: fitted parameters of the base; empty if the base is not refitted.
+        effects: the parameters of the effects by name, in the order in which the effects were added.
+        frames: for each effect that does not use its default frame, the frame with which it rotates (``scan``
+            or ``print``); see ``EffectChain``.
     """
 
     base: nn.Module
@@ -110,7 +119,7 @@ class Twin:
 
     @property
     def own(self) -> int:
-        """Return the number of fitted parameters of the base."""
+        """Return the number of fitted parameters of the base, which come first in ``vector``."""
         return len(self.numbers)
 
     @property
@@ -120,8 +129,8 @@ class Twin:
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """Return the fitted parameters of the effects, in the order in which they follow the parameters of
-        the base in ``vector``.
+        """Return the slots of the fitted effect parameters, in the order in which these parameters stand in
+        ``vector``, behind the parameters of the base.
         """
         return [
             Slot(name, key, label)
@@ -133,12 +142,14 @@ class Twin:
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """Return all fitted parameters, first those of the base."""
+        """Return all p fitted parameters: first those of the base, then those of the effects. The result has
+        shape (p,).
+        """
         of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
         return np.concatenate([self.numbers, of_slots])
 
     def at(self, vector: np.ndarray) -> Twin:
-        """Return the same twin with other parameters."""
+        """Return the same twin with the given values of all fitted parameters."""
         values = {name: {label: one.of(label) for label in one.values} for name, one in self.effects.items()}
         for slot, number in zip(self.slots, vector[self.own :].tolist(), strict=True):
             own = values[slot.effect]
@@ -148,45 +159,53 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """Return the twin with the base that was trained without this fold, if there is such a base."""
+        """If the base was trained once for each fold, return the twin with the base that was trained without
+        this fold. Otherwise, return the twin itself.
+        """
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
     def with_effect(self, name: str, by: str, values: Values) -> Twin:
-        """Add an effect with starting values by label (``""`` for all scans)."""
+        """Return the twin with a further effect, whose starting values are given by label (``""``
+        for all scans).
+        """
         return replace(self, effects={**self.effects, name: Added(by, values)})
 
     def without(self, name: str) -> Twin:
-        """Remove one effect."""
+        """Return the twin without the named effect."""
         return replace(self, effects={other: one for other, one in self.effects.items() if other != name})
 
     def ungrouped(self) -> Twin:
-        """Replace the strengths of groups by their mean, and sort parameters in the order in which effects
-        act.
+        """Return the twin with strengths that are the same in all scans: the means over the groups. Its
+        effects are in the order in which they act.
         """
         effects = {name: Added(ALL, {"": values}) for name, values in self.values().items()}
         return replace(self, effects=effects)
 
     def with_base_unfitted(self) -> Twin:
-        """Reset the base to its default values."""
+        """Return the twin with the default parameters of the base instead of the fitted ones."""
         if not (self.own and isinstance(self.base, Simulator)):
             return self
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
     def values(self, label_in: Mapping[str, str] = {}) -> dict[str, dict[str, float]]:
-        """Return the parameter values of all effects, in the order in which they act, for scans with these
-        labels; without labels, return mean strengths.
+        """Return the parameter values of all effects, in the order in which they act, for scans with the
+        given labels. For a grouping without a label, the mean over its groups is used.
+
+        Args:
+            label_in: label of the scans in each grouping, by the name of the grouping.
         """
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
-        """Return whether a parameter applies to this scan: it belongs to the scan's group or to all scans."""
+        """Return whether a parameter applies to this scan, because it applies to the group of the scan or to
+        all scans.
+        """
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Keep the strengths of the groups to which these scans belong.
-
-        Every other group gets the mean of the strengths that are kept.
+        """Return the twin with only those strengths that the given scans can determine. Strengths of the
+        groups to which the scans belong are kept, and every other group gets the mean of the kept strengths.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -200,7 +219,9 @@ class Twin:
 
     @cached_property
     def fitted_base(self) -> nn.Module:
-        """Return the base with its fitted parameters, as a copy if it has any."""
+        """Return the base with its fitted parameters. If there are such parameters, the result is a
+        copy of the base.
+        """
         if not self.own:
             return self.base
         base = copy.deepcopy(self.base)
@@ -208,8 +229,8 @@ class Twin:
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
-        """Return the chain of effects for one scan or, without a scan, with mean strengths; ``extra`` is a
-        further effect to try.
+        """Return the base and the effects as a chain for one scan. Without a scan, the chain has the mean
+        strengths over groups. ``extra`` contains the parameter values of a further effect to try.
         """
         base, labels = self.fitted_base, dict[str, str]()
         if scan is not None:
@@ -221,19 +242,20 @@ class Twin:
     def height(
         self, scan: PreparedScan, extra: Values | None = None, known: Fields | None = None
     ) -> np.ndarray:
-        """Return the predicted height of the print (y, x), µm.
+        """Return the predicted height of the print in a scan, µm, of shape (ny, nx).
 
         Args:
-            extra: a further effect to try.
-            known: fields of this scan that twins with the same base have already computed. New fields are
-                added.
+            scan: the scan.
+            extra: parameter values of a further effect to try, by its name.
+            known: cached fields of this scan that twins with the same base have already computed. Newly
+                computed fields are added to it.
         """
         chain, context = self.chain(scan, extra), scan.context
         return chain(context.layout_um, context, known, self.numbers.tobytes())[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Return the step of each parameter, (p,), for difference quotients. It is negative only near an
-        upper limit.
+        """Return the step of each parameter for difference quotients, of shape (p,). A step is negative only
+        if the parameter is near its upper bound.
         """
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
@@ -241,7 +263,9 @@ class Twin:
         return np.concatenate([5e-3 * np.maximum(np.abs(own), 0.2), effects])
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest and largest step (p,) that keep base and effects within their ranges."""
+        """Return the lowest and the highest step of each parameter that keep the parameters of base and
+        effects within their ranges. Both arrays have shape (p,).
+        """
         lower, upper, _ = self._ranges()
         own, effects = self.vector[: self.own], self.vector[self.own :]
         lowest, highest = parameter_room(self.base, own) if self.own else (own, own)
@@ -251,7 +275,9 @@ class Twin:
         )
 
     def _ranges(self) -> np.ndarray:
-        """Return the lower bound, upper bound and usual size of each effect parameter, (3, slots)."""
+        """Return the lower bound, the upper bound and the usual size of each effect parameter, of
+        shape (3, slots).
+        """
         known = [
             # A parameter that is usually zero, such as an angle, gets a tenth of its range as its usual size.
             (one.lower, one.upper, abs(one.typical - one.null) or 0.1 * (one.upper - one.lower))
@@ -260,20 +286,22 @@ class Twin:
         return np.array(known).reshape(-1, 3).T
 
     def free(self) -> np.ndarray:
-        """Return a mask (p,) that is True for parameters not on a bound."""
+        """Return a mask of shape (p,) that is True for parameters that are not on a bound."""
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
     def at_bounds(self) -> dict[str, float]:
-        """Return the fitted values of base and effects that lie on a bound, with that bound."""
+        """Return the names of the fitted parameters of base and effects that lie on a bound, each
+        with this bound.
+        """
         base = self.fitted_base
         found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def at_limits(self, name: str, kind: Kind) -> str:
-        """Return the names of an effect's amplitudes that lie on a limit of their range in some group,
-        separated by commas; for the kind ``shape``, those of its lengths, such as ranges and depths. The null
-        of an amplitude does not count as a limit.
+        """Return the names of the parameters of an effect that lie on a limit of their range in some group,
+        separated by commas. For the kind ``amplitude``, these are amplitudes, and the null of an amplitude
+        does not count as a limit. For the kind ``shape``, these are lengths, such as ranges and depths.
         """
         own = ((one.parameter, one.facts, bound) for one, bound in self._on_bounds() if one.effect == name)
         counted = (

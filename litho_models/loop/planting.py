@@ -1,4 +1,4 @@
-"""Plant an effect in copies of the scans and test whether the loop finds it."""
+"""Plant an effect in copies of the scans, and test whether the loop finds it there."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from litho_models.loop.record import Planted
 
 
 def parse_planted(text: str) -> tuple[Effect, float]:
-    """Parse ``NAME=AMOUNT`` into an effect and an amount, in the unit of the effect's first amplitude.
+    """Parse ``NAME=AMOUNT`` into an effect and the value of its first amplitude.
 
     Raises:
-        InputError: the text is not NAME=AMOUNT, the effect is unknown or per-scan, or the amount is not a
-            number.
+        InputError: the text is not NAME=AMOUNT, the effect is unknown or a per-scan effect, or the amount is
+            not a number or lies outside the physical range of the amplitude.
     """
     name, separator, number = text.partition("=")
     effect = get_effect(name.strip())
@@ -40,12 +40,12 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 def plant(
     effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> Planted:
-    """Plant an effect in copies of the scans, run a new loop on the copies, and return what it finds.
+    """Plant an effect in copies of the scans, run the loop again on these copies, and return what it finds.
 
     Args:
-        effect, amount: results of ``parse_planted``.
+        effect, amount: the effect and the value of its first amplitude, as ``parse_planted`` returns them.
         closed: result of the loop on the original scans.
-        close_again: function that runs the same loop on other scans.
+        close_again: function that runs the same loop on the scans that it receives.
     """
     amplitude = effect.amplitudes[0]
     values = {effect.name: {**effect.off_values(), amplitude: amount}}

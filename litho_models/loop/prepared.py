@@ -1,4 +1,6 @@
-"""Prepare scans for the loop: convert them to tensors, sample pixels, and find positions."""
+"""Prepare scans for the loop: convert their layouts to tensors, choose the pixels for fits, and find the
+position of each scan in the write field and in the writing order.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +20,23 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# If a scan has at least this size, fits and screening use only one of its quadrants, with a margin.
+# If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan,
+# with a margin.
 LARGE_PX = 400
 
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """One scan that is ready to be predicted and compared.
+    """A scan with the data that are needed to predict it and to compare it with predictions.
 
     Attributes:
         stored: the scan in the store.
-        context: the position and exposed layout of the scan, which the effects use.
-        sample: flat indices of the pixels that fits and screening use: a thinned selection away from the
-            edge.
-        height: measured height at ``sample``, float64 µm.
-        line: index of the scan line under each pixel (y, x).
-        quadrant: part of a large scan that fits and screening use; see ``window``.
+        context: the exposed layout, the position and other facts about the scan, which effects use.
+        sample: flat indices of the n pixels that fits and screening use. They are a thinned selection of the
+            measured pixels away from the edge.
+        height: measured height at ``sample``, µm, float64, of shape (n,).
+        line: index of the scan line of each pixel, of shape (ny, nx).
+        quadrant: for a large scan, the part that fits and screening use; see ``window``.
     """
 
     stored: PrintedScan
@@ -45,7 +48,7 @@ class PreparedScan:
 
     @cached_property
     def usable(self) -> np.ndarray:
-        """Return a mask (y, x) of the measured pixels, which are scored."""
+        """Return a mask of the measured pixels, which are scored, of shape (ny, nx)."""
         return self.stored.usable
 
     @property
@@ -57,21 +60,24 @@ class PreparedScan:
         return self.quadrant or self
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
-        """Return the values of a (…, y, x) map at the sampled pixels, float64."""
+        """Return the values of a map of shape (…, ny, nx) at the sampled pixels, as float64."""
         flat = field_map.detach().cpu().numpy() if isinstance(field_map, Tensor) else field_map
         return flat.reshape(-1)[self.sample].astype(np.float64)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
-        """Return smooth scan terms at the sampled pixels, (k, n)."""
+        """Return the smooth maps of the named scan terms at the sampled pixels, of shape (k, n)."""
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
     def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
-        """Return an orthonormal basis (n, k) of the scan's free terms for a predicted height (y, x), µm."""
+        """Return an orthonormal basis of the named scan terms at the sampled pixels, of shape (n, k). The
+        terms are computed for a predicted height of shape (ny, nx), µm.
+        """
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
 
 def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
-    """Prepare all scans of a store. Positions in the writing order are scaled to the range of these scans.
+    """Prepare all scans of a store. Positions in the writing order are scaled so that these scans span -0.5
+    to 0.5.
 
     Raises:
         InputError: there is no scan.
@@ -84,8 +90,8 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans. Their positions in the writing order are interpolated between those of known
-    scans.
+    """Prepare further scans. Their scaled positions in the writing order are interpolated between those of
+    the scans ``known``, so that both are on the same scale.
     """
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
@@ -99,7 +105,7 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
     dose = 1.0 if scan.dose is None else float(scan.dose)
-    # Exposure is level times dose, so a smaller dose acts like a lower layout.
+    # The exposure is the nominal height times the dose, so a smaller dose acts like a lower layout.
     layout = torch.from_numpy(scan.layout_um * np.float32(dose))[None, None]
     write = scan.write or {}
     line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
@@ -122,8 +128,8 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
-    """Give large scans a window. Successive scans use different quadrants, which together cover the whole
-    field.
+    """If a scan is large, choose the quadrant that fits and screening use. Successive scans use different
+    quadrants, so that together they cover the whole field.
     """
     shape, pitch = scan.stored.shape, scan.stored.pitch_um
     if min(shape) < LARGE_PX:
@@ -156,7 +162,9 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
 
 
 def _half(size: int, second: bool) -> tuple[slice, slice]:
-    """Return one half of an axis, with and without a margin of 48 pixels towards the other half."""
+    """Return one half of an axis as two slices: first with a margin of 48 pixels into the other
+    half, then without it.
+    """
     middle = size // 2
     if second:
         return slice(middle - 48, size), slice(middle, middle + size // 2)
@@ -164,11 +172,10 @@ def _half(size: int, second: bool) -> tuple[slice, slice]:
 
 
 def sample_border_px(size: int) -> int:
-    """Return the number of unsampled pixels at each end of an axis; ``size`` is the length of the shortest
-    axis.
+    """Return the number of pixels at each end of an axis that fits leave out, because the neighbourhood of
+    these pixels extends beyond the layout. ``size`` is the length of the shorter axis.
 
-    The neighbourhood of these pixels extends beyond the layout. Errors are scored on all pixels, as in the
-    benchmark (``Blocks.border_px``).
+    Errors are nevertheless scored on all pixels, as in the benchmark (``NuisanceProtocol.border_px``).
     """
     return min(8, size // 8)
 
@@ -179,6 +186,6 @@ def _inner(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _thinned(scan: PrintedScan, context: FieldContext, sampled: np.ndarray, line: LineIndex) -> PreparedScan:
-    # Residuals correlate over about 5 px, so denser sampling would add little information.
+    # Residuals are correlated over about 5 px, so more pixels would add little information.
     sample = thinned(sampled, 16384)
     return PreparedScan(scan, context, sample, scan.height_um.reshape(-1)[sample].astype(np.float64), line)

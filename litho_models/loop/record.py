@@ -1,4 +1,6 @@
-"""The record of a loop, ``close_loop.json`` (schema 4), from which the report and its tables are made."""
+"""The record of a loop, which is the file ``close_loop.json`` (schema 4). The report and its tables
+are made from it.
+"""
 
 from __future__ import annotations
 
@@ -34,21 +36,25 @@ MeasuredBy = Literal["print alone", "published", "shared"]
 
 
 class ErrorRow(Record):
-    """Error of one model on held-out scans.
+    """The error of one model on held-out scans.
 
     Attributes:
         model: ``base`` for the base model, ``causes`` for the base model with the causes that were found, or
             ``all`` for the corrected model.
         measurement: what was added to the predicted print. ``print alone`` adds nothing, ``published`` adds
             the smooth background of the training scans (the published protocol), and ``shared`` adds the
-            whole measurement model.
-        policy: the ``k`` terms fitted to each scan, on pixels that are not scored.
+            changes of the whole measurement model.
+        policy: name of the set of terms that were fitted to each scan, on pixels that are not scored.
+        k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
-            all choices were also made without the held-out scans.
-        printer_numbers: number of fitted parameters of the model.
+            not only the fit but also all choices were made without the held-out scans.
+        printer_numbers: number of fitted parameters of the printer model.
         measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
             number is largest.
-        edge_by_scan_nm: mean distance of the edges, for films.
+        mae_nm, rmse_nm: mean absolute error and root mean square error.
+        mae_ci95_nm: 95 % confidence interval of the mean absolute error over scans.
+        by_scan_nm: mean absolute error of each scan, by its id.
+        edge_by_scan_nm: for films, the mean distance between measured and predicted edges of each scan.
     """
 
     model: Stage
@@ -66,21 +72,22 @@ class ErrorRow(Record):
 
     @property
     def leading_by_scan_nm(self) -> dict[str, float]:
-        """Return the leading error by scan, which is the error of the edges for films and the error of the
+        """Return the main error of each scan. It is the error of the edges for films, and the error of the
         heights for all other prints.
         """
         return self.edge_by_scan_nm or self.by_scan_nm
 
     @property
     def leading_nm(self) -> float:
-        """Return the mean of the leading error over scans."""
+        """Return the mean of the main error over scans."""
         return sum(self.leading_by_scan_nm.values()) / len(self.leading_by_scan_nm)
 
     @property
     def is_headline(self) -> bool:
-        """Return whether this is the headline error.
+        """Return whether this row is the headline error of its model, which is the error that the report
+        shows first.
 
-        The headline error is computed with k = 1 (for films with k = 0), with the shared measurement model
+        The headline error is computed with k = 1 (for films with k = 0), with the shared measurement model,
         and on held-out folds of scans.
         """
         usual = usual_policy(bool(self.edge_by_scan_nm))
@@ -88,8 +95,8 @@ class ErrorRow(Record):
 
 
 class Strength(Record):
-    """A fitted parameter for one label, with its confidence interval over prints, or over scans if no prints
-    are known.
+    """The fitted value of a parameter for one group of scans, with its 95 % confidence interval. ``label`` is
+    the label of the group; it is empty if the value holds for all scans.
     """
 
     label: str
@@ -102,17 +109,23 @@ class FoundEffect(Record):
     """An effect, law or table that was added to the model.
 
     Attributes:
-        by: the grouping by which the strength differs, or ``all`` if all scans have the same strength.
-        strengths: fitted values of each parameter.
-        gain_nm2: decrease of the squared error of held-out scans when the effect is added to everything else
-            in the model. The error is computed on the fitted pixels, after seven terms and an affine
-            registration error have been removed from each scan.
-        left_out_nm: increase of the mean absolute error if the effect is left out (k = 1).
+        by: the grouping by which the strength of the effect differs, or ``all`` if it is the same in all
+        scans.
+        strengths: fitted values of each parameter, by the name of the parameter.
+        confusable_with: other effects that look the same in these scans.
+        separating_experiment: experiments that would distinguish these effects.
+        gain_nm2: decrease of the squared error of held-out scans when the effect is added to all other
+            effects in the model. The error is computed on the pixels that fits use, after seven terms and an
+            affine registration error have been subtracted from each scan.
+        before_nm2: the same squared error without the effect.
+        scans_improved: number of held-out scans whose error falls, and number of all scans.
+        p_confirm: p value of the test that held-out scans confirm the effect.
         family_p: p value of the effect in the screening of all candidates.
-        group_p: p value of the grouping, from permuted labels.
-        reshaped_share: further gain if variants of the effect's change were added to the model, divided by
-            the gain of the effect itself.
-        survives_on: other bases with which the search also found the effect.
+        group_p: p value of the grouping, from permuted labels; None if the strength does not differ by group.
+        reshaped_share: further gain if variants of the change that the effect makes were added to the model,
+            divided by the gain of the effect itself.
+        left_out_nm: increase of the mean absolute error (k = 1) if the effect is removed from the model.
+        survives_on: other base models with which the search also found the effect.
     """
 
     name: str
@@ -137,7 +150,7 @@ class FoundEffect(Record):
 
 
 class Candidate(Record):
-    """An effect that was not added, with the reason."""
+    """An effect that was not added to the model, with the reason."""
 
     name: str
     verdict: CandidateVerdict
@@ -147,14 +160,14 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """A per-scan term, or a mark found in single scans, that is not part of any model.
+    """What single scans show about a per-scan term or about a mark, such as a scar. No model contains them.
 
     Attributes:
-        seen: whether the term or mark was found.
+        seen: whether the scans show the term or mark.
         evidence: the evidence, in words.
         p: p value of the test.
-        spread: standard deviation of each parameter over scans.
-        confusable_with: effects that look the same in these scans.
+        spread: standard deviation over scans of each parameter, by the name of the parameter.
+        confusable_with: other effects that look the same in these scans.
     """
 
     name: str
@@ -168,7 +181,7 @@ class ScanFinding(Record):
 
     @classmethod
     def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
-        """Make a finding, by default with the title and role that the catalogue states."""
+        """Make a finding. Its title and role are those in the catalogue, unless ``facts`` contains others."""
         effect = CATALOGUE.get(name)
         role = effect.role if effect else "measurement"
         known = {"title": effect.title if effect else name, "role": role, **facts}
@@ -176,11 +189,12 @@ class ScanFinding(Record):
 
 
 class Planted(Record):
-    """An effect planted in copies of the scans, and what the loop found in these copies.
+    """An effect that was planted in copies of the scans, and what the loop found in these copies.
 
-    ``rms_nm`` is the rms of the change that the planted effect makes, after the free terms of each scan are
-    removed. ``named`` is the reported set of effects that contains the planted effect; it is empty if no set
-    contains it. ``found`` is the fitted amount.
+    ``amount`` is the planted strength. ``rms_nm`` is the rms of the change that the planted effect makes,
+    after the free terms of each scan are fitted to it and subtracted. ``named`` is the set of
+    indistinguishable effects that contains the planted effect; it is empty if the loop found no such set.
+    ``found`` is the fitted strength; it is None if the effect is not in the model.
     """
 
     name: str
@@ -192,8 +206,9 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """How much of the squared error on held-out scans (nm²) can still be explained by features of the layout
-    and of the position. ``matters`` says whether this part is larger than expected by chance.
+    """The squared error on held-out scans after one stage of the loop, and the part of it that features of
+    the layout and of the position can still explain, both in nm². ``matters`` is True if this part is
+    significant and exceeds 1 % of the error.
     """
 
     stage: str
@@ -203,12 +218,12 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """A comparison of two answers on new prints.
+    """A comparison of two answers to a question on new prints.
 
-    ``gain_nm2`` and ``z`` say how much better the first answer fits, in nm² and in standard deviations.
-
-    ``z`` allows for an error in the form of the model. ``difference_nm`` is the rms difference of
-    the two predictions.
+    ``better`` is the answer that fits better, and ``worse`` is the other answer. ``gain_nm2`` is the
+    difference of their squared errors. ``z`` is this difference in standard deviations, after an allowance
+    for an error in the form of the model is subtracted. ``difference_nm`` is the rms difference of the two
+    predictions.
     """
 
     better: str
@@ -219,10 +234,11 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """The state of an open question after new prints.
+    """What new prints say about an open question.
 
-    ``declared`` lists the answers that were declared before the prints, and ``left`` lists the answers that
-    remain.
+    ``declared`` lists the possible answers, which were stated before these prints were made, and ``left``
+    lists the answers that are still possible. ``prints`` and ``scans`` are the numbers of new prints and
+    scans.
     """
 
     question: str
@@ -240,12 +256,12 @@ class CloseLoop(Result):
     """The record of a loop.
 
     Attributes:
-        errors: see ``ErrorRow``.
-        gain_nm: the error of the base model minus the error of the corrected model, at k = 1 and with the
-            shared measurement model. ``over_scans`` and ``over_prints`` contain its confidence intervals.
-        confounded: pairs of parameters that these scans cannot determine separately, with the correlation of
-            each pair.
-        decisions: open questions of this store to which the prints of further stores were applied.
+        errors: the errors of all models on held-out scans.
+        gain_nm: the headline error of the base model minus that of the corrected model (see
+            ``ErrorRow.is_headline``). ``over_scans`` and ``over_prints`` contain its confidence intervals.
+        confounded: pairs of parameters that these scans cannot determine separately, each with the
+            correlation of the two parameters.
+        decisions: decisions on open questions of this store, made with the prints of further stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -282,9 +298,9 @@ class CloseLoop(Result):
         measurement: MeasuredBy = "shared",
         held_out: str = "scans",
     ) -> ErrorRow | None:
-        """Return the row of the errors with these properties, or None if this error was not computed.
+        """Return the error with the given properties, or None if this error was not computed.
 
-        The default policy is the usual one.
+        By default, ``policy`` is the usual policy: one offset for each scan, or none for films.
         """
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out

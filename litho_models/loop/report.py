@@ -1,4 +1,4 @@
-"""Draw the report of a loop from its record."""
+"""Write the report of a loop from its record."""
 
 from __future__ import annotations
 
@@ -17,11 +17,15 @@ Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     """Write ``report.html`` and its tables.
 
-    ``maps`` contains the name and the residuals (y, x), nm, of each scan, before and after the correction.
+    Args:
+        result: the record of the loop.
+        maps: for each scan, its name and its residual maps before and after the correction, nm, of shape (ny,
+        nx).
+        folder: folder for the files.
     """
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",
-        "From the residual on held-out scans to causes, laws and a corrected model.",
+        "Causes and empirical laws in the residual on held-out scans, and errors of the corrected model.",
         run=result.run,
         facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
         words=Path(__file__).with_name("words.toml"),
@@ -51,7 +55,8 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.table(result.effects, "Effects added to the model.", "effects.csv", columns=columns)
         page.table(
             [row for one in result.effects for row in _strength_rows(one)],
-            "Fitted strengths with 95 % confidence intervals, from the scatter over prints (or scans).",
+            "Fitted parameters of these effects, with 95 % confidence intervals from the scatter over prints "
+            "(or over scans, if there are too few prints).",
             "strengths.csv",
             digits=3,
         )
@@ -62,14 +67,15 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     _residuals(page, maps)
     page.table(
         result.explained,
-        "The part of the squared error on held-out scans that can still be explained by a ridge regression "
-        "on features of the layout and of the position.",
+        "Squared error on held-out scans after each stage of the loop, and the part of it that a ridge "
+        "regression on features of the layout and of the position can still explain.",
         "explained.csv",
     )
     page.heading("All errors")
     page.table(
         [row.model_dump(exclude={"by_scan_nm", "edge_by_scan_nm"}) for row in result.errors],
-        "Each row names its model, measurement model and scan terms. All rows are computed in the same way.",
+        "Each row states its model, its measurement model and the terms fitted to each scan. All rows are "
+        "computed in the same way.",
         "errors.csv",
     )
     page.heading("Measurement errors that scans share", folded=True)
@@ -77,15 +83,21 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     page.heading("Terms that differ from scan to scan", folded=True)
     page.table(
         [one.model_dump() | {"spread": said("spread", one)} for one in result.single_scans],
-        "No model contains these terms. The spread is the standard deviation over scans.",
+        "These terms differ from scan to scan, so no model contains them. The spread is the standard "
+        "deviation over scans.",
         "single_scans.csv",
     )
     if result.planted:
         page.heading("What was planted in copies of the scans")
-        page.table(result.planted, "Whether the loop names each planted effect.", "planted.csv", digits=3)
+        page.table(
+            result.planted,
+            "Effects that were planted in copies of the scans, and what the loop found in these copies.",
+            "planted.csv",
+            digits=3,
+        )
     if result.confounded:
         page.paragraph(
-            "The parameters in each of these pairs cannot be determined separately from these scans: "
+            "These scans cannot determine the two parameters of each of the following pairs separately: "
             f"{'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
         )
     page.heading("Every other candidate", folded=True)
@@ -94,7 +106,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
 
 
 def said(about: str, one: object) -> str:
-    """Return the text of a macro: ``verdict`` (of a result), ``effect``, ``decision``, ``measurement``, …"""
+    """Return the text that a macro of ``sentences.jinja`` makes for an object. ``about`` is the name of the
+    macro, such as ``verdict`` (for a result), ``effect``, ``decision`` or ``measurement``.
+    """
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 
@@ -107,7 +121,12 @@ def _residuals(page: Page, maps: Maps) -> None:
         errors = " → ".join(f"{np.nanmean(np.abs(own)):.1f}" for own in pair)
         shown = [coloured_png(thumbnail(own), "RdBu_r", -limit_nm, limit_nm) for own in pair]
         rows.append((f"{name}: {errors} nm", shown))
-    page.gallery(titles, rows, "Measured minus expected height, with the mean absolute error of each map.")
+    page.gallery(
+        titles,
+        rows,
+        "Measured minus expected height of each scan, before and after the correction of the model. The "
+        "numbers are the mean absolute errors of the two maps.",
+    )
 
 
 def _strength_rows(one: FoundEffect) -> list[dict[str, object]]:

@@ -1,5 +1,5 @@
-"""Make the record of a loop, with errors, strengths, confidence intervals, and the reasons why effects were
-rejected.
+"""Make the record of a loop, which states errors, the strengths of effects with confidence intervals, and the
+reasons why the other effects were rejected.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ def record(
     left_out_nm: Mapping[str, float],
     **given: Any,
 ) -> CloseLoop:
-    """Make the record of one run.
+    """Make the record of one run of the loop.
 
     Args:
-        closed: result of ``close``.
-        errors: rows of ``error_rows``.
-        single_scans: findings in single scans.
-        left_out_nm: the value of ``FoundEffect.left_out_nm`` for each effect.
-        given: further fields of the record.
+        closed: the loop, as returned by ``close``.
+        errors: the errors of all models, as returned by ``HeldOut.errors``.
+        single_scans: terms and marks found in single scans.
+        left_out_nm: the value of ``FoundEffect.left_out_nm`` for each effect, by its name.
+        given: the remaining fields of the record.
     """
     study, final = closed.study, closed.final.twin
     effects = [_found(closed, one, left_out_nm[one.name]) for one in closed.found]
@@ -101,7 +101,9 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted physical values of the base model by name; an unfitted base model has none."""
+    """Return the fitted values of the parameters of the base model by name, in physical units if these are
+    known. The result is empty if the base model was not fitted.
+    """
     base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
         return {}
@@ -120,7 +122,8 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     effect, judgement = get_effect(cause.name), cause.judgement
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
-    # If another base does not need a cause, this cause may only correct an error of the chosen base.
+    # If the search with another base does not find a cause, the cause may only correct an error of the chosen
+    # base.
     corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
     return FoundEffect(
@@ -147,7 +150,9 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Return an effect's fitted values, with confidence intervals from the scatter over prints (or scans)."""
+    """Return the fitted values of the parameters of an effect, with confidence intervals from the scatter
+    over prints (or over scans, if there are too few prints).
+    """
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
     reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
@@ -164,19 +169,19 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """Return the independent unit of each scan for confidence intervals: its print, or the scan itself if
-    there are too few prints.
+    """Return the name of the unit to which each scan belongs. Confidence intervals treat these units as
+    independent. A unit is a print, or a single scan if there are too few prints.
     """
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
 
 
 def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
-    """Return the cluster-robust covariance (p, p) of fitted parameters.
+    """Return the cluster-robust covariance of the p fitted parameters, of shape (p, p).
 
     Args:
-        linear: derivatives of each window at the optimum.
-        units: print or scan of each window.
+        linear: the linearised problem of each scan at the optimum.
+        units: the cluster (print or scan) to which each scan belongs.
     """
     parts = [eliminated(part, RULES.term_weight) for part in linear]
     normal = np.sum([part[0] for part in parts], axis=0)
@@ -189,7 +194,9 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 
 
 def confounded(state: State) -> list[tuple[str, str, float]]:
-    """Return the pairs of parameters that these scans cannot determine separately, with their correlation."""
+    """Return the pairs of fitted parameters that the scans cannot determine separately, each with the
+    correlation of the two parameters. These are the pairs with an absolute correlation of at least 0.95.
+    """
     twin = state.twin
     normal = eliminated_sum(state.linear, RULES.term_weight)[0]
     free = np.flatnonzero(np.diag(normal) > 0)
@@ -205,9 +212,12 @@ def confounded(state: State) -> list[tuple[str, str, float]]:
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
-    """Explain for every other effect why it was not added.
+    """State for every effect that was not added why it was not.
 
-    Per-scan effects (``seen``) are listed elsewhere.
+    Args:
+        closed: the loop.
+        added: the effects that were added.
+        seen: names of the per-scan effects, which the record lists elsewhere.
     """
     named, films, count = closed.named, closed.study.of_films, len(closed.study.scans)
     sets = {other: one.name for one in added for other in one.confusable_with}
@@ -229,12 +239,12 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
             few = f"{count} scans are too few: at least {FEWEST_SCANS} are needed to confirm it"
             return "too-few-scans", few
         if last.beside_base < SMALLEST_RETAINED:
-            return "not-testable", "on these layouts it cannot be distinguished from per-scan terms"
+            return "not-testable", "its change on these layouts cannot be distinguished from per-scan terms"
         if last.retained < max(0.01 * last.beside_base, SMALLEST_RETAINED):
-            return "absorbed", "a change of the base's parameters has the same effect"
+            return "absorbed", "a change of the parameters of the base model has the same effect"
         if not last.allowed and named.first[name].family_p <= FAMILY_P:
             return "contradicted", "its best-fitting strength has the wrong sign"
-        gained = f"it removes only {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²"
+        gained = f"it removes only {last.gain_nm2:.1f} of {named.state.mse_nm2:.0f} nm² of the squared error"
         return "below-noise", reason or gained
 
     return [

@@ -1,4 +1,4 @@
-"""Run the loop on a store, and write the record, the report, the tables and the corrected model."""
+"""Run the loop on a dataset store, and write its record, its report with tables, and the corrected model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
 Nested = Literal["folds", "prints"]
-# A function that maps a closed loop and its record to the record to write, and to further records.
+# A function that receives a closed loop and its record, and returns the record to write and a list of further
+# records to write.
 Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
 
 
@@ -58,34 +59,35 @@ def close_loop(
     decided_by: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
-    """Close the loop on a dataset store and write the result to ``out``.
-
-    The folder ``out`` appears only when the result is complete.
+    """Close the loop on a dataset store: find the effects that a base model lacks, and write the corrected
+    model and the record to the folder ``out``. This folder appears only when the result is complete.
 
     Args:
-        store: a store made by ``litho-data build``.
-        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto``, which lets small
-            models compete.
-        base_settings: fields of the config of a small base, such as ``{"spot.sigma_um": 0.3}``.
-        folds: number of folds; each scan is predicted by fits that have not used its fold.
-        nested: ``folds`` or ``prints`` to repeat all choices without each fold, or without each print, and to
-            judge the choices on the fold or print that was left out.
-        inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to see
+        store: folder of a store made by ``litho-data build``.
+        out: folder of the result.
+        base: the base model to correct: the name of a model, a frozen model (its folder or ``zoo:NAME``), or
+            ``auto``, which tries several small models and chooses one of them.
+        base_settings: settings of a small base model, such as ``{"spot.sigma_um": 0.3}``.
+        folds: number of folds. Each scan is predicted by models that were fitted without the scans of its
+            fold.
+        nested: ``folds`` (or ``prints``) to repeat all choices once without each fold (or print), and to
+            judge these choices on the fold (or print) that was left out.
+        inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to test
             whether the loop finds it.
-        open_lock_box: whether to score the locked scans, too.
-        steps: number of optimiser steps of a network; by default the number in its recipe. For each fold, a
-            network is trained without the scans of this fold.
+        open_lock_box: whether to score the corrected model also on the locked scans.
+        steps: number of optimiser steps if the base is a network; by default the number in its recipe. For
+            each fold, a network is trained without the scans of this fold.
         cache: folder in which trained networks are kept; by default a folder beside ``out``.
-        seed: seed of folds, calibration blocks and permutations.
+        seed: seed of the folds, the calibration blocks and the permutations.
         workers: number of local processes.
         dask: address of a Dask scheduler to use instead of local processes.
-        further: function that is called before anything is written.
+        further: function that may change the record, or return further records, before anything is written.
         decided_by: hashes of the further stores that the function ``further`` uses.
         report: function that receives the progress messages.
 
     Raises:
-        InputError: there is no store, the base is unknown, too few scans are usable, or ``nested`` is set
-            with a base that the loop does not refit.
+        InputError: there is no store, the base is unknown, fewer than two scans are usable, or ``nested`` is
+            set although the loop does not refit the base.
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
@@ -149,10 +151,10 @@ def close_loop(
 
 
 def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
-    """Return development scans, locked scans, and excluded scans with reasons.
+    """Return the scans for development, the locked scans, and a list of excluded scans, each with the reason.
 
     Raises:
-        InputError: there are fewer than two development scans.
+        InputError: there are fewer than two scans for development.
     """
     scans = store.scans()
     dropped = [scan.id for scan in scans if np.count_nonzero(scan.usable) < 1024]
@@ -168,8 +170,8 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
-    """Repeat all choices without each fold (or print), and judge them on the fold (or print) that was left
-    out.
+    """Repeat all choices once without each fold (or print), and judge these choices on the fold (or print)
+    that was left out. Return the errors on all scans.
     """
     scans = study.stored
     ids = [scan.id for scan in scans]
@@ -189,8 +191,8 @@ def _nested(
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
-    """Return the rounding step of the heights in the raw file of each scan; None if the store has no raw
-    files.
+    """Return the step to which the heights in the raw file of each scan are rounded, µm, by scan id; None if
+    the store has no raw files.
     """
     try:
         return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
@@ -199,7 +201,7 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
 
 
 def save_laws(result: CloseLoop, folder: Path) -> None:
-    """Write a module that registers the laws as effects, if there are any."""
+    """If laws were found, write a Python module that registers these laws as effects."""
     laws = [one for one in result.effects if one.knowledge == "law"]
     if not laws:
         return
@@ -208,7 +210,9 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
-    """Save the corrected model of the printer, with the strengths of the latest scan."""
+    """Save the corrected model as a frozen model. If strengths differ by group, those of the latest
+    scan are used.
+    """
     base = closed.final.twin.fitted_base
     base = base.common if isinstance(base, FoldedBase) else base
     assert isinstance(base, Simulator)

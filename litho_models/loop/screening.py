@@ -1,8 +1,9 @@
-"""Predict the held-out gain of every candidate from its derivative at the current model.
+"""Predict how much every candidate effect would gain on held-out scans, without fitting it.
 
-A candidate is a set of columns. The columns are either secants of an effect at some of its parameters, or
-maps along a covariate. The strength of a candidate is common to all scans or differs by group. The
-computation needs only inner products from each scan.
+Each parameter set that is tried for an effect gives a column: the change (secant) that the effect with these
+parameters makes to the predictions of the current model. The gain is predicted by a linear regression of the
+residual on the columns of the effect. The strength of an effect is the same in all scans or differs by group.
+The computation needs only the inner products between residual and columns of each scan.
 """
 
 from __future__ import annotations
@@ -26,19 +27,22 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
-# A test is valid only if the projections leave at least this share of a direction's information.
+# The scan terms and the model's own parameters are projected out of each column. A test is valid only if at
+# least this share of the squared norm of the column remains.
 SMALLEST_RETAINED = 1e-5
-# A candidate is fitted if its predicted gain reaches this share of the smallest useful gain. Derivatives
-# predict the gain of a fit only to within a factor of three.
+# A candidate is fitted if its predicted gain reaches this share of the smallest useful gain. The share is
+# below 1 because the gain of a fit is predicted only to within a factor of three.
 WORTH_FITTING = 0.3
+# Number of random permutations of the scans by which groupings are tested.
 PERMUTATIONS = 199
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect with the same shape and size; their amplitudes are fitted together.
+    """Parameter sets of one effect that differ only in which amplitudes are switched on. All of them have the
+    same values of the shapes, and their strengths are fitted together.
 
-    ``columns`` are the indices of the trial's changes among the changes of all trials.
+    ``columns`` contains the column numbers of these parameter sets among the columns of all trials.
     """
 
     effect: Effect
@@ -47,24 +51,24 @@ class Trial:
 
     @cached_property
     def _facts(self) -> np.ndarray:
-        """Return the null value, the lowest value and the highest value of each amplitude, and the usual
-        distance of the amplitude from the null value.
+        """Return the null value, the lowest value and the highest value of each amplitude, and its usual
+        distance from the null value. The result has shape (4, amplitudes).
         """
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """Return the distance of each amplitude from its null value, (…, amplitudes), after the parameter
-        sets are scaled by ``multiples`` (…, sets).
+        """Return the distance of each amplitude from its null value, of shape (…, amplitudes), after the
+        parameter sets are multiplied by ``multiples``, which has shape (…, sets).
         """
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
         """Return whether every amplitude lies on the allowed side of its null value after the parameter sets
-        are scaled by ``multiples`` (…, sets).
+        are multiplied by ``multiples``, which has shape (…, sets).
 
-        An amplitude with the wrong sign counts as noise and is ignored if it is small relative to the largest
-        amplitude of any group.
+        An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude of
+        all groups.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -72,9 +76,10 @@ class Trial:
         return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
-        """Return the largest share of the step that keeps all amplitudes within their ranges.
+        """Return the largest factor, at most 1, by which all steps can be multiplied so that the amplitudes
+        stay within their ranges.
 
-        A full step may leave the ranges, because it is a linear extrapolation.
+        The full steps may lead out of the ranges, because they are linear extrapolations.
         """
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
@@ -82,8 +87,8 @@ class Trial:
         return float(np.min(room[beyond] / steps[beyond], initial=1.0))
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
-        """Return the starting values of a fit. No value is farther from the null value than in the largest
-        trial.
+        """Return the parameter values from which a fit starts. No amplitude is farther from its null value
+        than in the trial with its largest value.
         """
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
@@ -94,18 +99,19 @@ class Trial:
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """Return the distance of each amplitude from its null value in each parameter set, (sets, amplitudes)."""
+    """Return the distance of each amplitude from its null value in each parameter set, of shape
+    (sets, amplitudes).
+    """
     nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
 
 
 def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
-    """Group the parameter sets of the effects into trials by shape and size.
+    """Combine the parameter sets of the effects into trials. The columns are numbered from ``first``.
 
-    Columns are numbered from ``first``.
-
-    The same amplitudes may be tried with the same shape at two sizes, because the change that a large effect
-    makes need not be a multiple of the change that a small effect makes.
+    The sets of a trial have the same values of the shapes. If the same amplitudes are tried at two sizes, the
+    sizes belong to different trials, because the change that a large effect makes need not be a multiple of
+    the change that a small effect makes.
     """
     found: list[Trial] = []
     for effect in effects:
@@ -123,10 +129,12 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
 
 
 class Secants:
-    """Compute and cache how trials change the windows at a given model.
+    """Compute the changes that trials make to the predictions of a given model in all windows, and cache
+    these changes.
 
     Attributes:
-        free_terms: orthonormal basis (n, k) of the free terms of each window.
+        free_terms: orthonormal basis of the free terms at the n sampled pixels of each window, of shape (n,
+            k).
     """
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
@@ -140,7 +148,9 @@ class Secants:
         self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
 
     def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
-        """Return the changes (n,), µm, that each set of each trial makes in each window."""
+        """Return for each window the changes that the parameter sets of all trials make, µm, each
+        of shape (n,).
+        """
         rows = []
         for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
             key = effect.name, *values.items()
@@ -159,23 +169,23 @@ class Secants:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A trial, the grouping of its strength, and the gain that is predicted for held-out scans.
+    """A trial with the grouping of its strength, and the gain that is predicted for held-out scans.
 
     Attributes:
-        trial: the parameters that were tried.
+        trial: the parameter sets that were tried.
         by: the grouping by which the strength differs.
-        gains_nm2: decrease of the squared error of each scan, (scans,). The strengths are fitted without the
-            fold of this scan.
-        multiples: for each label, the factors by which the amplitudes of the trial are multiplied; they are
-            fitted to all scans.
-        allowed: whether the strengths have a physical sign.
-        retained: share of the information that remains after both the scan terms and the model's own
-            parameters are projected out.
-        beside_base: share of the information that remains if the scan terms alone are projected out.
-        family_p: share of the sign flips of the scans in which at least one candidate gains as much as this
-            one.
-        group_p: share of the permutations of the scans in which at least one grouping gains as much as this
-            one; None if no grouping was tested.
+        gains_nm2: predicted decrease of the squared error of each scan, of shape (scans,), with strengths
+            that are fitted without the fold of this scan.
+        multiples: for each label, the factors by which the parameter sets of the trial are multiplied. They
+            are fitted to all scans.
+        allowed: whether the amplitudes have signs that are physically possible.
+        retained: share of the squared norm of the columns that remains after the scan terms and the model's
+            own parameters are projected out.
+        beside_base: the same share if only the scan terms are projected out.
+        family_p: p value of the candidate: the share of random sign flips of the scans after which at least
+            one candidate gains as much as this one.
+        group_p: p value of the grouping: the share of random permutations of the scans after which at least
+            one grouping gains as much as this one. None if no grouping was tested.
     """
 
     trial: Trial
@@ -207,13 +217,15 @@ class Screened:
 
 
 class Screening:
-    """The secants of all trials, and their inner products with the residual of a fitted model.
+    """Screen candidate effects against the residual of a fitted model.
 
     Args:
-        state: the current model.
-        effects: candidates that the model does not contain.
-        secants: secants at a similar model; by default they are taken at the current model.
-        beside_own: whether the model's own parameters are projected out of the candidates.
+        state: the fitted model.
+        effects: the candidates, none of which is in the model.
+        secants: changes that the candidates make to the predictions of a similar model; by default, they are
+            computed for the fitted model.
+        beside_own: whether the changes that the model's own parameters can make are projected out of the
+            columns.
     """
 
     def __init__(
@@ -242,7 +254,7 @@ class Screening:
 
     @cached_property
     def candidates(self) -> dict[str, dict[str, Screened]]:
-        """Return the best trial of each effect in each grouping."""
+        """Return the best trial of each effect for each grouping, by the names of effect and grouping."""
         found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
@@ -261,7 +273,9 @@ class Screening:
 
     @property
     def common(self) -> dict[str, Screened]:
-        """Return the candidates with one strength for all scans."""
+        """Return the best trial of each effect with a strength that is the same in all scans, by
+        the name of the effect.
+        """
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
@@ -278,8 +292,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with the best grouping; None if its gain over a common strength may be
-        chance.
+        """Return the candidate with the best grouping of its strength; None if the additional gain over a
+        strength that is the same in all scans may be chance.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
@@ -290,8 +304,11 @@ class Screening:
         return replace(better[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
-        """Return the cosine of the angle between the changes of two candidates, pooled over scans."""
-        # A change is the sum of the columns multiplied by factors (scans, columns).
+        """Return the cosine of the angle between the changes that two candidates make in all scans
+        together.
+        """
+        # The change of a candidate is a sum of columns. ``factors`` contains the factors of the columns in
+        # each scan.
         factors = np.zeros((2, *self.freed.shape[:2]))
         for own, one in zip(factors, (a, b), strict=True):
             own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
@@ -319,11 +336,14 @@ class Screening:
         columns: Sequence[int],
         taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return the held-out gains (scans,), nm², of some columns whose strengths differ by label. Also
-        return the strengths that are fitted to all scans.
+        """Return the gains on held-out scans, nm², of shape (scans,), for columns whose strengths differ by
+        label. Also return the strengths of each label that are fitted to all scans.
 
         Args:
-            taken: function that returns the factor by which the fitted strengths are multiplied.
+            labels: label of each scan.
+            columns: column numbers.
+            taken: function that receives the strengths fitted without a fold and returns the factor by which
+                they are multiplied before the gain is computed.
         """
         own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
         scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
@@ -346,14 +366,14 @@ class Screening:
         """Choose the grouping with the fewest parameters among those that gain nearly the most.
 
         Args:
-            options: gain, nm², and number of parameters by grouping.
-            gains_of: function that returns the gains (scans,), nm², if the strengths of the candidate in a
-                grouping differ by other labels.
+            options: for each grouping, the gain in nm² and the number of parameters.
+            gains_of: function ``gains_of(by, labels)`` that returns the gains in nm², of shape (scans,), of
+                the candidate for the grouping ``by`` if its strengths differ by the given labels instead.
 
         Returns:
-            The grouping, and the share of permutations of the scans after which any grouping gains as much.
-            Permutations that reproduce the grouping are not counted. None if no grouping has a gain, or if
-            the gain may be chance.
+            The chosen grouping, and its p value: the share of random permutations of the scans after which
+            any grouping gains as much. Permutations that reproduce the chosen grouping are not counted. None
+            if no grouping has a gain, or if the gain may be chance.
         """
         most = max((gain for gain, _ in options.values()), default=0.0)
         close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}
@@ -375,7 +395,7 @@ class Screening:
 
 
 def _beside(labels: np.ndarray) -> np.ndarray:
-    """Return a mask (n, n) of pairs of scans that share a label."""
+    """Return a mask of the pairs of scans that share a label, of shape (scans, scans)."""
     return labels[:, None] == labels[None, :]
 
 

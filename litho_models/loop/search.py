@@ -1,9 +1,10 @@
-"""Search for causes. Effects are added as long as they reduce the error on held-out scans, and every added
-effect is tested again at the end.
+"""Search for the effects that a model lacks. Effects are added as long as they reduce the error on held-out
+scans, and every added effect is tested again at the end.
 
-All candidates are screened at once, with common strengths and with strengths by group. The most promising
-candidates are fitted in full before one is chosen, because a derivative at zero strength gives only a rough
-estimate of the gain of a large effect.
+All candidates are screened at once, with strengths that are the same in all scans and with strengths that
+differ by group. Before one of them is chosen, the most promising candidates are fitted in full, because
+screening uses the derivative at zero strength, which gives only a rough estimate of the gain of a large
+effect.
 """
 
 from __future__ import annotations
@@ -27,20 +28,21 @@ SAME_COSINE = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """An effect in the model.
+    """An effect that a search has added to the model: a cause, a law or a table.
 
     Attributes:
         name: name of the effect.
         by: the grouping by which its strength differs.
         alike: other effects that look the same in these scans.
-        judgement: judgement of the gain on held-out scans when the effect is added to the rest of the model.
+        judgement: the gain on held-out scans when the effect is added to all other effects of the model, and
+            whether this gain is significant.
         family_p: p value of the effect in the screening of all candidates.
-        group_p: p value of the grouping.
-        values: starting values of the parameters by label, for the fit of a table.
-        reshaped_share: further gain if variants of the effect's change were added to the model, divided by
-            the gain of the effect itself.
-        reason: why the name of the effect was refused; empty if the name was not refused.
-        corrects: whether the name was refused because the effect may merely correct another formula.
+        group_p: p value of the grouping; None if the strength does not differ by group.
+        values: for a table, the starting values of its parameters by label.
+        reshaped_share: further gain if variants of the change that the effect makes were added to the model,
+            divided by the gain of the effect itself.
+        reason: reason why the effect was rejected as the cause; empty if it was not rejected.
+        corrects: whether it was rejected because it may merely correct the formula of another effect.
     """
 
     name: str
@@ -57,9 +59,14 @@ class Cause:
 
 @dataclass
 class Found:
-    """The result of a search: the model, its causes, and what is known about the other candidates.
+    """The result of a search.
 
-    ``failed`` lists the causes whose names were refused.
+    Attributes:
+        state: the model with the effects that were added.
+        causes: the effects that were added.
+        first, last: the first and the last screening result of each candidate, by its name.
+        refused: reasons why candidates were rejected, by name.
+        failed: effects that were added at first and later rejected as causes.
     """
 
     state: State
@@ -81,14 +88,15 @@ def search(
     secants: Secants | None = None,
     seed: Found | None = None,
 ) -> Found:
-    """Add at most ``most`` effects to a fitted model.
+    """Add effects to a fitted model as long as held-out scans confirm them.
 
     Args:
-        start: the current model.
+        start: the fitted model.
         candidates: effects that may be added.
-        secants: secants of the candidates at a similar model; by default they are computed at the current
-            model.
-        seed: result of the same search with another base. The causes in this result are tried first.
+        most: largest number of effects in the result.
+        secants: changes that the candidates make to the predictions of a similar model; by default, these
+            changes are computed for the current model.
+        seed: result of the same search with another base. The search starts with the effects in this result.
     """
     found = _seeded(start, seed) if seed and seed.causes else Found(start)
     while len(found.causes) < most and _add_one(found, candidates, secants):
@@ -98,7 +106,9 @@ def search(
 
 
 def _seeded(start: State, seed: Found) -> Found:
-    """Add all causes that were found with another base, and remove those that this base does not need."""
+    """Add all effects that a search with another base has found, and remove those that this base
+    does not need.
+    """
     twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
     found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
     _test_again(found)
@@ -108,7 +118,9 @@ def _seeded(start: State, seed: Found) -> Found:
 def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
-    """Find significant tables for a model, each by a separate linear fit."""
+    """Find tables that held-out scans confirm as an addition to a model. Each table is judged separately, by
+    a linear fit. At most ``most`` tables are tried.
+    """
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
         judgement = judge(state.freed_nm2, state.freed_nm2 - one.gains_nm2, state.study)
@@ -118,7 +130,7 @@ def describe(
 
 
 def with_table(state: State, table: Cause) -> State:
-    """Add a table to a model and refit everything."""
+    """Add a table to a model, and refit all parameters of the model."""
     twin = state.twin.with_effect(table.name, table.by, table.values)
     return fit_state(twin, state.study, from_here=True)
 
@@ -134,7 +146,7 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
     study.report(f"{len(left)} of {len(effects)} candidates are significant")
     while left:
         best = left[0]
-        # Up to three rivals enter with the best candidate.
+        # Up to three candidates that make a similar change are fitted together with the best candidate.
         near = (one for one in left[1:] if one.gain_nm2 >= 0.3 * best.gain_nm2)
         entering = [best, *[one for one in near if abs(screening.cosine(best, one)) >= 0.5][:3]]
         left = [one for one in left if one not in entering]
@@ -158,7 +170,8 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
 def _regroup(found: Found, name: str) -> None:
     """Let the strength of a cause differ by group if held-out scans confirm the difference.
 
-    The derivative at the fitted strength is more reliable than the derivative at zero that screening uses.
+    Screening has already tried strengths that differ by group. This second test is more reliable, because it
+    uses the derivative at the fitted strength instead of the derivative at zero strength.
     """
     twin, study = found.state.twin, found.state.study
     at_cause = found.names.index(name)
@@ -170,7 +183,8 @@ def _regroup(found: Found, name: str) -> None:
         for at, slot in enumerate(twin.slots, twin.own)
         if slot.effect == name and slot.facts.kind == "amplitude"
     }
-    # Common parameters cannot explain a difference between groups, so they are not projected out.
+    # Parameters that all scans share cannot explain a difference between groups, so they are not projected
+    # out.
     screening = Screening(found.state, (), beside_own=False)
 
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -205,8 +219,8 @@ def _regroup(found: Found, name: str) -> None:
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """Return the effects that look the same in these scans. They are compared by their fits if these are
-    available, otherwise by screening.
+    """Return the names of the other effects that look the same as this effect in the scans. Effects are
+    compared by their fits if they were fitted, and otherwise by the results of screening.
     """
     own = fitted[one.name]
     by_fit = [
@@ -241,7 +255,12 @@ def _fit(job: tuple[str, Twin, Study]) -> State:
 
 
 def same_change(before: State, one: State, other: State) -> bool:
-    """Return whether two states change the held-out prediction in the same way."""
+    """Return whether two models change the predictions of held-out scans in nearly the same way.
+
+    Args:
+        before: the model before the change.
+        one, other: the two models.
+    """
     inner = np.zeros((2, 2))
     for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
         changes = np.stack([old - a, old - b])
@@ -251,9 +270,10 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Test each cause again together with all others, and remove it if it is no longer confirmed.
+    """Test each cause again in the model with all other causes, and remove it if it is no longer confirmed.
 
-    A strength that differs by group may become visible only when the other causes are in the model.
+    Before that, test again whether its strength differs by group, because such a difference may become
+    visible only when the other causes are in the model.
     """
     if len(found.causes) > 1:
         for name in found.names:
@@ -262,8 +282,8 @@ def _defend(found: Found) -> None:
 
 
 def _test_again(found: Found) -> None:
-    """Judge the gain of each cause with all other causes in the model, and remove each cause that is not
-    confirmed.
+    """Judge the gain of each cause in the model with all other causes, and remove each cause that
+    is not confirmed.
     """
     study = found.state.study
     for cause in list(found.causes):
@@ -280,7 +300,7 @@ def _test_again(found: Found) -> None:
 
 
 def untestable(study: Study) -> dict[str, str]:
-    """Return the effects that these scans cannot test, with reasons."""
+    """Return the effects that these scans cannot test, each with the reason."""
     reasons = {}
     one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
     for effect in CATALOGUE.values():
@@ -296,6 +316,6 @@ def untestable(study: Study) -> dict[str, str]:
 
 
 def separating(names: Sequence[str]) -> str:
-    """Return the experiments that would distinguish the members of a set."""
+    """Return the experiments that would distinguish the named effects, in words."""
     texts = dict.fromkeys(get_effect(name).separating for name in names)
     return "; ".join(text for text in texts if text)

@@ -1,7 +1,7 @@
-"""Find terms that differ from scan to scan: datum, gain, bow, drift, registration, line offsets.
+"""Find terms that differ from scan to scan: datum, gain, bow, drift, registration errors and line offsets.
 
-These terms cannot be predicted for the next print, so they enter no model. A term is judged by its variance:
-its fit on one half of a scan's pixels must agree with the other half.
+These terms cannot be predicted for the next print, so no model contains them. A term is judged by its
+variance: the term fitted to one half of the pixels of a scan must agree with the residual of the other half.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided
 
 
 class SingleScans:
-    """Scans and their expected maps, with terms fitted on pixels that are not scored.
+    """Test which per-scan terms the scans contain. Terms are fitted to pixels that are not scored.
 
     Args:
         study: the study, which provides the seed and the folds.
         scans: the original scans.
-        maps_um: expected map (y, x) of each scan, predicted while the scan was held out. The map includes the
-            measurement model.
+        maps_um: map that each scan is expected to show, µm, of shape (ny, nx). It includes the measurement
+            model, and both models were fitted without this scan.
     """
 
     def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
@@ -50,7 +50,9 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Test each per-scan effect in addition to those already found; line offsets come last."""
+        """Test all per-scan effects, each in addition to the effects that were already found. Line offsets
+        are tested last.
+        """
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
         names = dict.fromkeys(term.effect for term in SCAN_TERMS.values() if term.effect)
@@ -75,7 +77,7 @@ class SingleScans:
         judgement = _as_variance(before, after, self.study)
         values = self.coefficients(own, accepted | own)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
-        # If scans of one print agree, the printer may be the cause as well.
+        # If the scans of one print agree, the printer may be the cause instead of the microscope.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
         few, many = (np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after))
@@ -94,9 +96,10 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """Return the coefficients (scans, k) of ``own`` in a fit of all ``terms``.
+        """Fit all ``terms`` to each scan, and return the k coefficients of the terms in ``own``, of shape
+        (scans, k).
 
-        Displacements are in µm.
+        Coefficients of displacements are in µm.
         """
         found = []
         lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
@@ -108,19 +111,19 @@ class SingleScans:
         return np.stack(found)
 
     def _spread(self, values: np.ndarray, unit: str) -> Strength:
-        """Return the standard deviation over scans with its bootstrap interval."""
+        """Return the standard deviation of the values over scans, with its bootstrap confidence interval."""
         count = len(values)
         draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
         low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
         return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
-        """Test for offsets of the scan's rows, and for offsets of the layout's rows.
+        """Test whether the scan lines, or the rows of the layout, have height offsets.
 
-        The two are compared with each other, and with offsets along columns, which serve as a control. Scans
-        are slightly rotated relative to their layouts. Offsets that follow the layout's rows come from the
-        printer, and offsets that follow the scan's rows come from the microscope. Without a rotation, the two
-        cannot be distinguished.
+        These two kinds of offsets are compared with each other. They are also compared with offsets of the
+        layout's columns, which serve as a control. Scans are slightly rotated relative to their layouts.
+        Offsets that follow the layout's rows come from the printer, and offsets that follow the scan lines
+        come from the microscope. Without a rotation, the two kinds cannot be distinguished.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
@@ -160,9 +163,10 @@ class SingleScans:
         return found
 
     def _with_profile(self, axis: int) -> list[np.ndarray]:
-        """Add to each map the mean residual of every line over scans of other folds.
+        """Add to each expected map a profile across its lines: the mean residual of each line, over the scans
+        of other folds. Rows are the lines if ``axis`` is 1, and columns are the lines if it is 0.
 
-        Nothing is added if scans differ in size, because their lines do not correspond.
+        Nothing is added if the scans differ in size, because their lines then do not correspond.
         """
         if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
             return list(self.maps_um)
@@ -176,7 +180,8 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """Describe in words a period that the line means have in common, such as the period of mains hum.
+        """Return a description in words of a period that the line means of all scans have in common, such as
+        the period of mains hum. The text is empty if there is none.
 
         All frequencies are tested at once.
         """
@@ -197,9 +202,9 @@ class SingleScans:
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:
-        """Return the residual (y, x) of each scan without datum and bow.
+        """Return the residual of each scan after datum and bow are subtracted, µm, of shape (ny, nx).
 
-        Pixels without a measurement are 0.
+        Pixels that were not measured are 0.
         """
         return [
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
@@ -208,9 +213,9 @@ class SingleScans:
 
 
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
-    """Judge a per-scan term by whether the two halves of each scan agree.
+    """Judge a per-scan term by whether the two halves of each scan agree on it.
 
-    The gain is not a suitable test, because a scan whose term is near zero gains nothing.
+    The gain of each scan would not be a suitable test, because a scan whose term is near zero gains nothing.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
@@ -222,6 +227,6 @@ def _frame(effect: str) -> str:
 
 
 def _columns_of(names: Iterable[str], terms: Terms) -> list[int]:
-    """Return the columns of ``term_maps(…, terms)`` that belong to the named terms."""
+    """Return the indices of the maps in ``term_maps(…, terms)`` that belong to the named terms."""
     wanted = parameter_names(names)
     return [at for at, name in enumerate(parameter_names(terms)) if name in wanted]

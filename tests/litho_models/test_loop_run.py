@@ -227,7 +227,7 @@ def test_a_folder_of_the_loop_is_frozen_as_its_model(closed, tmp_path: Path) -> 
 def test_texts_follow_the_verdict(closed) -> None:
     result, _, _ = closed
     words = {
-        "described": "no cause and no short law is confirmed",
+        "described": "confirm no cause and no short law",
         "nothing-missing": "These scans show nothing",
         "unexplained": "The model lacks something",
         "too-few-scans": f"at least {result.fewest_scans} scans",
