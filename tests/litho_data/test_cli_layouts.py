@@ -123,7 +123,7 @@ def test_options_that_a_card_already_fixes_are_refused(app, tmp_path):
     for option in (("--count", 3), ("--size-px", 64), ("--write-field-um", 100)):
         with pytest.raises(InputError, match="given with --layouts"):
             run(app, "simulate", "--out", tmp_path / "s", *card, *option)
-    with pytest.raises(InputError, match="references"):
+    with pytest.raises(InputError, match="reference prints cannot be added"):
         run(app, "simulate", "--out", tmp_path / "s", *card, "--references")
 
 

@@ -144,7 +144,7 @@ def test_correlation_takes_over_where_keypoints_are_too_few():
     )
     found = register(scan_of(layout, warp, SCAN_SHAPE, snr=5), layout)
     assert found.quality.method == "correlation"
-    assert "coarse fit by" in found.quality.warning
+    assert "coarse fit used only" in found.quality.warning
     assert warp_error_px(found.scan_to_layout, true_scan_to_layout(warp, "identity", SCAN_SHAPE), SHAPE) < 0.3
 
 

@@ -103,7 +103,7 @@ def test_a_hologram_is_designed_for_its_source(tmp_path):
 
 def test_a_wide_source_is_refused_where_only_one_plane_wave_is_computed():
     wide = OPTICS.model_copy(update={"source_sine": 0.02})
-    with pytest.raises(InputError, match="source of the lens"):
+    with pytest.raises(InputError, match="source of a lens"):
         LensBench(LAYOUT, wide, LensView(window_px=64))
     with pytest.raises(InputError, match=r"source_sine of a large element"):
         only(hologram_settings(changes={"optics.source_sine": 0.02}), LIGHT)

@@ -398,7 +398,7 @@ def test_every_setting_of_a_training_is_reached_from_the_command_line(store, tmp
     for wrong, said in (
         ("batsh=8", "did you mean batch?"),
         ("batch=0", "setting batch, got 0"),
-        ("seed=1", "seed, which an option sets"),
+        ("seed=1", "seed, which another option also sets"),
         ("batch", "PATH=VALUE"),
     ):
         words = [*command, str(tmp_path / "other"), "--set", wrong]
