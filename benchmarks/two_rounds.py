@@ -262,8 +262,8 @@ def summary(trials: list[dict[str, Any]]) -> str:
         f"that {PRINTS} prints decide a question. Brackets contain 95 % Wilson intervals of the share. For "
         "the questions in the last column, the plan stated before printing that no experiment separates the "
         "answers.",
-        "For each planted knob, the number of questions about it that the optimised layouts decided "
-        f"correctly: {_by_knob(trials)}.",
+        "With the optimised layouts, the questions about each planted knob were decided correctly in this "
+        f"many trials: {_by_knob(trials)}.",
     )
 
 

@@ -341,7 +341,7 @@ def _attribution(given: Sequence[str]) -> Any:
         raise InputError(
             "--attribute",
             got=wrong[0],
-            wanted="EFFECT=microscope or EFFECT=printer in every use, if the option is used more than once",
+            wanted="EFFECT=microscope or EFFECT=printer each time, because the option is used more than once",
         )
     return dict(text.split("=", 1) for text in given)
 

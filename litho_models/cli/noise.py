@@ -21,14 +21,14 @@ def noise(
     ] = None,
     substrate: Annotated[Path | None, option("scan of the bare substrate, instead of a store")] = None,
     flat: Annotated[Path | None, option("scan of a flat print, instead of a store")] = None,
-    steps: Annotated[Path | None, option("scan of a step print, instead of a store")] = None,
+    steps: Annotated[Path | None, option("scan of a printed step pattern, instead of a store")] = None,
     unit: Annotated[str | None, option("height unit of the scan files, if they do not state it")] = None,
     size_um: Annotated[
         tuple[float, float] | None,
         option("size of the scans in µm, if the files do not state it", metavar="Y X"),
     ] = None,
     level_height_um: Annotated[
-        float | None, option("nominal height of one step of the step print, µm; 0.1 by default")
+        float | None, option("nominal height of one step of this pattern, µm; 0.1 by default")
     ] = None,
     residuals: Annotated[
         str | None,
@@ -66,7 +66,7 @@ def noise(
         raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store with {of_a_store}")
     elif level_height_um is not None and steps is None:
         raise InputError(
-            "noise", got="--level-height-um without --steps", wanted="--steps with the scan of the step print"
+            "noise", got="--level-height-um without --steps", wanted="--steps SCAN, a scan of a printed step pattern"
         )
     else:
         result = analyse_noise_of_files(out, **of_files)
