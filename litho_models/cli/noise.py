@@ -66,7 +66,9 @@ def noise(
         raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store with {of_a_store}")
     elif level_height_um is not None and steps is None:
         raise InputError(
-            "noise", got="--level-height-um without --steps", wanted="--steps SCAN, a scan of a printed step pattern"
+            "noise",
+            got="--level-height-um without --steps",
+            wanted="--steps SCAN, a scan of a printed step pattern",
         )
     else:
         result = analyse_noise_of_files(out, **of_files)
