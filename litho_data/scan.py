@@ -1,4 +1,4 @@
-"""One height map as an instrument recorded it, with everything that its file states about it."""
+"""Class Scan: one height map as an instrument recorded it, with everything that its file states about it."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -27,8 +27,8 @@ class Scan:
         mask: mask that the file contains, a bool array of shape (ny, nx); None if the file has no mask.
         header: all other entries of the file's header, as strings.
         source: path of the file.
-        format: name of the reader that read it.
-        notes: warnings for whoever uses the heights.
+        format: name of the reader that read the file.
+        notes: warnings about the heights, which everyone who uses them should know.
 
     Raises:
         InputError: the heights are not a map of at least 2 x 2 pixels or contain no finite value, the shape
@@ -88,7 +88,7 @@ class Scan:
         return self.height_um.shape[0], self.height_um.shape[1]
 
     def require_pitch(self) -> YX:
-        """Return the pitch along y and along x in µm. Every operation that uses lateral lengths needs it.
+        """Return the pitch along y and along x in µm, for operations that cannot work without it.
 
         Raises:
             InputError: the pitch is unknown.

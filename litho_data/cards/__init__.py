@@ -1,1 +1,3 @@
-"""Dataset cards, which describe the raw files of a dataset, their location and their fields."""
+"""Dataset cards: TOML files that describe the raw files of a dataset, where they are, and the printed fields
+that they show.
+"""

@@ -16,7 +16,7 @@ from litho_data.foundation.results import Record, first_error
 from litho_data.readers.registry import formats
 from litho_data.store.schema import Instrument, Surround
 
-# Longest value that a message shows, in characters.
+# Number of characters at which messages cut off a value.
 _LONGEST = 80
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
@@ -35,7 +35,9 @@ def load_card(path: str | Path) -> Card:
 
 
 def check_card(content: dict[str, Any], what: str) -> Card:
-    """Check the content of a card, given as a dict, and return the card. Messages call the card ``what``."""
+    """Check the content of a card, given as a dict, and return the card. Error messages refer to the card as
+    ``what``.
+    """
     try:
         return Card.model_validate(content)
     except ValidationError as error:
@@ -89,8 +91,8 @@ def _file_patterns(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def _inside(value: str) -> str:
-    """Check that a path is relative and stays in the data folder. Slashes and backslashes are accepted as
-    separators.
+    """Check that a path is relative and does not lead out of the data folder. Both slashes and backslashes
+    are accepted as separators.
     """
     parts = PurePosixPath(value.replace("\\", "/")).parts
     leaves = not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value)
@@ -122,8 +124,8 @@ class LayoutFiles(Record):
 
     If the layouts are saved as pictures, ``grey_per_level`` is the difference in grey value between
     neighbouring levels, such as 255 / (levels - 1) if white is the highest level. If ``average_px`` is set,
-    the files are black-and-white pictures. Each square with this many pixels on a side becomes one pixel of
-    the layout, whose level is the number of white pixels in the square.
+    the files are black-and-white pictures. Each square of ``average_px`` x ``average_px`` pixels becomes one
+    pixel of the layout. The level of this pixel is the number of white pixels in the square.
     """
 
     files: FilePatterns
@@ -147,13 +149,13 @@ class ScanFiles(Record):
     """The ``[scan]`` table: the scan files, and how to read them. ``size_um`` is the size of the field along
     y and x, for file formats that do not state it.
 
-    ``instrument``: the kind of microscope. A ``confocal`` microscope has no tip. The files of a scanning
-    electron microscope (``sem``) are pictures of a film that has the layout's full height; the build measures
-    the edges of this film.
+    ``instrument`` is the kind of microscope. A ``confocal`` microscope has no tip. The files of a scanning
+    electron microscope (``sem``) are pictures of a film of uniform height, the full height of the layout; the
+    build measures where the edges of this film lie.
 
-    If ``levelled`` is true, the build uses the heights in the files without levelling them. ``missing``
-    contains numbers and words that mark pixels without a measurement; an empty list says that there are no
-    such marks.
+    If ``levelled`` is true, the build uses the heights in the files without levelling them. ``missing`` lists
+    the numbers and words that stand for unmeasured pixels in the files; an empty list says that no value has
+    this meaning.
     """
 
     files: FilePatterns
@@ -178,11 +180,12 @@ class ScanFiles(Record):
 
 
 class Process(Record):
-    """How raw scans are processed: the file of a levelling recipe, the registration model and the tip.
+    """The ``[process]`` table: how raw scans are processed. It names a file with a levelling recipe, the
+    registration model and the tip.
 
-    Without ``level``, a plane that is fitted together with the layout is subtracted from each scan, unless
-    the card says that the scans are levelled. ``tip`` is the radius of the microscope's tip in µm, or
-    ``blind`` to estimate it from the scans.
+    If ``level`` is missing and the card does not say that the scans are levelled, a plane is fitted to each
+    scan together with the layout, and this plane is subtracted. ``tip`` is the radius of the microscope's tip
+    in µm, or ``blind`` to estimate it from the scans.
     """
 
     level: InsidePath | None = None
@@ -191,9 +194,9 @@ class Process(Record):
 
 
 class Ids(Record):
-    """What the ids of the scans mean. ``print`` is a regular expression that matches a whole id, and its
-    group named ``print`` gives the print of the scan. ``table`` is a CSV file with further facts about each
-    scan.
+    """The ``[ids]`` table: what the ids of the scans mean. ``print`` is a regular expression that matches a
+    whole id. The text that its group named ``print`` captures is the name of the print to which the scan
+    belongs. ``table`` is a CSV file with further facts about each scan.
     """
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None
@@ -201,8 +204,8 @@ class Ids(Record):
 
 
 class Standard(Record):
-    """A scan of a standard of known size. Reading options that are not given here are taken from the card's
-    ``scan`` table.
+    """A scan of a calibration standard, whose size is known. Options for reading the file that are not given
+    here are taken from the card's ``scan`` table.
     """
 
     file: InsidePath
@@ -214,13 +217,17 @@ class Standard(Record):
 
 
 class Grating(Standard):
-    """A grating that calibrates the scale of one axis. A square grating can be used for both axes."""
+    """A grating that calibrates the lateral scale of one axis. A square grating (periodic along both axes)
+    can calibrate both.
+    """
 
     period_um: Length
 
 
 class Step(Standard):
-    """A step, ridge or groove of known height, whose edges are perpendicular to ``axis``."""
+    """A step, ridge or groove of known height, which calibrates the scale of heights. Its edges are
+    perpendicular to ``axis``.
+    """
 
     height_um: Length
     axis: Literal["x", "y"] = "x"
@@ -241,10 +248,10 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """How the printer wrote a field. Facts that are missing here are assumed, and the listing names these
-    assumptions.
+    """The ``[write]`` table: how the printer wrote a field. For facts that are missing here, default
+    assumptions are made; the listing of the card's files names them.
 
-    ``surround`` says what lies around a printed field: the bare substrate or more of the print.
+    ``surround`` says what lies around a printed field: the bare substrate, or more of the same print.
     """
 
     slow_axis: Literal["x", "y"] | None = None
@@ -253,8 +260,8 @@ class Write(Record):
 
 
 class KnownGrating(Record):
-    """The certified period of the grating that scans with the use ``grating`` show. It holds along both
-    axes.
+    """The certified period of the grating in the reference scans whose use is ``grating``. The grating has
+    this period along both axes.
     """
 
     period_um: Length
@@ -262,13 +269,17 @@ class KnownGrating(Record):
 
 
 class Planned(Record):
-    """Facts about planned prints: the hash of the dataset from which the prints were planned."""
+    """Facts about prints that were planned with models: the hash of the dataset from which they were
+    planned.
+    """
 
     dataset_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
 class Source(Record):
-    """Where to get the files: a base URL, and a registry of SHA-256 sums beside the card."""
+    """Where to download the files: a base URL, and a file beside the card that lists the SHA-256 sum of each
+    file.
+    """
 
     url: str = Field(pattern=r"^https?://")
     registry: InsidePath
@@ -311,7 +322,8 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":
-        # This is a message of our own validators; for a table it already names the key.
+        # The message comes from a validator of this module; if it concerns a whole table, it already names
+        # the key.
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"
         return InputError(f"{what}: {key}{shown}: {cause}")
@@ -332,7 +344,7 @@ def _shown(value: object) -> str:
 
 
 def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the model that contains the key at an error location."""
+    """Return the pydantic model that contains the key at the location of a validation error."""
     model: type[BaseModel] = Card
     for part in location:
         annotation = model.model_fields[str(part)].annotation

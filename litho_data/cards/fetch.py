@@ -78,7 +78,9 @@ def find_card(dataset: str | Path) -> Path:
 
 
 def known_cards() -> dict[str, Path]:
-    """Return the project's cards by name; files like ``<name>.split.toml`` are not cards."""
+    """Return the paths of the project's cards, keyed by card name. Files like ``<name>.split.toml`` are not
+    cards and are left out.
+    """
     return {path.stem: path for path in sorted(CARDS.glob("*.toml")) if "." not in path.stem}
 
 
@@ -105,7 +107,9 @@ def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
 
 
 def _missing(folder: Path, registry: pooch.Pooch) -> list[str]:
-    """Return the registered files that are missing in the folder or have another hash."""
+    """Return the names of the registered files that are missing in the folder or have another hash than
+    registered.
+    """
     hashes = registry.registry.items()
     return [
         file
@@ -121,7 +125,7 @@ def _download(registry: pooch.Pooch, file: str) -> None:
     downloader = pooch.HTTPDownloader(progressbar=False, timeout=60)
     logger = pooch.get_logger()
     level = logger.level
-    logger.setLevel("ERROR")  # the progress bar shows what happens
+    logger.setLevel("ERROR")  # the progress bar makes pooch's log messages superfluous
     try:
         registry.fetch(file, downloader=downloader)
     except (requests.RequestException, OSError) as error:
@@ -129,7 +133,7 @@ def _download(registry: pooch.Pooch, file: str) -> None:
         raise InputError(
             f"cannot fetch {file}", got=error, wanted=url, hint="run fetch again to resume"
         ) from error
-    except ValueError as error:  # pooch removes a file that does not match
+    except ValueError as error:  # pooch has already removed a file whose hash is wrong
         url, wanted = registry.get_url(file), registry.registry[file]
         hint = "the source has changed or the download was damaged; the file was not kept"
         raise InputError(f"{file} from {url}", got="another SHA-256", wanted=wanted, hint=hint) from error

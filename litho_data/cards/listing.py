@@ -18,7 +18,7 @@ from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, rea
 from litho_data.foundation import Facts, InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
-# A separate process matches a card's regular expression against ids; it is stopped after this time.
+# Time limit for the separate process that matches a card's regular expression against the ids.
 _LONGEST_S = 10.0
 _MATCH = """
 import json, re, sys
@@ -29,12 +29,13 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 
 @dataclass(frozen=True)
 class PrintedField:
-    """One field to build: its files and what the card says about it.
+    """One printed field to build: its layout file, its scan files, and what the card says about it.
 
     ``columns`` contains the optional numbers and words that the card's table states for this field, such as
-    its dose. ``read`` contains the reading options that the table states for this scan; they replace those of
-    the card. If the scan is an integer image, ``full_scale_um`` is the height that the largest possible pixel
-    value stands for. ``layout`` may be None only for a reference scan (whose ``use`` is not dataset).
+    its dose. ``read`` contains the options for reading that the table states for this scan; they take
+    precedence over the card's options. If the scan is an integer image, ``full_scale_um`` is the height that
+    the largest possible pixel value stands for. ``layout`` may be None only for a reference scan, i.e. a scan
+    whose ``use`` is not ``dataset``.
     """
 
     id: str
@@ -53,8 +54,8 @@ class Listing:
     """A dataset card, the folder that contains its files, the fields to build, and the files found for each
     id.
 
-    Each id that is not built is a key of ``unpaired`` (its layout or its scan is missing) or of ``refused``
-    (it cannot be used). The value is the reason.
+    Each id that is not built is a key of ``unpaired`` if its layout or its scan is missing, and a key of
+    ``refused`` if its files are present but cannot be used. The value is the reason.
     """
 
     card: Card
@@ -67,7 +68,9 @@ class Listing:
     assumptions: tuple[str, ...]
 
     def relative(self, path: Path) -> str:
-        """Return the path as the record states it: relative to the data folder, with forward slashes."""
+        """Return the path in the form in which records of a build state it: relative to the data folder, with
+        forward slashes.
+        """
         return path.relative_to(self.data_dir).as_posix()
 
 
@@ -76,8 +79,8 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 
     Args:
         card_path: path of the card.
-        data_dir: folder where the card's file patterns start. By default, it is the first folder that has
-            files: the card's own folder, ``$LITHO_DATA_DIR/<name>``, or the user cache.
+        data_dir: folder to which the card's file patterns are relative. By default, it is the first folder
+            that has files: the card's own folder, ``$LITHO_DATA_DIR/<name>``, or the user cache.
 
     Raises:
         InputError: the card or its table is invalid, no folder has the files, or no id has both a layout and
@@ -167,8 +170,8 @@ def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
-    """Find the files that match one pattern or several, and return them by id. In a pattern, ``{id}`` stands
-    for the id, and ``*`` for any part of a name.
+    """Find the files that match one or several patterns, and return lists of their paths keyed by id. In a
+    pattern, ``{id}`` stands for the id, and ``*`` for any part of a name.
     """
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):
@@ -199,8 +202,8 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
 
 
 def leads_out(files: tuple[Path, ...], folder: Path) -> str:
-    """Return a message if a file is a link that leads out of the data folder, otherwise an empty text. Such a
-    link is refused because the card describes only this folder.
+    """Return a message if one of the files is a link to a place outside the data folder, otherwise an empty
+    string. Such a link is refused because the card describes only files in this folder.
     """
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
@@ -218,8 +221,8 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
-    """Some effects need facts that the card may not state. Return the assumptions that replace the missing
-    facts.
+    """Return sentences that name the assumptions made in place of facts that the card does not state but some
+    effects need.
     """
     assumed = []
     if card.process.level is None and not card.scan.levelled:
@@ -234,22 +237,22 @@ def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
 
 
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
-    """Return the print of each id, which is the text that the group ``print`` of a regular expression
-    captures. It is None if the expression does not match the whole id.
+    """Return the name of the print to which each id belongs: the text that the group ``print`` of a regular
+    expression captures, or None if the expression does not match the whole id.
 
-    Without an expression, every id counts as a separate print. Matching an expression with nested repetitions
-    can take forever and cannot be interrupted, so an expression with any repetition is matched in a separate
-    process.
+    If ``pattern`` is None, every id counts as a separate print. Matching an expression with nested
+    repetitions can take forever and cannot be interrupted from within Python. An expression that contains any
+    repetition is therefore matched in a separate process.
 
     Raises:
-        InputError: the separate process has no result after 10 s.
+        InputError: the separate process has not finished after 10 s.
     """
     if pattern is None:
         return list(ids)
     if not set("*+{?") & set(pattern.replace("(?", "(")):
         return [found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)]
     try:
-        # The process is isolated and loads no site packages; loading them would take ten times as long.
+        # Python runs isolated and without site packages, because loading them would take ten times as long.
         done = subprocess.run(
             [sys.executable, "-ISc", _MATCH],
             input=json.dumps([pattern, list(ids)]),

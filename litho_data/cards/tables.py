@@ -1,5 +1,5 @@
-"""Read the two files to which a card may refer: the table with facts about each id, and the file with the
-full-scale heights of integer images.
+"""Read the two files to which a dataset card may refer: the CSV table with facts about each id, and the JSON
+file with the full-scale heights of integer images.
 """
 
 import csv
@@ -28,11 +28,12 @@ _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, Any]]:
-    """Read and check a card's CSV table. Return a dict that maps each id to the values in its row, by column
-    and without empty cells.
+    """Read and check a card's CSV table. Return a dict that maps each id to a dict of the values in its row,
+    keyed by column name. Empty cells are left out.
 
-    The reader accepts the variants that spreadsheets write in different languages: cells separated by commas,
-    semicolons or tabs, text that may be UTF-16, and decimal commas if cells are not separated by commas.
+    The function accepts what spreadsheet programs write in different languages: cells may be separated by
+    commas, semicolons or tabs, the text may be UTF-16, and numbers may have decimal commas if cells are not
+    separated by commas.
 
     Raises:
         InputError: the file is unreadable, a column is unknown, an id is not a plain name, or a cell is of
@@ -66,10 +67,10 @@ def read_table(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _value(name: str, text: str) -> Any:
-    """Return the value of a cell in the column ``name``.
+    """Convert the text of a cell in the column ``name`` to the type of this column.
 
     Raises:
-        InputError: the text is of the wrong kind.
+        InputError: the text cannot be converted, such as a word in a column of numbers.
     """
     words = {
         "use": get_args(Use),
@@ -105,8 +106,8 @@ def _value(name: str, text: str) -> Any:
 
 
 def read_full_scales(path: Path) -> dict[str, float]:
-    """Read a JSON file that states, for each image, the height in metres of the largest possible grey value.
-    Return these heights in µm, by file name or id.
+    """Read a JSON file that states, for each image, the height in metres that the largest possible grey value
+    stands for. Return these heights in µm, keyed as in the file, by file name or id.
 
     Raises:
         InputError: the file does not exist or is not a JSON object, or a value is not a positive number.

@@ -1,1 +1,3 @@
-"""Move data into and out of a store: release files, and the pair format of the paper's authors."""
+"""Export a dataset store as files for release, and import and export the format in which the paper's authors
+published their data.
+"""

@@ -1,4 +1,6 @@
-"""Write the Croissant description of a release: its files, and the columns of its quality table."""
+"""Write the description of a release in the metadata format Croissant: its files, and the columns of its
+table of scan quality.
+"""
 
 import json
 from collections.abc import Sequence
@@ -18,7 +20,8 @@ def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any
     """Return the Croissant description of a release as JSON-LD.
 
     Args:
-        root: the entry for the dataset in the RO-Crate. ``files`` are the entries for its files.
+        root: the entry that describes the dataset in the RO-Crate.
+        files: the entries that describe the files of the release in the RO-Crate.
         table: CSV file with one row per scan; the description lists its columns.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}

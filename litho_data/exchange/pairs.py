@@ -1,9 +1,9 @@
-"""Import and export pairs of 8-bit layout and height files, the format in which the paper's authors published
-their data. ``litho_data.readers.pairs`` describes the limits of this format.
+"""Import and export pairs of an 8-bit layout file and an 8-bit height file. The paper's authors published
+their data in this format. ``litho_data.readers.pairs`` describes the limits of this format.
 
-``mask/<id><q>.tif`` contains levels, ``afm/<id><q>.tif`` contains heights, and ``src_max_dict.txt`` contains
-the full scale of each height file (the height of grey value 255) in metres. The quadrant q is 1 (top left), 2
-(top right), 3 (bottom left) or 4 (bottom right).
+``mask/<id><q>.tif`` contains level numbers, ``afm/<id><q>.tif`` contains heights, and ``src_max_dict.txt``
+contains the full scale of each height file (the height of grey value 255) in metres. The digit q names a
+quadrant of the field: 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
 """
 
 import json
@@ -48,23 +48,23 @@ def import_pairs(
     dask: str | None = None,
     strict: bool = False,
 ) -> BuildResult:
-    """Build a store from a folder in the pair format. Four files whose names differ only in the quadrant
-    become one field.
+    """Build a store from a folder in the pair format. Four pairs of files whose names differ only in the
+    digit of the quadrant are joined to one field.
 
     The height of a pixel is grey value / 255 · full scale. In the authors' own files, heights were rounded
     down to a grey value, so they are too low by half a grey value (about 2 nm) on average.
 
     Args:
-        folder: folder with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
+        folder: folder that contains ``mask/``, ``afm/`` and ``src_max_dict.txt``.
         out: path of the store.
         pitch_um, level_height_um, levels: pixel pitch and nominal height of a level, in µm, and number of
             levels. The files do not state these values; the defaults are those of the paper.
         name: name of the dataset; by default that of the folder.
         workers, dask: as for ``build_dataset``.
-        strict: whether to build nothing if a field must be skipped.
+        strict: if true, nothing is built if any field cannot be used; if false, such fields are skipped.
 
     Raises:
-        InputError: the folder has no file of full scales or no complete pair, or the pitch or the level
+        InputError: the folder has no ``src_max_dict.txt`` or no complete pair, or the pitch or the level
             height is not positive.
     """
     root = Path(folder).resolve()
@@ -100,8 +100,8 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """A job that joins the quadrants of one field. ``quadrants`` maps the number of each quadrant to the name
-    that its layout file and its height file share.
+    """A job that joins the quadrants of one field. ``quadrants`` maps the number of each quadrant to the file
+    name that its layout file and its height file share.
 
     A field that is not divided has only the quadrant 0.
     """
@@ -116,19 +116,25 @@ class PairsJob:
 
     @property
     def files(self) -> dict[str, Path]:
-        """Return the layout files and then the height files, each in the order of the quadrants."""
+        """Return the files of the field: first the layout files, then the height files, each in the order of
+        the quadrants.
+        """
         names = [f"{kind}/{name}" for kind in ("mask", "afm") for name in self.quadrants.values()]
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
-        """Return the hash of everything that determines the finished field."""
+        """Return a hash of everything that determines the finished field, by which a resumed build recognises
+        it.
+        """
         operation = OPERATIONS["stitch-pairs"]
         card = self.card.model_dump(mode="json")
         plan = [self.print_id, self.order, card, operation.version, operation.code_sha256, self._params]
         return record_sha256([plan, {name: file_sha256(path) for name, path in self.files.items()}])
 
     def run(self) -> Piece:
-        """Return the field, joined from its quadrants, as a piece of a store."""
+        """Join the field from its quadrants, and return it in the form in which a store under construction
+        takes it.
+        """
         chain = Chain()
         chain.run("stitch-pairs", self._params, self.files)
         return chain.piece(
@@ -152,7 +158,9 @@ class PairsJob:
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Return the file names by field and quadrant, and the unusable files, each with the reason."""
+    """Return the file names keyed by field and quadrant, and a dict that maps each unusable file to the
+    reason.
+    """
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
     unpaired = {f"mask/{name}": "no height file of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout file of this name" for name in sorted(heights - masks)}
@@ -186,13 +194,14 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format. Return a note on each scan whose negative heights or unmeasured
-    pixels the format cannot represent.
+    """Write a store in the pair format. Return one note for each scan that has negative heights or unmeasured
+    pixels, which the format cannot represent.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 
     Raises:
-        InputError: a field cannot be cut into quadrants, or the folder contains files of another kind.
+        InputError: a field cannot be cut into four quadrants, or the output folder contains files of another
+            kind.
     """
     store = open_store(store_path)
     notes: list[str] = []

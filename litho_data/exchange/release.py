@@ -1,5 +1,5 @@
-"""Export a store for release, as one file or as a folder with descriptions in the formats RO-Crate and
-Croissant.
+"""Export a store for release, either as one packed file or as a folder that also describes the data in the
+formats RO-Crate and Croissant.
 """
 
 import json
@@ -13,7 +13,7 @@ from litho_data.foundation import InputError, atomic_file, file_sha256
 from litho_data.foundation.begun import whole_folder
 from litho_data.store.read import Store, open_store
 
-# A zip archive states a time for every file. With a fixed time, the same store always gives the same archive.
+# A zip archive states a time for every file. A fixed time makes the archives of the same store identical.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
@@ -40,14 +40,15 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
 
 
 def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
-    """Write a release folder: the packed store, its quality table, and their descriptions.
+    """Write a release folder that contains the packed store, a table of the quality of each scan, and
+    descriptions of both.
 
-    ``ro-crate-metadata.json`` lists every raw file with its SHA-256, the software of the build, the licence
+    ``ro-crate-metadata.json`` states the SHA-256 of every raw file, the software of the build, the licence
     and the citation. ``croissant.json`` describes the files and the columns of the table.
 
     Raises:
-        InputError: the store does not exist, is packed or has no manifest, or the folder contains files of
-            another kind.
+        InputError: the store does not exist, is packed or has no manifest, or the output folder contains
+            files of another kind.
     """
     store = open_store(store_path)
     if "card" not in store.manifest:
@@ -73,7 +74,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def _root(store: Store) -> dict[str, Any]:
-    """Return the entry for the dataset in the RO-Crate."""
+    """Return the entry that describes the dataset in the RO-Crate."""
     manifest = store.manifest
     card = manifest["card"]
     root: dict[str, Any] = {
@@ -112,7 +113,7 @@ def _graph(store: Store, root: dict[str, Any], files: list[dict[str, Any]]) -> l
             "@type": "CreateAction",
             "name": "Building the dataset from raw files",
             "startTime": build["started"],
-            # Older stores do not record the end.
+            # Older stores do not record when the build ended.
             **({"endTime": build["ended"]} if "ended" in build else {}),
             "instrument": {"@id": "#software"},
             "object": [{"@id": f"#raw/{row['path']}"} for row in raw],

@@ -1,4 +1,5 @@
-"""Parts that all packages use: errors, files, hashes, units, records, and facts about a run.
+"""Basic parts that all packages of the project use: errors, files, hashes, units, records, and facts about a
+run.
 
 This package exports the names that most modules use. Import all other names from their modules.
 """
