@@ -1,4 +1,5 @@
-"""Rules for commands that write a folder: how they declare, begin, continue and finish the result in it.
+"""Rules for commands that write their result as a folder: how they declare, begin, continue and finish this
+result.
 
 A command first declares its result: the name of its record file, which is written last, and the fields of
 this record that determine the result. The folder is then in one of four states:
@@ -35,8 +36,8 @@ BEGUN = "begun.json"
 
 @dataclass(frozen=True)
 class Begun:
-    """A folder to which a command adds the files of its result. ``finished`` is true if the same result was
-    already complete at the start.
+    """A folder to which a command adds the files of its result. ``finished`` is true if the folder already
+    contained the complete result when the command started.
     """
 
     folder: Path
@@ -49,22 +50,22 @@ def growing_folder(
 ) -> Iterator[Begun]:
     """Yield a folder to which the files of a result are added one by one, so that a stopped run can resume.
 
-    Other files in a folder that contains this result are left alone. Only one process at a time writes the
-    folder.
+    If the folder already contains this result, its other files are left alone. Only one process at a time may
+    write the folder.
 
     Args:
         out: the folder; it is created if it is missing.
         record: name of the record file of a finished result, such as ``run.json``. The ``with`` block writes
             this file last.
-        facts: fields of the record that determine the result; a folder whose record has other values is
-            refused.
+        facts: fields of the record that determine the result. A folder whose record has other values of these
+            fields is refused.
         holds: names of files that the folder may contain before the result is begun, such as designs that
             were made one by one.
 
     Raises:
-        InputError: ``out`` is a file, contains something other than this result, contains this kind of result
-            with other facts, is being written by another process, or cannot be written. The error is raised
-            before the ``with`` block begins.
+        InputError: ``out`` is a file, contains something other than this result, contains a result of this
+            kind whose ``facts`` differ, is being written by another process, or cannot be written. The error
+            is raised before the ``with`` block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
     begun = _require_own(folder, record, facts or {}, holds)
@@ -95,12 +96,14 @@ def growing_folder(
 def whole_folder(
     out: str | Path, *holds: str, record: str = "", facts: Facts | None = None
 ) -> Iterator[Path]:
-    """Yield a folder that will replace ``out`` as a whole; a stopped run cannot be resumed.
+    """Yield an empty folder that replaces ``out`` as a whole if the ``with`` block ends without an error. A
+    stopped run cannot be resumed.
 
     Args:
         out: the folder that will be replaced.
-        holds: names, or patterns of names, of everything that such a result may contain.
-        record, facts: as for ``growing_folder``; without a record, any older result is replaced.
+        holds: names, or patterns of names, of all files and folders that such a result may contain.
+        record, facts: as for ``growing_folder``. If no record is named, any older result is replaced,
+            whatever its settings.
 
     Raises:
         InputError: as for ``growing_folder``, or the folder contains anything besides an older result.
@@ -113,7 +116,9 @@ def whole_folder(
 
 
 def _require_own(folder: Path, record: str, facts: Facts, holds: str) -> bool:
-    """Return whether the same result was begun in this folder but not finished."""
+    """Return whether the same result was begun in this folder but not finished; raise InputError if the
+    folder contains anything that this result must not replace.
+    """
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # If a process was stopped before it wrote the content of ``begun.json``, the folder counts as empty.

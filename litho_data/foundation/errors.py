@@ -1,20 +1,23 @@
-"""InputError, the one exception whose message is written for users, and helpers that raise it."""
+"""InputError, the only exception of the project whose message is written for users, and helpers that raise
+it.
+"""
 
 import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _MANY = 12
-# The given value can have any length, so messages show only its beginning.
+# Messages show only this many characters of the given value, which can have any length.
 _LONGEST = 240
 
 
 class InputError(ValueError):
-    """An error for bad input. Its one-line message says what is wrong, what was given and what is wanted, and
-    may give a hint.
+    """An error for bad input. Its one-line message says what is wrong, what was given and what is allowed,
+    and may add a hint.
 
     The command lines print the message without a traceback and exit with code 2; every other exception is a
-    defect of this project. If ``got`` is an exception, the message states its cause in plain words.
+    defect of this project. If ``got`` is an exception, the message states in plain words what caused that
+    exception.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
@@ -30,7 +33,7 @@ class InputError(ValueError):
 
 @contextmanager
 def about(what: str) -> Iterator[None]:
-    """Add ``what`` at the beginning of the message of any InputError that the block raises."""
+    """Prepend ``what`` to the message of any InputError that the ``with`` block raises."""
     try:
         yield
     except InputError as error:
@@ -39,8 +42,9 @@ def about(what: str) -> Iterator[None]:
 
 @contextmanager
 def damaged(what: str) -> Iterator[None]:
-    """Report any error that the content of a file causes in this block as damage of the file. Use it for
-    files that a program wrote, because somebody may have edited them.
+    """Turn any error that the content of a file causes in the ``with`` block into an InputError which says
+    that the file is damaged. Use it to read files that a program wrote but that somebody may have edited
+    since.
 
     Raises:
         InputError: the content of the file causes an error, such as a missing key, text instead of a number,
@@ -55,7 +59,7 @@ def damaged(what: str) -> Iterator[None]:
 
 
 def said(error: Exception) -> str:
-    """Return the reason for an error in plain words instead of Python's."""
+    """Return the reason for an error in plain words instead of Python's own message."""
     if isinstance(error, UnicodeDecodeError):
         return "bytes that are not text"
     if isinstance(error, OSError) and error.strerror:
@@ -79,14 +83,15 @@ def unknown_name(
     """Return the error for an unknown name. If a known name is similar, the hint suggests the nearest one.
 
     Args:
-        what: what the name stands for.
-        got: the unknown name. ``known`` are all known names.
+        what: what the name stands for, such as "model".
+        got: the unknown name.
+        known: all known names.
         hint: what to suggest if no known name is similar.
         also: what else could have been given instead of a name, such as "an image file".
     """
     names = list(known)
     near = difflib.get_close_matches(str(got), names)
-    # A screen full of names does not help a user who misspelt one of them.
+    # A long list of names does not help a user who misspelt one of them, so only the nearest is suggested.
     shown = [] if near and len(names) > _MANY else names
     wanted = " or ".join(filter(None, (", ".join(shown), also)))
     return InputError(

@@ -1,4 +1,4 @@
-"""The public face of a package: the few names that users import, each loaded when it is first used."""
+"""Lazy loading of the public names of a package: each name is imported when it is first used."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from pathlib import Path
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
-# litho_data does not need torch; if torch is missing, the extras `models` and `design` are missing too.
+# Both extras, `models` and `design`, install torch, and litho_data alone does not need it. If torch is
+# missing, neither extra is installed.
 _OF_EXTRAS = "torch"
-# With these environment variables, waiting threads sleep. The first is for GNU's OpenMP, the second for
+# These environment variables make waiting threads sleep. The first is read by GNU's OpenMP, the second by
 # Intel's.
 _SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 
 
 def let_waiting_threads_sleep() -> None:
-    """Let waiting threads of torch sleep; call this before torch is loaded. Otherwise threads spin while they
-    wait for one another.
+    """Make torch's threads sleep while they wait for one another; by default, they keep a processor busy
+    (they spin). Call this before torch is loaded.
 
     If another process keeps a processor busy, a computation with two spinning threads takes ten times as
     long. Environment variables that are already set are not changed.
@@ -32,8 +33,9 @@ def let_waiting_threads_sleep() -> None:
 def lazy_face(package: str, file: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
-    Use it in a package's ``__init__``. Type checkers follow the imports in this file. At run time the imports
-    are not executed; only their names are read::
+    Use it in a package's ``__init__``, as shown below. Type checkers follow the imports under
+    ``TYPE_CHECKING``. At run time these imports are not executed; the function only reads the names from the
+    file::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan

@@ -1,4 +1,4 @@
-"""Write files and folders that appear completely or not at all."""
+"""Write files and folders atomically: they appear at their path completely or not at all."""
 
 import contextlib
 import errno
@@ -17,8 +17,8 @@ from litho_data.foundation.errors import InputError
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, with the same suffix. The file that the block writes there
-    replaces ``path`` only if the block succeeds.
+    """Yield a temporary path beside ``path``, with the same suffix. The file that the ``with`` block writes
+    there replaces ``path`` only if the block ends without an error.
 
     Raises:
         InputError: ``path`` is a folder, or cannot be written.
@@ -45,13 +45,14 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
-    """Yield an empty folder that replaces ``path`` if the block succeeds. An older folder at ``path`` stays
-    until then.
+    """Yield an empty folder that replaces ``path`` if the ``with`` block ends without an error. An older
+    folder at ``path`` stays in place until then.
 
     For a path that a user chose, use ``litho_data.foundation.begun.whole_folder`` instead.
 
     Args:
-        wait: if true, wait for another process that is writing the folder; otherwise refuse.
+        wait: if another process is writing the folder, true means to wait for it and false means to raise an
+            InputError.
 
     Raises:
         InputError: ``path`` cannot be written, or another process is writing it.
@@ -87,11 +88,11 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
             try:
                 work.mkdir(parents=True, exist_ok=True)
             except FileExistsError:
-                # The last holder of the lock may have removed the folder since ``mkdir`` found it.
+                # The process that held the lock before may have removed the folder after ``mkdir`` found it.
                 if work.exists() and not work.is_dir():
                     raise
                 continue
-            # The last holder of the lock removes the lock file.
+            # The process that held the lock before may already have removed the lock file.
             with contextlib.suppress(FileNotFoundError):
                 lock = locked(work / "lock", target, wait)
                 if os.path.samestat(os.fstat(lock.fileno()), (work / "lock").stat()):
@@ -130,7 +131,7 @@ def _work(target: Path) -> Path:
 
 
 def _put_back(work: Path, target: Path) -> None:
-    """Put an older folder back if it was moved aside and no new folder took its place."""
+    """Move an older folder back to ``target`` if it was moved aside and no new folder took its place."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.replace(target)
@@ -152,7 +153,9 @@ def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
 
 
 def _lock(stream: IO[str], wait: bool = False) -> bool:
-    """Take the lock and return whether that succeeded. On a system without such locks, return True."""
+    """Try to lock an open file, and return whether that succeeded. On a system without such locks, return
+    True.
+    """
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -164,7 +167,9 @@ def _lock(stream: IO[str], wait: bool = False) -> bool:
 
 
 def _remove_unless_held(left: Path) -> None:
-    """Remove a partial file that a stopped process left, unless it is locked because it is being written."""
+    """Remove a partial file that a stopped process left. A file that is locked is still being written, and
+    stays.
+    """
     with contextlib.suppress(FileNotFoundError), open(left) as stream:
         if _lock(stream):
             left.unlink()
@@ -186,7 +191,8 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
     """Read a text file and parse it as TOML or JSON.
 
     Raises:
-        InputError: the file does not exist or cannot be parsed. The message starts with ``what``.
+        InputError: the file does not exist or cannot be parsed. The message starts with ``what`` and says
+            that ``wanted`` was expected.
     """
     try:
         return parse(read_text(file))
@@ -195,7 +201,7 @@ def parsed(file: Path, parse: Callable[[str], Any], what: str, wanted: str) -> A
 
 
 def table_beside(module: str, name: str) -> dict[str, Any]:
-    """Read the TOML file ``name`` that lies beside a module."""
+    """Read the TOML file ``name`` in the folder of a module; ``module`` is the module's ``__file__``."""
     return tomllib.loads(Path(module).with_name(name).read_text(encoding="utf-8"))
 
 

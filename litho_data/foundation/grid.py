@@ -1,4 +1,6 @@
-"""The pixel grid of an array (shape, pitch and origin), as all three packages use it."""
+"""The pixel grid of an array, given by its shape, pitch and origin. All three packages of the project use
+it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,7 @@ class PixelGrid:
 
     @classmethod
     def square(cls, shape: tuple[int, int], pitch_um: float) -> PixelGrid:
-        """Make a grid of square pixels whose top-left corner lies at the origin."""
+        """Make a grid of square pixels whose top-left corner lies at (0, 0)."""
         return cls((int(shape[0]), int(shape[1])), (float(pitch_um), float(pitch_um)))
 
     @property

@@ -1,4 +1,6 @@
-"""Compute the SHA-256 of what determines a result: files, arrays, plain data, source code."""
+"""Compute SHA-256 hashes of everything that can determine a result: files, arrays, plain data, source
+code.
+"""
 
 import hashlib
 import json
@@ -23,11 +25,11 @@ def file_sha256(path: str | Path) -> str:
 
 
 def array_sha256(array: Array, unit: str, dims: Sequence[str]) -> str:
-    """Return the hash of an array as it is after decoding. The hash covers the type, shape, values, unit and
-    dimension names, but not the division into chunks.
+    """Return the hash of a decoded array. The hash covers the type, shape, values, unit and dimension names.
+    It does not depend on how a file divides the array into chunks.
 
     Args:
-        array: any numeric or boolean array; every NaN counts as the same NaN.
+        array: any numeric or boolean array; all bit patterns of NaN are treated as equal.
         unit: unit of the stored values; "1" if they have none.
         dims: one name per axis.
 

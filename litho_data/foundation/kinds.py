@@ -1,4 +1,4 @@
-"""Types that many signatures use: maps, their shapes, pairs of lengths along y and x, plain data."""
+"""Type aliases that many signatures use: arrays, their shapes, pairs of lengths along y and x, plain data."""
 
 from collections.abc import Mapping
 from typing import Any

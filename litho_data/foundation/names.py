@@ -1,4 +1,4 @@
-"""Check that names from received files are plain before they become part of a path."""
+"""Check that names found in files from elsewhere are plain before they become part of a path."""
 
 import re
 from typing import Annotated
@@ -7,7 +7,7 @@ from pydantic import AfterValidator
 
 from litho_data.foundation.errors import InputError
 
-# File systems allow 255 bytes; the remaining bytes are left for suffixes.
+# Longest allowed name, in bytes. File systems allow 255 bytes; the difference is left for suffixes.
 _LONGEST_BYTES = 200
 _NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
 
@@ -22,7 +22,7 @@ def is_plain_name(name: object) -> bool:
         and not _NO_NAME.search(name)
         and name[0] not in ".-~ "
         and name[-1] not in ". "
-        # Surrogates stand for undecodable bytes, not for text.
+        # This excludes surrogates, which stand for bytes that could not be decoded.
         and name.isprintable()
     )
 

@@ -1,8 +1,8 @@
 """Rules for the option ``--out`` of every command: a command replaces only its own older result.
 
-A missing or empty folder is accepted. The folder of an earlier run is accepted if it is a run of the same
-command on the same subject (dataset, model, design) with the same settings. This run is resumed or repeated.
-Anything else is refused, and nothing is changed.
+A missing or empty folder is accepted. The folder of an earlier run is accepted if the same command was run on
+the same dataset, model or design with the same settings; the run is then resumed or repeated. Anything else
+is refused, and nothing is changed.
 """
 
 import json
@@ -21,7 +21,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
     Args:
         path: where the result will be.
-        holds: names, or patterns of names, of everything that such a result may contain.
+        holds: names, or patterns of names, of all files and folders that such a result may contain.
 
     Raises:
         InputError: the path is the current folder, a file, or a folder that contains anything else; the
@@ -46,7 +46,9 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_same(folder: Path, held: Any, facts: Facts) -> None:
-    """Refuse a folder whose record, of a finished or a begun result, states other facts than ``facts``."""
+    """Refuse a folder whose existing result was made with other settings: raise InputError if the record
+    ``held`` of the finished or begun result differs from ``facts``.
+    """
     other = first_difference(held, json.loads(json.dumps(facts))) if isinstance(held, dict) else ""
     if other:
         raise InputError(
@@ -75,8 +77,8 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     """Accept a path that does not exist, an empty folder, or a folder with the same kind of result, whose
     record file is ``record``.
 
-    A file counts as the record of a result if its name matches the kind of result in its schema:
-    ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
+    A file counts as the record of a result if its name matches the kind of result that its schema names. For
+    example, ``close_loop.json`` matches the schema ``litho-models/close-loop/1``.
 
     Args:
         path: folder of the result. If it already holds a result of this kind, other files in it are left
@@ -89,7 +91,7 @@ def require_own_folder(path: str | Path, record: str, *begun: str) -> None:
     """
     folder = Path(path)
     _refuse_a_file(folder)
-    # Hidden files, such as those of desktops and version control, do not count as content.
+    # Hidden files, such as those of file managers and version control, do not count as content.
     names = sorted(one.name for one in folder.glob("*") if not one.name.startswith("."))
     strangers = [name for name in names if name != record and _is_record(folder / name)]
     if not strangers and not any(fnmatch(name, mark) for name in names for mark in (record, *begun)):

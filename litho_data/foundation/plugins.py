@@ -1,4 +1,5 @@
-"""Plug-ins: modules that register your own reader, effect or model when they are imported.
+"""Load plug-ins, which are modules of users that register additional readers, effects or models when they are
+imported.
 
 A plug-in is found through its entry point in the group ``litholoop.plugins``, or given as a file. Every
 command and every worker loads all plug-ins before its work begins.
@@ -14,7 +15,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 
 GROUP, OPTION = "litholoop.plugins", "--plugin"
-# Maps the name or file of each loaded plug-in to its version or the beginning of its hash.
+# Maps the name of each loaded plug-in to its version, or the file of the plug-in to the beginning of the
+# file's hash.
 _LOADED: dict[str, str] = {}
 
 
@@ -35,7 +37,7 @@ def load_plugins(files: Iterable[str | Path] = ()) -> None:
 
 
 def plugin_files() -> list[str]:
-    """Return the plug-in files that were loaded, so that other processes can load them too."""
+    """Return the paths of the loaded plug-in files, so that other processes can load the same files."""
     return [name for name in _LOADED if Path(name).is_absolute()]
 
 
@@ -47,7 +49,8 @@ def plugin_versions() -> dict[str, str]:
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the words of a command line without any ``--plugin FILE``, and the list of those files.
+    """Split a command line: return its words without any ``--plugin FILE``, and the list of the plug-in
+    files.
 
     Raises:
         InputError: the option is given without a file.

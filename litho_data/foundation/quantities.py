@@ -1,4 +1,6 @@
-"""Allowed ranges of physical quantities: types for records, and checks for everything else."""
+"""Allowed ranges of physical quantities: annotated types for the fields of records, and checks for all other
+values.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated

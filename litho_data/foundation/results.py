@@ -18,8 +18,8 @@ _SHORT.maxstring = _SHORT.maxother = 120
 
 
 class Record(BaseModel):
-    """An immutable part of a result. Unknown keys are errors, except for the keys in ``FORMER``, which occur
-    only in older files and are ignored.
+    """Base class of immutable records, of which result files are composed. Unknown keys are errors. The keys
+    listed in ``FORMER`` occur only in older files and are ignored.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset()
@@ -34,7 +34,9 @@ class Record(BaseModel):
 
 
 class Result(Record):
-    """Base of the records that are result files. Subclasses set ``SCHEMA`` and ``FILE_NAME``."""
+    """Base class of records that are written as result files. Subclasses set ``SCHEMA``, the name and version
+    of the file's schema, and ``FILE_NAME``.
+    """
 
     SCHEMA: ClassVar[str]
     FILE_NAME: ClassVar[str]
@@ -60,11 +62,13 @@ class Result(Record):
         return pd.DataFrame(self._facts()).to_html(index=False, header=False)
 
     def _facts(self) -> list[tuple[str, str]]:
-        """Return the facts for a one-line summary: short values, names of parts, sizes of collections."""
+        """Return pairs (name of a field, text) for a one-line summary. The text is a short value, the name of
+        a nested record, or the size of a collection.
+        """
         facts = []
         for name in type(self).model_fields:
             value = getattr(self, name)
-            # A part that has a name (a dataset, a model) is represented by its name.
+            # A nested record that has a name (such as a dataset or a model) is represented by its name.
             value = getattr(value, "name", value)
             if isinstance(value, list | tuple | dict):
                 value = len(value)

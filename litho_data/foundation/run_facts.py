@@ -1,4 +1,4 @@
-"""The facts that every result states about its run: command, commit, versions, seeds, scans."""
+"""The facts that every result states about the run that made it: command, commit, versions, seeds, scans."""
 
 import platform
 import subprocess
@@ -23,10 +23,10 @@ _COMMAND: ContextVar[str] = ContextVar("command", default="")
 
 
 class RunFacts(Record):
-    """The command line and the code that made a result.
+    """The command line and the version of the code that made a result.
 
     ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed from the
-    commit. It is None if the code did not run from a Git checkout, and in older result files.
+    commit. It is None if the code did not run from a Git checkout, and in result files of older versions.
     """
 
     command: str = ""
@@ -36,8 +36,8 @@ class RunFacts(Record):
 
 
 class RunInfo(RunFacts):
-    """The command line, code and scans of a result; ``dropped`` lists the scans that were left out, each with
-    the reason.
+    """The command line, code, seeds and scans of a result. ``dropped`` lists the scans that were left out,
+    each with the reason.
     """
 
     seeds: list[int]
@@ -58,8 +58,8 @@ def run_facts() -> dict[str, Any]:
 
 @contextmanager
 def running_command(command: str) -> Iterator[None]:
-    """Record a command line in all results that are made inside this context. Library code alone cannot know
-    the command line.
+    """Record a command line in all results that are made inside the ``with`` block. Library code cannot find
+    out the command line by itself.
     """
     token = _COMMAND.set(command)
     try:

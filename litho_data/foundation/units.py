@@ -23,8 +23,8 @@ _IN_UM = {
     "ångström": 1e-4,
     "pm": 1e-6,
 }
-# MICRO SIGN and GREEK SMALL LETTER MU look the same, Bruker files write a tilde for both, and the ångström
-# has a sign of its own in addition to the letter.
+# Maps all signs for micro and for ångström to one letter each. MICRO SIGN and GREEK SMALL LETTER MU look the
+# same, Bruker files write a tilde instead, and the ångström has a sign of its own besides the letter Å.
 _SPELLINGS = str.maketrans({"\u00b5": "u", "\u03bc": "u", "~": "u", "\u212b": "å", "\u00c5": "å"})
 
 

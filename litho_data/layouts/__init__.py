@@ -1,4 +1,6 @@
-"""Make random layouts (by the paper's equation) and calibration patterns; compute statistics of layouts."""
+"""Make random layouts (by the equation of arXiv:2309.17343) and calibration patterns, and compute statistics
+of layouts.
+"""
 
 from litho_data.layouts.layout_set import PATTERNS, write_layout_set
 from litho_data.layouts.patterns import (

@@ -28,24 +28,27 @@ def write_card(
     levelled: bool = False,
     **tables: Facts,
 ) -> Path:
-    """Write a card for the layouts in the folder ``layouts`` and their scans in the folder ``scans``.
+    """Write a dataset card for layouts in the subfolder ``layouts`` and their scans in the subfolder
+    ``scans``.
 
     The scans may be added later.
 
     Args:
-        folder: folder in which the card is written.
-        name: name of the dataset. ``title`` is its title, on one line.
-        pitch_um: pixel pitch of the layouts, µm. ``level_height_um`` is the nominal height of a level, µm,
-            and ``levels`` is the number of levels.
-        scan_size_um: extent of a scan along y and x, µm. ``scan_format`` is the format of the microscope's
-            files.
-        levelled: whether a build uses the heights in the scan files without levelling them.
+        folder: folder that contains both subfolders, in which the card is written.
+        name: name of the dataset.
+        title: title of the dataset, on one line.
+        pitch_um: pixel pitch of the layouts, µm.
+        level_height_um: nominal height of a level, µm.
+        levels: number of levels.
+        scan_size_um: extent of a scan along y and along x, µm.
+        scan_format: format of the microscope's files.
+        levelled: whether the scan files will contain levelled heights, which a build uses as they are.
         tables: further tables of the card, such as ``ids`` and ``write``; values that are None are omitted.
 
     Raises:
         InputError: a value is not allowed in a card.
     """
-    plain = scan_format == "text-matrix"  # files of other formats state unit and size
+    plain = scan_format == "text-matrix"  # files of other formats state the unit and the size themselves
     scan = {
         "files": f"scans/{{id}}.{'txt' if plain else scan_format}",
         "format": scan_format,
@@ -87,13 +90,13 @@ def write_layout(folder: Path, scan_id: str, level: Array) -> Path:
 
     path = folder / "layouts" / f"{scan_id}.tif"
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Without a description, the bytes of the file depend only on the levels.
+    # Without a description in the TIFF, the bytes of the file depend only on the levels.
     tifffile.imwrite(path, level, compression="zlib", metadata=None, software=False)
     return path
 
 
 def write_table(folder: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Path:
-    """Write the CSV table to which the card refers."""
+    """Write the CSV table of facts about each scan, to which the card refers."""
     path = folder / TABLE_NAME
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)

@@ -27,14 +27,16 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# Width of a step of a framed ladder. The printer blurs each edge over 1 µm, so a flat strip of 1 µm remains
-# between two edges.
+# Width of each step of a framed ladder. The printer blurs each edge over 1 µm on both sides, so a flat strip
+# of 1 µm remains in the middle of the step.
 _TREAD_UM = 3.0
 
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, its relative dose, and the use of its scan (see the card's table)."""
+    """One layout with its id, its relative dose, and the use of its scan (one of the uses that a dataset
+    card's table may state).
+    """
 
     id: str
     level: Array
@@ -44,7 +46,7 @@ class NamedLayout:
 
 @dataclass(frozen=True)
 class SetSettings:
-    """The arguments of `write_layout_set`."""
+    """The arguments of `write_layout_set`, as a record."""
 
     count: int
     shape: Shape
@@ -84,20 +86,25 @@ def write_layout_set(
 
     Args:
         pattern: a key of `PATTERNS`.
-        count: number of random layouts, or number of doses of a dose matrix.
+        count: number of random layouts, or number of doses in a dose matrix (one layout printed with several
+            doses).
         size_px: side length of a square layout in pixels, or its shape (ny, nx).
         levels: number of levels.
-        cutoff_per_um: cut-off frequency of the low-pass filter that makes random layouts, cycles/µm.
-        passband: pass band of this filter, ``square`` or ``round``.
+        cutoff_per_um: cut-off frequency, in cycles/µm, of the low-pass filter with which random layouts are
+            made.
+        passband: shape of the pass band of this filter, ``square`` or ``round``; see ``random_layout``.
         pitch_um: pixel pitch, µm.
         level_height_um: nominal height of a level, µm.
         seed: seed of every random draw.
-        quantiser: rounding to whole levels, ``round`` or ``floor``. ``field_px`` is the side length of a
-            larger field from which random layouts are cut. For both, see ``random_layout``.
+        quantiser: how random layouts are rounded to whole levels, ``round`` or ``floor``; see
+            ``random_layout``.
+        field_px: side length, in pixels, of a larger field from whose middle each random layout is cut; None to
+            make the layouts without a larger field.
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
-            folder contains anything but a set with these settings, such as scans.
+            folder contains anything but a set that was made with these settings. Scans count as other
+            content, too.
     """
     require_known("pattern", pattern, PATTERNS)
     LEVELS.require("levels of a layout", levels)
@@ -185,8 +192,8 @@ def _features(settings: SetSettings, feature: int, ground: int) -> Array:
 
 
 def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
-    # The frame has twice the cut-off frequency of the settings, because finer structure determines the
-    # lateral scale better.
+    # The frame is a random layout with twice the cut-off frequency of the settings, because finer structure
+    # determines the lateral scale better.
     frame = random_layout(
         settings.shape,
         levels=settings.levels,

@@ -1,4 +1,4 @@
-"""Draw calibration patterns. The print of each pattern shows one property of the printer at a time.
+"""Draw calibration patterns, each of which isolates one property of the printer.
 
 All pattern functions return an array of levels, shape (ny, nx), in the smallest unsigned type. Lengths are in
 whole pixels.
@@ -17,8 +17,8 @@ def flat(shape: Shape, *, level: int) -> Array:
 
 
 def step_ladder(shape: Shape, *, highest: int) -> Array:
-    """Draw stairs along x, with one step for each level from 0 to ``highest``, to measure how the height
-    depends on the level. All steps have about the same width.
+    """Draw a staircase that rises along x, with one step for each level from 0 to ``highest``, to measure how
+    the printed height depends on the level. All steps have about the same width.
     """
     _positive(highest, "highest level of a step ladder")
     steps = highest + 1
@@ -29,17 +29,18 @@ def step_ladder(shape: Shape, *, highest: int) -> Array:
 
 
 def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0) -> Array:
-    """Draw stairs along x inside a registration frame, to measure how height and roughness depend on the
-    level.
+    """Draw a staircase that rises along x inside a registration frame, to measure how the printed height and
+    the roughness depend on the level.
 
-    A ladder alone looks the same after a shift along its edges, so a scan of it cannot be registered. The
-    frame, whose width is a fifth of the side, makes registration possible. The stairs rise evenly from
-    ``lowest`` to ``highest``, with one step for each level if the width allows it.
+    A staircase alone looks the same after a shift along its edges, so a scan of it cannot be registered. The
+    frame makes registration possible; on each side, its width is a fifth of the layout's side. The staircase
+    rises evenly from ``lowest`` to ``highest``, with one step for each level if there is room.
 
     Args:
-        frame: layout of shape (ny, nx) that has no periodic pattern. The stairs replace its middle.
-        highest: level of the last step. ``lowest`` is the level of the first step.
-        tread_px: smallest width of a step; at least 3 steps must fit.
+        frame: layout of shape (ny, nx) that has no periodic pattern. The staircase replaces its middle.
+        highest: level of the last step.
+        tread_px: smallest allowed width of a step, in pixels. At least 3 steps of this width must fit.
+        lowest: level of the first step.
     """
     inset_y, inset_x = (size // 5 for size in frame.shape)
     width = frame.shape[1] - 2 * inset_x
@@ -57,8 +58,8 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
 
 
 def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Array:
-    """Draw a checkerboard of squares whose sides are ``cell_px`` pixels long, to measure lateral scale, shear
-    and the rounding of corners.
+    """Draw a checkerboard of squares whose sides are ``cell_px`` pixels long, to measure the lateral scale,
+    the shear and the rounding of corners.
 
     The square at the top left has the level ``high``.
     """
@@ -70,8 +71,8 @@ def checkerboard(shape: Shape, *, cell_px: int, high: int, low: int = 0) -> Arra
 def line_space_sweep(
     shape: Shape, *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
 ) -> Array:
-    """Draw lines, each followed by a space of the same width, to measure how the print's resolution depends
-    on the line width.
+    """Draw lines, each followed by a space of the same width, to measure how well lines of each width are
+    printed.
 
     Each line is one pixel wider than the line before.
 
@@ -106,12 +107,12 @@ def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
-    """Draw isolated squares of the given widths, to measure the size of the printer's spot, and the shrinkage
-    and collapse of single features.
+    """Draw isolated squares of the given widths, to measure the size of the printer's spot and how single
+    features shrink and collapse.
 
-    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. The layout is divided into a
-    square array of cells. In reading order, each cell contains one square in its middle. The space between
-    two squares is at least twice the larger width.
+    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. The layout is divided into as
+    many rows as columns of cells. The cells are filled in reading order, each with one square in its middle.
+    The space between two neighbouring squares is at least twice the width of the larger one.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)
@@ -131,7 +132,9 @@ def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, g
 
 
 def relative_doses(count: int) -> Array:
-    """Return the doses of a dose matrix, evenly spaced from 0.7 to 1.3, shape (count,)."""
+    """Return the relative doses (1 is the nominal dose) of a dose matrix, evenly spaced from 0.7 to 1.3. The
+    result has shape (count,).
+    """
     if count < 2:
         raise InputError("dose matrix", got=count, wanted="at least 2 doses")
     return np.linspace(0.7, 1.3, count)

@@ -29,9 +29,10 @@ def random_layout(
     and the largest to 1, and ``Q`` rounds to the nearest of ``levels`` values (halves are rounded up). The
     result is periodic in both directions.
 
-    The paper does not define the low-pass filter. The measured layouts show a sharp square pass band of ±0.25
-    cycles/µm (prints 1–4) or ±0.5 cycles/µm (prints 6 and 7). These layouts were cut from a larger field, and
-    their levels were rounded down; ``quantiser="floor", field_px=540`` makes similar layouts.
+    The paper does not define the low-pass filter. The spectra of the layouts that its authors published show
+    a sharp square pass band of ±0.25 cycles/µm (prints 1–4) or ±0.5 cycles/µm (prints 6 and 7). These layouts
+    were cut from a larger field, and their levels were rounded down; ``quantiser="floor", field_px=540``
+    makes similar layouts.
 
     Args:
         shape: shape (ny, nx) of the layout in pixels.
@@ -39,10 +40,10 @@ def random_layout(
         cutoff_per_um: highest spatial frequency that the filter passes, cycles/µm.
         pitch_um: pixel pitch, µm.
         seed: seed of the noise, as `numpy.random.default_rng` accepts it.
-        passband: ``square`` limits the frequency along each axis separately. ``round`` limits the length of
-            the frequency vector.
-        quantiser: ``round`` rounds as in the paper's equation; ``floor`` rounds down, so only the largest
-            value gets the highest level.
+        passband: ``square`` applies the cut-off to the frequencies along x and along y separately. ``round``
+            applies it to the length of the frequency vector.
+        quantiser: ``round`` rounds as in the paper's equation; ``floor`` rounds down, so only pixels with the
+            largest value of all get the highest level.
         field_px: side length, in pixels, of a larger field from whose middle the layout is cut. Such a layout
             is not periodic and may lack the lowest or the highest level. If None, the layout is the whole
             field.
@@ -71,7 +72,8 @@ def random_layout(
         passband=passband,
     )
     lowest, highest = field.min(), field.max()
-    # If only the mean passes, rounding errors of the transform still cause variations of about 1e-17.
+    # If only the mean passes the filter, rounding errors of the transform still cause variations of about
+    # 1e-17.
     if highest - lowest < 1e-12:
         raise InputError(
             "cutoff_per_um of a random layout",
@@ -96,7 +98,8 @@ def low_pass(field: Array, *, cutoff_per_um: float, pitch_um: float, passband: s
         distance = np.maximum(np.abs(frequency_y), frequency_x)
     else:
         distance = np.hypot(frequency_y, frequency_x)
-    # An even filter keeps a real field real, so the half-plane transform is enough.
+    # The filter is an even function of frequency, so the filtered field is real and a real transform is
+    # enough.
     return np.fft.irfft2(np.fft.rfft2(field) * (distance <= cutoff_per_um), s=field.shape)
 
 

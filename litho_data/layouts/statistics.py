@@ -16,15 +16,15 @@ _BIN_PER_UM = 0.05
 
 
 class LayoutStatistics(Result):
-    """Pooled statistics of a set of layouts.
+    """Statistics of a set of layouts, pooled over all layouts.
 
     Args:
         level_share: share of the pixels that have each level; the shares sum to 1.
         jump_share: share of the pairs of neighbouring pixels (along x and y) whose levels differ by 0, 1, 2
             …; the shares sum to 1.
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
-        power_share: share of the spectral power (without that of the mean level) in each bin; the shares sum
-            to 1.
+        power_share: share of the spectral power in each frequency bin; the shares sum to 1. The power of the
+            mean level is left out.
         settings: settings with which ``write_layout_set`` made the layouts; None if it did not make them.
     """
 
@@ -42,7 +42,7 @@ class LayoutStatistics(Result):
 
 
 def layout_statistics(layouts: Iterable[Array | Path], *, levels: int, pitch_um: float) -> LayoutStatistics:
-    """Compute the pooled statistics of layouts, reading one layout at a time.
+    """Compute statistics pooled over all layouts, with only one layout in memory at a time.
 
     Args:
         layouts: arrays of levels, each of shape (ny, nx), or paths of layout files.
@@ -91,9 +91,11 @@ def _checked(layout: Array | Path, levels: int) -> Array:
 
 
 def _radial_power(level: Array, pitch_um: float) -> Array:
-    """Return the spectral power of a layout about its mean in radial frequency bins. The values sum to 1.
+    """Subtract the mean from a layout, and return the share of its spectral power in each radial frequency
+    bin. The shares sum to 1.
 
-    The bins extend to the Nyquist frequency of the axes; the last bin includes all higher frequencies.
+    The bins extend to the Nyquist frequency along an axis; the last bin includes all higher frequencies,
+    which occur in the corners of the spectrum.
     """
     window = np.outer(np.hanning(level.shape[0]), np.hanning(level.shape[1]))
     weighted = (level - (level * window).sum() / window.sum()) * window

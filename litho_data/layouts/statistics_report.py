@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 4
-# Lower limit of the logarithmic axes. Shares below this limit are only rounding errors.
+# Lower limit of the logarithmic axes. Shares below this limit are nothing but rounding errors.
 _LEAST_SHARE = 1e-6
 
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
-    """Make a page with pictures of the first layouts, the shares of levels and jumps, and the spectrum."""
+    """Make a page with pictures of the first layouts, the shares of the levels, the shares of the jumps
+    between neighbouring pixels, and the spectrum.
+    """
     from litho_data.readers import read_layout
 
     page = Page(
