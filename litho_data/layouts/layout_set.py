@@ -98,8 +98,8 @@ def write_layout_set(
         seed: seed of every random draw.
         quantiser: how random layouts are rounded to whole levels, ``round`` or ``floor``; see
             ``random_layout``.
-        field_px: side length, in pixels, of a larger field from whose middle each random layout is cut; None to
-            make the layouts without a larger field.
+        field_px: side length, in pixels, of a larger field from whose middle each random layout is cut; None
+            to make the layouts without a larger field.
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the

@@ -1,4 +1,6 @@
-"""Level scans. Every levelling operation returns the levelled map and the surface that it removed."""
+"""Level scans, i.e. remove tilt, bow and row offsets from their heights. Every levelling operation returns
+the levelled height map and the surface that it subtracted.
+"""
 
 from litho_data.level.features import mark_features, mask_and_relevel
 from litho_data.level.layout_aware import layout_in_scan_frame, level_layout_aware

@@ -1,4 +1,6 @@
-"""Mark features that levelling must not follow, such as particles or structures, and level without them."""
+"""Mark features to which the background must not be fitted, such as particles or structures, and level a scan
+without them.
+"""
 
 from typing import Annotated, Literal
 
@@ -22,7 +24,8 @@ Side = Literal["above", "below", "both"]
 Threshold = Annotated[float, Field(gt=0)]
 Grown = Annotated[int, Field(ge=0)]
 _MAX_ROUNDS = 50
-# If less than this share of the selected pixels is background, the fitted background is unreliable.
+# Smallest accepted share of background among the selected pixels. With less, the fitted background is
+# unreliable.
 _LEAST_BACKGROUND = 0.02
 
 
@@ -35,15 +38,18 @@ def mark_features(
     side: Side = "both",
     grow_px: Grown = 0,
 ) -> Array:
-    """Mark the pixels whose distance from the main surface exceeds ``threshold`` times the noise sigma.
+    """Mark the pixels whose height differs from that of the main surface by more than ``threshold`` times the
+    noise sigma.
 
-    The main surface is the median of the selected pixels, and the noise sigma is 1.4826 · MAD, so features
-    must be a minority. Measured pixels that were not selected are marked too, so the mask contains all pixels
-    that later steps should exclude.
+    The height of the main surface is the median over the selected pixels, and the noise sigma is 1.4826 times
+    the median absolute deviation (MAD) from it. Both are reliable only if features cover less than half of
+    these pixels. Measured pixels that were not selected are marked too, so the mask contains all pixels that
+    later steps should exclude.
 
     Args:
         z: heights in any unit, already levelled, shape (ny, nx).
-        threshold: distance above which a pixel is marked, in units of the noise sigma.
+        threshold: height difference from the main surface above which a pixel is marked, in units of the
+            noise sigma.
         side: whether to mark pixels above the main surface, below it, or on both sides.
         grow_px: number of pixels by which the marked areas are widened, to cover blurred edges.
 
@@ -70,19 +76,21 @@ def mask_and_relevel(
     side: Side = "both",
     grow_px: Grown = 2,
 ) -> MaskedLevelling:
-    """Level, mark the features, and level again without them, until the marks no longer change.
+    """Level a scan, mark its features, and level it again without the marked pixels, until the marks no
+    longer change.
 
-    The first background is a robust polynomial fit (Tukey's biweight). The later backgrounds are
-    least-squares fits to the unmarked pixels. The background is subtracted with its constant term, so that
-    the main surface lies at zero. The returned mask marks the same pixels as ``mark_features``.
+    In the first round, the background is a robust polynomial fit (Tukey's biweight). In all later rounds, it
+    is a least-squares fit to the unmarked pixels. The whole background, including its constant term, is
+    subtracted, so that the main surface lies at zero. The returned mask marks the same pixels as
+    ``mark_features``.
 
     Raises:
         InputError: a parameter is outside its range, or the features leave too few background pixels.
     """
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     surface = robust_surface(z, chosen, terms)
-    # The noise is estimated only once. If it were estimated over the unmarked pixels, it would shrink in
-    # every round.
+    # The noise is estimated only once. If it were estimated again in every round from the unmarked pixels,
+    # the estimate would shrink each time.
     limit = threshold * noise_sigma((z - surface)[chosen])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):

@@ -1,4 +1,6 @@
-"""Level a scan using its layout, so that the slope and bow of the printed structure itself are kept."""
+"""Level a scan with the help of its layout, so that slope and bow which belong to the printed structure are
+kept.
+"""
 
 from __future__ import annotations
 
@@ -39,23 +41,24 @@ def level_layout_aware(
 ) -> Levelled:
     """Fit the background and the printed structure together, and subtract only the background.
 
-    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g is a piecewise linear
-    function, fitted freely, with one knot per level. A polynomial fit without g would count the slope of the
-    printed structure as background. The datum (the unknown zero height of the scan) is part of g. The
-    subtracted polynomial therefore has no free constant term, and its mean over the fitted pixels is zero.
+    The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g, the height as a function
+    of the level, is a piecewise linear function with one freely fitted value per level. A polynomial fit
+    without g would treat the slope of the printed structure as background. The datum (the unknown zero height
+    of the scan) is part of g. The subtracted polynomial therefore has no free constant term, and its mean
+    over the fitted pixels is zero.
 
     Args:
         z: heights in any unit, shape (ny, nx).
         layout_level: level of the layout under each pixel of the scan, shape (ny, nx), NaN outside the
             layout; see ``layout_in_scan_frame``.
         blur_px: sigma, in pixels, of the Gaussian that blurs the layout as printing does. By default, a few
-            values are tried and the best one is used. Pixels within two sigma of the layout's edge are not
-            fitted, because their height depends on what surrounds the layout.
+            values are tried, and the one with the best fit is used. Pixels within two sigma of the layout's
+            edge are not fitted, because their height depends on what surrounds the layout.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
         InputError: the layout has another shape than the scan, does not overlap with it, or cannot be
-            separated from the background because it looks like a background, as a ramp does.
+            separated from the background because it has the same form, as a ramp does.
     """
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
@@ -78,8 +81,8 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the known pixels except those within ``border_px`` of unknown pixels. If this leaves too few,
-    select all known pixels.
+    """Select the pixels at which ``known`` is true, except those within ``border_px`` of a pixel at which it
+    is false. If this leaves too few, select all known pixels.
     """
     if known.all():
         return known
@@ -99,8 +102,10 @@ def layout_in_scan_frame(
 
     Args:
         layout_level: levels of the layout, shape (ny, nx).
-        scan_to_layout: 3 x 3 matrix that maps (x_um, y_um, 1) from the scan's frame to the layout's.
-        bend_um: bend of the scan, which is removed before ``scan_to_layout`` is applied.
+        scan_to_layout: 3 x 3 matrix that maps homogeneous coordinates (x_um, y_um, 1) in the scan's frame to
+            those in the layout's frame.
+        bend_um: bend of the scan lines; it is removed from the coordinates before ``scan_to_layout`` is
+            applied.
 
     Returns:
         A float64 array of shape ``scan_shape``. Each value is that of the nearest layout pixel, because
@@ -119,8 +124,8 @@ def layout_in_scan_frame(
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Fit background and structure together. Return the background's Legendre coefficients, and the negative
-    of the sum of squares that the fit explains.
+    """Fit background and structure together. Return the Legendre coefficients of the background, and the sum
+    of squares that the fit explains with a minus sign, so that the best fit has the lowest value.
     """
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
@@ -141,8 +146,8 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
 
 
 def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, Array]:
-    """Sum the normal equations of the joint fit over strips of rows, so that the whole design matrix is never
-    in memory.
+    """Return the matrix and the right-hand side of the normal equations of the joint fit. They are summed
+    over strips of rows, so that the whole design matrix is never in memory.
     """
     x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))

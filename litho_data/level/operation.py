@@ -1,5 +1,5 @@
-"""Define the operations of levelling recipes: functions whose signatures state their parameters, defaults and
-limits.
+"""Make functions usable as steps of levelling recipes. The signature of such a function states the parameters
+of the step, their defaults and their limits.
 """
 
 import inspect
@@ -17,15 +17,15 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The steps that a recipe can contain, by the name of the operation."""
-# Arguments whose values come with the scan and are therefore not settings of a step, and how messages name
-# them.
+# Arguments whose values come with the scan, so they are not settings of a step. The values are the phrases
+# with which messages name these arguments.
 _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The state between two steps of a recipe: the heights (µm), the current mask, and the pitch and the
-    layout if they are known.
+    """What one step of a recipe passes to the next: the heights (µm), the current mask, and, if known, the
+    pitch and the layout.
     """
 
     height_um: Array
@@ -37,14 +37,14 @@ class State:
 class Step(BaseModel):
     """Base class of the steps of a recipe. The fields of a step are the arguments of its operation.
 
-    ``masking`` says how the current mask is used. The current mask is the one that the last step made that
-    marked pixels. Before any such step, it is the scan's mask.
+    ``masking`` says how the step uses the current mask: the mask made by the last earlier step that marked
+    pixels, or, if there is no such step, the scan's own mask.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     function: ClassVar[Callable[..., Any]]
-    # The arguments whose values come with the scan, and whether each is optional.
+    # Maps the name of each argument whose value comes with the scan to whether the argument is optional.
     of_scan: ClassVar[dict[str, bool]]
 
     op: str
@@ -65,14 +65,13 @@ class Step(BaseModel):
 
 
 def operation(op: str) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Return a decorator that registers a function of heights and usable pixels as the recipe operation
-    ``op``.
+    """Return a decorator that registers a function as the operation named ``op`` of levelling recipes.
 
-    The function receives two arrays of shape (ny, nx): the heights (float64), and which pixels are usable
-    (bool). Callers of the decorated function pass a height map of any type, a ``mask`` and ``masking``, from
-    which ``select`` determines the usable pixels. Keyword arguments of the function become fields of the step
-    and are checked at every call, except for arguments whose values come with the scan. The function returns
-    a ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
+    The function receives two arrays of shape (ny, nx): the heights (float64), and a bool array that is True
+    at the usable pixels. Callers of the decorated function instead pass a height map of any numeric type, a
+    ``mask`` and a ``masking``, from which ``select`` determines the usable pixels. The keyword arguments of
+    the function, except those whose values come with the scan, become fields of the step and are checked at
+    every call. The function returns a ``Levelled``, a ``MaskedLevelling``, or a bool array of pixels to mark.
     """
 
     def made(function: Callable[..., R]) -> Callable[..., R]:

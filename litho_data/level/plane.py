@@ -1,5 +1,5 @@
-"""Remove the tilt of a scan, given by a fitted plane or by the prevailing facet, and set the zero height, as
-Gwyddion does.
+"""Remove the tilt of a scan, and choose which height is zero, by the same rules as Gwyddion. The tilt is that
+of a fitted plane or of the prevailing facet, i.e. the most common orientation of the surface.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ def level_plane(z: Array, chosen: Array) -> Levelled:
     """Subtract the tilt of the least-squares plane. The height at the pivot (column nx/2, row ny/2) does not
     change.
 
-    As in Gwyddion, the fitted constant of the plane is replaced by -(bx nx + by ny) / 2, where bx and by are
-    the slopes of the plane in height per pixel. The mean height of the scan therefore changes by (bx + by) /
-    2.
+    As in Gwyddion, the constant term of the subtracted plane is not the fitted one but -(bx nx + by ny) / 2,
+    where bx and by are the slopes of the plane in height per pixel. The mean height of the scan therefore
+    changes by (bx + by) / 2.
 
     Raises:
         InputError: the selected pixels do not determine a plane. (Gwyddion removes nothing in this case.)
     """
     coefficients = fit_terms(z, chosen, polynomial_terms(1, 1, 1))
-    # The plane is fitted in coordinates from -1 to 1.
+    # `fit_terms` uses coordinates from -1 to 1, so its slopes are converted to height per pixel.
     ny, nx = z.shape
     return _without_tilt(z, 2 * coefficients[0, 1] / (nx - 1), 2 * coefficients[1, 0] / (ny - 1))
 
@@ -37,14 +37,14 @@ def level_facet(z: Array, chosen: Array, *, pitch_um: YX) -> Levelled:
     """Subtract the tilt of the prevailing facet. The height at the pivot (column nx/2, row ny/2) does not
     change.
 
-    ``prevailing_slope`` finds the tilt from the slopes v of all 2 x 2 cells whose four pixels are selected,
-    with the weights exp(-|v|² / s²) and s² = mean |v|² / 20. The iteration ends when the change of the slope
-    is below sqrt(1e-9), the limit of Gwyddion 2.62. (Version 2.45 has the limit sqrt(1e-8), which changes the
-    result by 2e-3 of the height range.)
+    The tilt is found iteratively by ``prevailing_slope`` from the slopes v of all 2 x 2 cells whose four
+    pixels are selected, with the weights exp(-|v|² / s²) and s² = mean |v|² / 20. The iteration ends when the
+    slope changes by less than sqrt(1e-9), as in Gwyddion 2.62. (Gwyddion 2.45 uses the limit sqrt(1e-8),
+    which changes the result by 2e-3 of the height range.)
 
     Args:
-        z: heights in µm, shape (ny, nx). The slopes are physical, so heights and pitch must have the same
-            unit.
+        z: heights in µm, shape (ny, nx). Slopes are computed as height / length, so heights and pitch must
+            have the same unit.
         pitch_um: pixel pitch along y and x, µm.
 
     Raises:

@@ -15,15 +15,16 @@ Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
 # If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this limit, the
-# smallest eigenvalue is only rounding error.
+# smallest eigenvalue is nothing but rounding error, so the fit is not determined.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
-# Widths of the weight functions in units of the noise. With these widths, the fits have 95 % of the
-# efficiency of least squares under Gaussian noise (Holland and Welsch 1977, doi:10.1080/03610927708827533).
+# Widths of Huber's and Tukey's weight functions in units of the noise. With these widths, the robust fits
+# have 95 % of the efficiency of least squares under Gaussian noise (Holland and Welsch 1977,
+# doi:10.1080/03610927708827533).
 _HUBER, _TUKEY = 1.345, 4.685
 _MAD_TO_SIGMA = 1.4826
 _MAX_ROUNDS = 200
-# A change of the surface below this limit, in units of the noise, is too small to matter.
+# The robust fit ends when the surface changes by less than this, in units of the noise.
 _SETTLED = 1e-7
 
 
@@ -64,9 +65,10 @@ def level_robust(
     """Subtract a robustly fitted polynomial, including its constant term, so that the main surface lies at
     zero.
 
-    The fit is iteratively reweighted least squares; its scale is 1.4826 · MAD of the residuals. Tukey's
-    biweight gives features far from the surface no weight. The iteration starts from the Huber fit, whose
-    loss has a single minimum.
+    The polynomial is fitted by iteratively reweighted least squares. Residuals are measured in units of
+    1.4826 times their median absolute deviation (MAD). The weights are Tukey's biweight, which gives features
+    far from the surface no weight. The iteration starts from a fit with Huber's weights, because Huber's loss
+    has a single minimum.
 
     Args:
         z: heights in any unit, shape (ny, nx).
@@ -95,8 +97,8 @@ def robust_surface(z: Array, chosen: Array, terms: Terms) -> Array:
 
 
 def noise_sigma(residual: Array) -> float:
-    """Return 1.4826 times the median absolute residual. This is the sigma of Gaussian noise, even if there
-    are a few outliers.
+    """Return 1.4826 times the median absolute residual. For Gaussian noise this is the standard deviation,
+    and a few outliers hardly change it.
     """
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
@@ -124,9 +126,11 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
     """Fit the heights by weighted least squares, and return the coefficients c[q, p] of the products P_q(y)
     P_p(x) of Legendre polynomials.
 
-    Column j has the coordinate x = 2 j / (nx - 1) - 1, from -1 to 1, and likewise for y. If a set of terms
-    contains all lower terms, Legendre products span the same polynomials as powers, but are far better
-    conditioned. The moments are separable, so the fit costs only a few thin matrix products.
+    Column j has the coordinate x = 2 j / (nx - 1) - 1, from -1 to 1; rows have y coordinates defined in the
+    same way. If a set of terms contains, for each of its terms, all terms of lower degrees, then products of
+    Legendre polynomials span the same polynomials as products of powers, but the fit is far better
+    conditioned. The sums over the pixels separate into x and y, so the fit costs only a few products of thin
+    matrices.
 
     Args:
         z: heights, shape (ny, nx); NaN only where the weight is zero.
@@ -150,7 +154,8 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
         )
     residual = np.where(weights > 0, z, 0.0)
     coefficients = np.zeros((basis_y.shape[1], basis_x.shape[1]))
-    # If the mask makes the fit badly conditioned, a second round removes the rounding error of the first.
+    # If the mask makes the fit badly conditioned, a second round fits what the rounding errors of the first
+    # left over.
     for _ in range(1 if scales[-1] <= _WELL_CONDITIONED * scales[0] else 2):
         right = (basis_y.T @ (weights * residual) @ basis_x)[q, p]
         step = np.zeros_like(coefficients)
@@ -161,7 +166,9 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
 
 
 def evaluate(coefficients: Array, shape: Shape) -> Array:
-    """Return the surface of the given shape that has the coefficients returned by ``fit_terms``."""
+    """Evaluate the surface that is given by coefficients as returned by ``fit_terms``, on a grid of the given
+    shape.
+    """
     basis_y, basis_x = (_basis(n, k - 1) for n, k in zip(shape, coefficients.shape, strict=True))
     return basis_y @ coefficients @ basis_x.T
 

@@ -1,4 +1,6 @@
-"""Levelling recipes: lists of steps, written in TOML or Python and stored with the data."""
+"""Levelling recipes: lists of levelling steps, written in TOML or Python and stored with the levelled
+data.
+"""
 
 import tomllib
 import warnings
@@ -10,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import litho_data.level.features
 import litho_data.level.layout_aware
 
-# Importing each module registers its operations.
+# These modules are imported because each registers its operations when it is imported.
 import litho_data.level.plane
 import litho_data.level.polynomial
 import litho_data.level.scars  # noqa: F401
@@ -69,8 +71,8 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Return plain data, as ``from_dict`` takes them, with everything that determines the result of the
-        recipe, including all defaults.
+        """Return the recipe as plain data that ``from_dict`` accepts. The data contain every setting that
+        affects the result, including the defaults.
         """
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
@@ -107,7 +109,9 @@ class Recipe(BaseModel):
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
-        """Return the result of ``apply``, and the texts of the warnings that its steps issued."""
+        """Level a scan as ``apply`` does. Return the result, and the texts of the warnings that the steps
+        issued.
+        """
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)
             levelled = self.apply(scan, **arguments)

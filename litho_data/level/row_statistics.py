@@ -1,4 +1,6 @@
-"""Compute the trimmed mean, or the modus (estimated most frequent value), of selected values in each row."""
+"""Compute the trimmed mean or the modus (an estimate of the most frequent value) of the selected values in
+each row.
+"""
 
 import numpy as np
 
@@ -6,22 +8,22 @@ from litho_data.foundation import Array
 
 _FEW_FOR_MODUS = 9
 METRE_PER_UM = 1e-6
-# Heights in metres are rounded to this many significant digits. Files state fewer digits, and the rounding
-# errors of unit conversions affect only later digits.
+# Heights in metres are rounded to this many significant digits. Files state fewer digits, so the rounding
+# removes only the errors of unit conversions.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to this exponent are exact in double precision.
 _LARGEST_EXACT_POWER = 22
 
 
 def row_trimmed_mean(values: Array, chosen: Array, trim: float) -> Array:
-    """Return the trimmed mean of each row. It is the mean of sorted[t : n - t], where ``sorted`` are the n
+    """Return the trimmed mean of each row: the mean of sorted[t : n - t], where ``sorted`` contains the n
     selected values of the row in ascending order and t = floor(trim n + 0.5).
 
-    If this range is empty, the result is the upper median sorted[n // 2], which for even n differs from the
-    mean of the two middle values. A row without selected values gives 0.
+    If this slice is empty, the result is the upper median sorted[n // 2], which for even n is the larger of
+    the two middle values. The result is 0 for a row without selected values.
     """
     counts = chosen.sum(axis=1)
-    # Sorting places unselected values after all others.
+    # Unselected values become infinite, so that sorting places them last.
     ordered = np.sort(np.where(chosen, values, np.inf), axis=1)
     cut = np.floor(trim * counts + 0.5).astype(int)
     first = np.where(2 * cut >= counts, counts // 2, cut)
@@ -38,9 +40,10 @@ def row_modus(values: Array, chosen: Array) -> Array:
     length is the difference between its last and its first value. With fewer than 9 values, the result is the
     upper median; without selected values, it is 0.
 
-    If heights have few digits, several windows often have the same length. Gwyddion chooses the window that
-    is shortest in metres. The lengths are therefore compared in metres, after rounding the values to 12
-    digits, so that the unit of the file does not affect the choice.
+    If heights have few digits, several windows often have the same length, and rounding errors would decide
+    which is the shortest. Gwyddion compares the lengths in metres. This function therefore converts the
+    values to metres and rounds them to 12 digits, so that the choice is the same as Gwyddion's for every unit
+    of the file.
     """
     return np.array([_modus(np.sort(row[use])) for row, use in zip(values, chosen, strict=True)])
 

@@ -1,4 +1,6 @@
-"""Align the rows of a scan by the methods of Gwyddion's function Align Rows."""
+"""Align the rows of a scan, i.e. remove the height offsets between them, by the methods of Gwyddion's
+function Align Rows.
+"""
 
 import warnings
 from typing import Annotated, Literal
@@ -43,23 +45,23 @@ def align_rows(
     pitch_um: YX | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Align the rows of a scan. Warn if the print, instead of an offset between rows, seems to have caused
-    some of the shifts.
+    """Align the rows of a scan. Warn if some of the shifts between rows seem to be part of the print instead
+    of an error of the scan.
 
     Args:
-        z: heights in µm, shape (ny, nx). ``"matching"`` and ``"modus"`` require this unit, because both
-            convert heights to metres as Gwyddion does. The unit matters because the weights of ``"matching"``
-            compare a squared height with a height, and because ``"modus"`` chooses between windows of equal
-            length.
-        method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that this statistic is the same
-            for all rows. The two ``-of-differences`` methods and ``matching`` add up the steps between
-            neighbouring rows, which preserves large features. ``polynomial`` subtracts a polynomial that is
-            fitted to each row separately. ``facet-tilt`` removes the prevailing slope of each row, found in
-            up to 30 passes.
-        direction: lines to align; ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
+        z: heights in µm, shape (ny, nx). The methods ``"matching"`` and ``"modus"`` require this unit,
+            because they convert heights to metres to give the same result as Gwyddion. Their results depend
+            on the unit: the weights of ``"matching"`` compare a squared height with a height, and rounding
+            errors decide between windows of equal length in ``"modus"``.
+        method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that the median, trimmed mean or
+            modus is the same for all rows. The two ``-of-differences`` methods and ``matching`` estimate the
+            step between each pair of neighbouring rows and add up these steps, which preserves large
+            features. ``polynomial`` subtracts a polynomial that is fitted to each row separately.
+            ``facet-tilt`` removes the prevailing slope of each row, found in up to 30 passes.
+        direction: ``"horizontal"`` to align rows, ``"vertical"`` to align columns.
         degree: degree of the polynomial, 0 to 5.
-        trim: fraction of the values that the trimmed means leave out at each end, 0 to 0.5; 0.5 gives the
-            median.
+        trim: fraction of the values that trimmed means leave out at each end of the sorted values, 0 to 0.5.
+            The value 0.5 gives the median.
         pitch_um: pixel pitch along y and x, needed only by ``facet-tilt``.
 
     Raises:
@@ -95,11 +97,12 @@ def align_rows(
 
 
 def print_taken_for_offsets(z: Array, removed: Array) -> str:
-    """Return a warning if an alignment shifted lines that seem to have no offset, otherwise an empty string.
+    """Return a warning if an alignment shifted lines that seem to have had no offset, otherwise an empty
+    string.
 
-    A real offset shifts all pixels of a line. The alignment is suspect if it shifted a line relative to its
-    neighbour by far more than the noise, although many pixels of the two lines had about the same height. The
-    height difference in the other pixels is then part of a printed structure.
+    A real offset shifts all pixels of a line. The alignment is suspect if it shifted a line relative to a
+    neighbouring line by far more than the noise, although many pixels of the two lines had about the same
+    height before. The height difference in the other pixels is then part of a printed structure.
 
     Args:
         z: heights before the alignment, shape (ny, nx). The rows of the array are the lines.
@@ -118,8 +121,8 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """Return the shifts of the rows, with mean zero. A row with fewer than ``fewest`` selected pixels gets
-    the upper median of all selected heights.
+    """Return the shifts of the rows, from which their mean has been subtracted. Where a row has fewer than
+    ``fewest`` selected pixels, its shift is first replaced by the upper median of all selected heights.
     """
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
@@ -130,19 +133,19 @@ def _difference_shifts(z: Array, chosen: Array, trim: float) -> Array:
     both = chosen[1:] & chosen[:-1]
     steps = np.where(both.sum(axis=1) < _fewest(z), 0.0, row_trimmed_mean(np.diff(z, axis=0), both, trim))
     shifts = np.concatenate([[0.0], np.cumsum(steps)])
-    # The steps between rows cannot separate drift of the microscope from a slope of the sample, so the linear
-    # part stays in the data.
+    # A constant step between rows can be drift of the microscope or a slope of the sample, so the linear part
+    # of the shifts stays in the heights.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
 def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array:
-    """Return the shifts of the rows. They are cumulative sums of the weighted mean steps between neighbouring
-    rows.
+    """Return the shifts of the rows by Gwyddion's method of matching: cumulative sums of the steps between
+    neighbouring rows, where each step is a weighted mean over the pixels.
 
     Args:
-        last_column_counts: whether the last column is used regardless of the mask, as in Gwyddion's mode that
-            includes the mask.
+        last_column_counts: whether the last column is used even where it is not selected. Gwyddion does so if
+            the mask marks the pixels to include.
     """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
     usable = chosen[1:] & chosen[:-1]
@@ -159,9 +162,10 @@ def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array
 
 
 def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
-    """Return the polynomial fit of each row, minus the mean of all measured pixels, masked or not.
+    """Fit a polynomial to each row. Return the fitted values, minus the mean of all measured pixels, whether
+    they are masked or not.
 
-    Gwyddion also adds this mean back.
+    Subtracting the result from the heights therefore adds this mean back, as in Gwyddion.
     """
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
     fitted = np.zeros(z.shape)

@@ -1,4 +1,4 @@
-"""Level one scan. Return the levelled heights and the removed surface, or write them to files."""
+"""Level one scan, and either return the levelled heights and the removed surface or write them to files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +18,8 @@ _DIMS = ("y", "x")
 
 
 class LevelRecord(RunFacts, Result):
-    """Record of the source, recipe and results of one levelling, stored beside the levelled file as
-    ``<file>.json``.
+    """Record of how one scan was levelled: the source file, the recipe and the results. It is stored beside
+    the levelled file as ``<file>.json``.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
@@ -95,7 +95,7 @@ def write_heights(
     """Write a height map in the format that the file's suffix names.
 
     A ``.gsf`` file contains float32 metres with size and title, and opens in Gwyddion. A ``.npy`` file
-    contains only float64 µm. Missing pixels are NaN in both.
+    contains only the heights, as float64 in µm. Missing pixels are NaN in both.
 
     Raises:
         InputError: the file has another suffix.

@@ -1,4 +1,6 @@
-"""Find and remove scars, which are short streaks along the fast axis where the feedback lost the surface."""
+"""Find and remove scars: short streaks along the fast axis, where the feedback of the microscope lost the
+surface.
+"""
 
 from functools import wraps
 from typing import Annotated, Any, Literal
@@ -31,11 +33,11 @@ def mark_scars(
     them.
 
     A streak may be up to ``max_width_px`` rows wide. In each column, the prominence of a streak is the height
-    of its lowest pixel minus the height of the pixel just above or just below the streak, whichever is
-    higher. Negative streaks are found in the same way after the sign of the heights is reversed. The
-    prominence is divided by the rms difference between rows, sqrt(sum of squared differences between
-    neighbouring rows / number of pixels). A run of pixels along a row is a scar if it is at least
-    ``min_length_px`` long, and its prominence reaches ``high`` somewhere and never falls below ``low``.
+    of its lowest pixel minus the height of the higher one of the two pixels that adjoin the streak in this
+    column. Negative streaks are found in the same way after the sign of the heights is reversed. The
+    prominence is stated in units of the rms difference between rows, sqrt(sum of squared differences between
+    neighbouring rows / number of pixels). A run of at least ``min_length_px`` pixels along a row is a scar if
+    its prominence reaches ``high`` somewhere and never falls below ``low``.
 
     Returns:
         A bool array of shape (ny, nx). Only selected pixels are marked.
@@ -60,14 +62,16 @@ def mark_scars(
 
 
 def remove_scars(height: Array, *, scars: Array) -> Levelled:
-    """Replace the marked pixels by the harmonic surface through their surroundings.
+    """Replace the marked pixels by a harmonic surface, i.e. a smooth interpolation from the pixels around
+    them.
 
-    Laplace's equation is solved inside the marked areas. At the border of the image, the gradient across the
-    border is zero. All unmarked pixels keep exactly their values, so ``removed`` is zero at these pixels.
+    Laplace's equation is solved inside the marked areas. At the border of the image, the derivative across
+    the border is zero. The values of all unmarked pixels do not change at all, so ``removed`` is zero at
+    these pixels.
 
     Raises:
         InputError: ``scars`` is not a bool array of the shape of the heights, or a marked area has no
-            measured neighbour.
+            measured pixel next to it.
     """
     z = as_height(height)
     if scars.shape != z.shape or scars.dtype != np.bool_:
@@ -86,7 +90,9 @@ def _fill_scars(z: Array, chosen: Array, **how: Any) -> Levelled:
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:
-    """Return the prominence of each pixel, as part of a ridge that is at most ``max_width_px`` rows wide."""
+    """Return the prominence of each pixel: the largest prominence of all ridges that contain the pixel and
+    are at most ``max_width_px`` rows wide.
+    """
     ny = z.shape[0]
     prominence = np.zeros_like(z)
     for width in range(1, min(max_width_px, ny - 2) + 1):
@@ -112,8 +118,7 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 def _harmonic(z: Array, unknown: Array) -> Array:
     """Return values for the unknown pixels that satisfy Laplace's equation, in the order of ``z[unknown]``.
-
-    Laplace's equation is solved over the unmeasured pixels as well.
+    Unmeasured pixels (NaN) are solved for like unknown ones, but their values are not returned.
     """
     from SurfaceTopography import Topography
 

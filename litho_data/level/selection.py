@@ -1,4 +1,4 @@
-"""Select pixels for levelling operations, and hold their results."""
+"""Select the pixels that levelling operations use, and define the types of their results."""
 
 from typing import Literal, NamedTuple
 
@@ -13,8 +13,8 @@ class Levelled(NamedTuple):
     """A levelled height map and the surface that levelling removed; ``height + removed`` is the input.
 
     Both maps are float64 arrays of shape (ny, nx) in the unit of the input. Pixels that are NaN in the input
-    are NaN in ``height``. ``removed`` has no NaN, and may be a read-only view if it is constant along an
-    axis.
+    are NaN in ``height``. ``removed`` has no NaN. If it is constant along an axis, it may be a read-only
+    view.
     """
 
     height: Array
@@ -22,8 +22,8 @@ class Levelled(NamedTuple):
 
 
 class MaskedLevelling(NamedTuple):
-    """A levelled height map with the removed surface, and the mask of the features that were excluded from
-    the fit.
+    """A levelled height map, the removed surface, and the mask of the features that were excluded from the
+    fit.
     """
 
     levelled: Levelled
@@ -43,8 +43,9 @@ def as_height(height: Array) -> Array:
 
 
 def select(z: Array, mask: Array | None, masking: Masking) -> Array:
-    """Return a bool array of shape (ny, nx) that is True at the pixels that an operation may use. Unmeasured
-    pixels (NaN) are never used.
+    """Return a bool array of shape (ny, nx) that is True at the pixels that an operation may use. ``masking``
+    says whether the mask excludes pixels, selects them, or is ignored. Unmeasured pixels (NaN) are never
+    used.
 
     Raises:
         InputError: the mask is not boolean or has another shape, or no pixel is left.
