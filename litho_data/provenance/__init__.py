@@ -1,1 +1,3 @@
-"""Trace the origin of every array of a store: list its history, verify it, and replay it."""
+"""Trace the origin of every array of a store: list the steps that made it, verify its hash, and recompute it
+from the raw files.
+"""

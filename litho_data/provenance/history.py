@@ -1,4 +1,6 @@
-"""Trace the origin of a scan's arrays: ``history`` lists the recorded steps, and ``replay`` reruns them."""
+"""Trace the origin of a scan's arrays: ``history`` lists the recorded processing steps, and ``replay`` runs
+these steps again.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,11 @@ Recorded = dict[str, list[tuple[str, Step]]]
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
-    """Return the steps of one scan as text, from the raw files to the arrays, with parameters and hashes.
+    """Return the recorded processing steps of one scan as text, in order from the raw files to the stored
+    arrays, with their parameters and hashes.
 
-    If no scan is given, the text has one line per scan. Each line names the raw files, the operations, and
-    the last array that they made.
+    If no scan is given, the text has one line per scan, which names the raw files, the operations, and the
+    array that the last operation made.
 
     Raises:
         InputError: there is no such store or scan.
@@ -66,7 +69,8 @@ def _overview(recorded: Recorded) -> Iterator[str]:
 
 
 def read_steps(store: Store) -> Recorded:
-    """Return the recorded steps of every scan in order, each with its recorded id.
+    """Return the processing steps recorded in a store as a dict keyed by scan id. The values are lists of
+    pairs (recorded id of the step, step), in the order in which the steps were run.
 
     Raises:
         InputError: the store has no provenance, or a record is invalid.
@@ -83,7 +87,7 @@ def read_steps(store: Store) -> Recorded:
 
 
 def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
-    """Return the recorded steps of one scan, or raise InputError if there is no such scan."""
+    """Return the recorded processing steps of one scan, or raise InputError if there is no such scan."""
     require_known("scan", scan_id, recorded)
     return recorded[scan_id]
 
@@ -112,7 +116,8 @@ def require_folder(data_dir: str | Path) -> Path:
 
 
 def stored_array(store: Store, scan_id: str, name: str) -> Array | None:
-    """Read a scan's array by name, from the arrays over all scans or from the scan's own group.
+    """Read one array of a scan by name. The store holds it either as part of an array over all scans or in
+    the group of this scan.
 
     Return None for the layout of a reference scan, which is not stored.
 
@@ -135,12 +140,14 @@ def replay(
     arrays: Sequence[str] | None = None,
     data_dir: str | Path | None = None,
 ) -> pd.DataFrame:
-    """Recompute arrays from the raw files with the recorded parameters, and compare them with the store.
+    """Recompute arrays from the raw files with the recorded parameters, and compare them with the stored
+    arrays.
 
     Args:
         store_path: path of the store.
         scan_ids: scans to recompute; by default all.
-        arrays: arrays to compare; by default all. All steps of the scans are run in any case.
+        arrays: names of the arrays to compare; by default all. All recorded steps of the scans are run in any
+            case.
         data_dir: folder of the raw files, as in ``verify``.
 
     Returns:
@@ -180,8 +187,8 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
-    """Run the recorded steps again, each with the outputs of earlier steps. Yield the name and values of each
-    array in the order in which the steps make them.
+    """Run recorded steps again, with the raw files in ``folder`` and the outputs of earlier steps as inputs.
+    Yield the name and the values of each array as soon as a step has made it.
     """
     made: dict[str, Array] = {}
     for step in steps:

@@ -24,7 +24,7 @@ F = TypeVar("F")
 
 @dataclass(frozen=True)
 class Finding:
-    """A change since the build: where it was found, and what is wrong."""
+    """One change since the build: the place where it was found, and what is wrong there."""
 
     where: str
     problem: str
@@ -35,7 +35,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of ``verify``; ``notes`` are remarks that do not report damage."""
+    """The result of ``verify``. ``findings`` report damage or changes; ``notes`` are remarks that do not."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -119,7 +119,9 @@ def _documents(path: Path) -> Iterator[Finding]:
 
 
 def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
-    """Yield the findings of a check. If the check cannot read its data, an additional finding says so."""
+    """Yield what a check yields. If the check ends because it cannot read its data, yield one more finding
+    that says so.
+    """
     try:
         with damaged("data that a check needs"):
             yield from check
@@ -128,7 +130,9 @@ def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
 
 
 def _attributes(store: Store) -> Iterator[Finding]:
-    """Compare the attributes of the root group with those computed from the manifest and the arrays."""
+    """Yield a finding for each attribute of the root group that differs from the value computed from the
+    manifest and the arrays.
+    """
     attributes = dict(store.root.attrs)
     sha256 = attributes.get("dataset_sha256")
     try:
@@ -144,8 +148,8 @@ def _attributes(store: Store) -> Iterator[Finding]:
 
 
 def _tables(store: Store) -> Iterator[Finding]:
-    """Compare the tables with their hashes in the manifest, and the manifest with its hash in the root
-    group.
+    """Yield a finding for each table that does not match its hash in the manifest, and one if the manifest
+    does not match its hash in the root group.
     """
     manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
     files = read_table(group_of(store.root, "manifest"), "path")
@@ -157,7 +161,9 @@ def _tables(store: Store) -> Iterator[Finding]:
 
 
 def _steps(store: Store, history: Recorded) -> Iterator[Finding]:
-    """Compare each step's id with its content, and its inputs with the outputs of earlier steps."""
+    """Yield a finding for each step whose id does not match its content, for each input that is neither a raw
+    file nor the output of an earlier step, and for each scan without recorded steps.
+    """
     raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
     for scan_id, steps in history.items():
         made: dict[str, str] = {}

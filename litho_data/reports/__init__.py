@@ -1,1 +1,1 @@
-"""Make reports: HTML pages, their pictures, and copies of figures and tables for papers."""
+"""Write reports: HTML pages, the pictures on them, and copies of their figures and tables for papers."""

@@ -1,5 +1,5 @@
-"""Write self-contained HTML reports with a verdict, pictures, tables (also as CSV) and a record of their
-origin.
+"""Write self-contained HTML reports that contain a verdict, pictures, tables and a record of the run. The
+tables are also written as CSV files.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ if TYPE_CHECKING:
 
     Table = pd.DataFrame | Facts | Iterable[Facts | BaseModel]
 
-# Maps the key of a table's column to its title and meaning; the CSV file keeps the key.
+# Maps the key of a table's column to the title and the meaning that the page shows. The CSV file keeps the
+# key.
 Words = Mapping[str, Sequence[str]]
 
 _SPELT = table_beside(__file__, "words.toml")
-# Columns whose cells name models; each cell has the colour of its model.
+# Columns whose cells are names of models; each cell is shown in the colour of its model.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns whose values are keys, which are spelt out like the names of columns.
+# Columns whose cells are keys; the page spells them out as it does the keys of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -40,12 +41,12 @@ class Page:
     """A report under construction; parts appear in the order in which they are added.
 
     Args:
-        title: what was done, and with what.
+        title: heading of the page: what was done, and with which data or model.
         lead: one line below the title.
-        run: the run that made the result; by default the run that writes the page.
-        facts: further facts that identify the result, such as hashes and seeds, by name.
-        words: titles and meanings of table columns, or the TOML file that contains them. The titles of other
-            columns are spelt out from their keys.
+        run: facts about the run that made the result; by default those of the run that writes the page.
+        facts: further facts that identify the result, such as hashes and seeds, keyed by name.
+        words: titles and meanings of table columns, keyed by the column's key, or a TOML file that contains
+            them. The title of a column that is not listed is made from its key.
     """
 
     def __init__(
@@ -67,7 +68,9 @@ class Page:
         self._figures: list[Figure] = []
 
     def heading(self, text: str, folded: bool = False) -> None:
-        """Start a section; a folded section shows only its heading until it is opened."""
+        """Start a section with this heading. If ``folded``, only the heading is visible until the reader
+        opens the section.
+        """
         self._sections.append({"title": text, "folded": folded, "parts": []})
 
     def verdict(self, text: str) -> None:
@@ -84,7 +87,7 @@ class Page:
             self._add("note", texts=texts)
 
     def points(self, texts: Sequence[str]) -> None:
-        """Add a list of sentences."""
+        """Add a bulleted list with one text per item."""
         self._add("points", texts=list(texts))
 
     def code(self, text: str) -> None:
@@ -92,11 +95,13 @@ class Page:
         self._add("code", text=text)
 
     def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:
-        """Add tiles with the few most important numbers, each as (value with unit, label)."""
+        """Add a row of tiles that show the few most important numbers. Each tile is a pair (value with unit,
+        label).
+        """
         self._add("tiles", tiles=list(tiles))
 
     def links(self, links: Sequence[tuple[str, str]]) -> None:
-        """Add relative links, each as (target, text)."""
+        """Add links to files near the page. Each link is a pair (relative target, text)."""
         self._add("links", links=list(links))
 
     def table(
@@ -113,7 +118,7 @@ class Page:
             table: a data frame, a mapping from column names to columns, or a sequence of rows (mappings or
                 records). A record inside a row becomes one column per field, named ``<key>_<field>``.
                 Intervals and lists become text.
-            digits: number of decimal places. Numbers that are too small for these places are shown with two
+            digits: number of decimal places. Numbers that would be rounded to zero are shown with two
                 significant digits.
             columns: the columns to show, in this order; all by default.
         """
@@ -140,17 +145,20 @@ class Page:
     def gallery(
         self, columns: Sequence[tuple[str, str]], rows: Sequence[tuple[str, Sequence[str]]], caption: str
     ) -> None:
-        """Add small pictures in rows and columns.
+        """Add a grid of small pictures.
 
         Args:
             columns: for each column, its title and its colour bar, as :func:`colour_bar_png` returns it.
-            rows: for each row, its label and one picture per column, as :func:`coloured_png` returns it.
+            rows: for each row, its label and its pictures, one per column, as :func:`coloured_png` returns
+                them.
             caption: text below the pictures.
         """
         self._add("gallery", columns=list(columns), rows=list(rows), caption=caption)
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
-        """Write the page, its tables and the copies for a paper into ``folder``; return the page's path."""
+        """Write the page, its tables and, if requested, the copies for a paper into ``folder``; return the
+        page's path.
+        """
         target = Path(folder)
         for csv_name, frame, names, digits in self._tables:
             with atomic_file(target / csv_name) as temporary:
@@ -194,7 +202,9 @@ def _frame(table: Table, digits: int) -> pd.DataFrame:
 
 
 def _cells(row: Facts | BaseModel, digits: int, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the column names and values of a row, including those of records inside the row."""
+    """Yield pairs (column name, value) for a row of a table. A record inside the row yields one pair per
+    field.
+    """
     for key, value in (row.model_dump() if isinstance(row, BaseModel) else row).items():
         if isinstance(value, Mapping | BaseModel):
             yield from _cells(value, digits, f"{prefix}{key}_")
@@ -220,8 +230,8 @@ def filled(template: Path, **values: object) -> str:
 
 
 def sentences(template: Path, about: str, one: object) -> str:
-    """Call the macro ``about`` of a Jinja template with the argument ``one``, and return the text as a single
-    line.
+    """Call the macro named ``about`` of a Jinja template with the argument ``one``, and return the resulting
+    text as a single line.
     """
     return " ".join(getattr(_plain(template).module, about)(one).split())
 
@@ -251,7 +261,7 @@ def capitalised(text: str) -> str:
 
 
 def spelt_out(key: str) -> str:
-    """Spell out the key of a column; for example, ``mae_abs_nm`` becomes "MAE abs (nm)"."""
+    """Make a readable title from the key of a column; for example, ``mae_abs_nm`` becomes "MAE abs (nm)"."""
     if "_" not in key:
         return _SPELT["short"].get(key, key)
     head, _, more = key.partition(" ")

@@ -29,7 +29,9 @@ _FONT_PT, _DPI = 7.0, 300
 
 @dataclass(frozen=True)
 class PaperCopies:
-    """Formats of the copies of figures and tables for a paper. Tables are always written as CSV, too."""
+    """File formats in which reports also save their figures and tables for a paper. Tables are always written
+    as CSV as well.
+    """
 
     figures: Figures | None = None
     tables: Tables = "csv"
@@ -40,8 +42,8 @@ _WANTED: ContextVar[PaperCopies | None] = ContextVar("paper copies", default=Non
 
 @contextmanager
 def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iterator[None]:
-    """Make every report that is written in this context also write copies of its figures and tables for a
-    paper.
+    """Make every report that is written inside the ``with`` block also write copies of its figures and tables
+    for a paper.
     """
     token = _WANTED.set(PaperCopies(figures, tables))
     try:
@@ -51,7 +53,7 @@ def paper_copies(figures: Figures | None = None, tables: Tables = "csv") -> Iter
 
 
 def wanted() -> PaperCopies:
-    """Return the copies requested by the surrounding ``paper_copies``."""
+    """Return the formats requested by the ``with paper_copies(...)`` block in which this code runs."""
     return _WANTED.get() or PaperCopies()
 
 
@@ -93,7 +95,8 @@ def write_figures(figures: Sequence[Figure], folder: Path) -> None:
 
 
 def write_table(frame: pd.DataFrame, names: Sequence[str], csv_path: Path, digits: int) -> None:
-    """Write a table beside its CSV file, in the requested format and with ``digits`` decimal places.
+    """Write a copy of a table beside its CSV file, in the requested format and with ``digits`` decimal
+    places. Write nothing if only CSV is requested.
 
     Args:
         frame: the table.

@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 
 _OWN = table_beside(__file__, "colours.toml")
 LIGHT, DARK = _OWN["light"], _OWN["dark"]
-# Colours of a figure that change with the light or dark mode of the screen.
+# Names of the colours in a figure that change with the light or dark mode of the screen.
 _OF_SCREEN = ("ink", "paper", "soft", "accent")
 _FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87400")
 _PICTURE_DPI = 110
 _COLOURS = 255
-# Side of a map in a notebook.
+# Side length of a map that a notebook shows.
 _NOTEBOOK_PX = 220
-_GAP = 255  # the last entry of the palette, transparent
+_GAP = 255  # the last entry of the palette, which is transparent and used for NaN
 
 
 def model_colour(name: str) -> str:
     """Return the colour of a model, which is the same on every page.
 
-    The project's models have fixed colours; for other models, the name determines the colour.
+    The project's own models have fixed colours. For any other model, the colour is derived from its name.
     """
     known = _OWN["models"].get(name)
     return known or _FURTHER_COLOURS[zlib.crc32(name.encode()) % len(_FURTHER_COLOURS)]
@@ -68,13 +68,14 @@ def svg_address(figure: Figure) -> str:
 
 
 def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
-    """Return an image as the data URL of a PNG, coloured by a matplotlib colour map and transparent at NaN.
+    """Return an image as the data URL of a PNG picture. Its values are coloured by a matplotlib colour map,
+    and NaN is transparent.
 
     Args:
         image: array of shape (ny, nx) with one value for each pixel of the picture.
         colours: name of the colour map.
-        low, high: values that get the first and the last colour of the map. Values outside this range get the
-            nearer of these two colours.
+        low, high: values that get the first and the last colour of the map. Values below ``low`` get the
+            first colour, and values above ``high`` the last.
     """
     import matplotlib
     from PIL import Image
@@ -90,8 +91,8 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
 
 
 def limits(image: Array) -> tuple[float, float]:
-    """Return the 0.5 % and 99.5 % quantiles of an image: its lowest and highest value without a few
-    outliers.
+    """Return the 0.5 % and 99.5 % quantiles of an image, as limits of a colour scale that a few outliers do
+    not affect.
     """
     low, high = np.nanpercentile(image, (0.5, 99.5))
     return float(low), float(high)
@@ -106,7 +107,9 @@ def thumbnail(image: Array, side_px: int = 180) -> Array:
 
 
 def colour_bar_png(colours: str) -> str:
-    """Return a picture of a colour map from low to high. It is one pixel high, and pages stretch it."""
+    """Return a picture of a colour map, from its first to its last colour, as a data URL. The picture is one
+    pixel high; pages stretch it.
+    """
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
 
 

@@ -1,1 +1,1 @@
-"""Share independent jobs among processes and machines."""
+"""Distribute independent jobs over processes and machines."""

@@ -1,4 +1,4 @@
-"""Send a function and its job to another process, and the result back."""
+"""Send a function and one of its jobs to another process, and send the result back."""
 
 import contextlib
 import ctypes
@@ -15,17 +15,19 @@ from litho_data.foundation import Facts, InputError
 from litho_data.foundation.plugins import load_plugins
 from litho_data.foundation.run_facts import running_command, software_record
 
-# Options of mallopt(3), with the values that the C library adapts to by itself if the options are not set.
+# Options of the C function mallopt: their numbers, and the values that the C library arrives at by itself if
+# the options are not set.
 _MALLOC = {"M_MMAP_THRESHOLD": (-3, 32 << 20), "M_TRIM_THRESHOLD": (-1, 64 << 20)}
 
 
 @dataclass(frozen=True)
 class Known:
-    """Large objects that are not sent to other processes. Every process makes these objects itself, and jobs
-    and results refer to them by name.
+    """Large objects that jobs use but that are not sent to other processes. Every process makes these objects
+    itself, and the pickled jobs and results contain only their names.
 
-    ``make`` is a function that makes ``objects`` again. It must be importable by name, or be a
-    ``functools.partial`` of such a function. A process keeps only the objects that it made last.
+    ``make`` is a function that returns the same ``objects``, keyed by name. It must be importable by name, or
+    be a ``functools.partial`` of such a function. A process keeps only the objects that it made most
+    recently.
     """
 
     make: Callable[[], Facts]
@@ -34,11 +36,11 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A function that runs in another process, with the working directory of this process. Results of the
-    function record the command line of this process.
+    """A wrapper with which a function of this process runs in another process, with the working directory of
+    this process. Results of the function record the command line of this process.
 
     ``plugins`` are plug-in files that the other process loads first. ``software`` states the versions and the
-    commit that a Dask worker must have, too.
+    commit that a Dask worker must also have; it is None for local processes.
     """
 
     function: Callable[[Any], Any]
@@ -66,8 +68,8 @@ def _made(make: bytes) -> Facts:
 
 
 def sent(content: Any, names: Mapping[int, str]) -> bytes:
-    """Pickle any content. Known objects inside the content are replaced by their names; ``names`` maps the
-    ``id`` of each known object to its name.
+    """Pickle any object. The objects of ``Known`` inside it are replaced by their names; ``names`` maps the
+    ``id()`` of each of them to its name.
     """
     stream = BytesIO()
     _Sender(stream, names).dump(content)
@@ -75,7 +77,9 @@ def sent(content: Any, names: Mapping[int, str]) -> bytes:
 
 
 def received(content: bytes, objects: Facts) -> Any:
-    """Unpickle what ``sent`` has pickled, and replace each name in it by the object that has this name."""
+    """Unpickle what ``sent`` has pickled. Where ``sent`` put the name of an object, insert the object that
+    has this name in ``objects``.
+    """
     return _Receiver(BytesIO(content), objects).load()
 
 
@@ -98,15 +102,16 @@ class _Receiver(pickle.Unpickler):
 
 
 def _require_alike(wanted: Facts, folder: str) -> None:
-    """Refuse a Dask worker that has several threads, other software or other files, because its results could
-    differ. Every job makes this check, because workers may join and leave.
+    """Refuse to run on a Dask worker that has several threads, other software or other files than this
+    process, because its results could differ. The check is made for every job, because workers may join and
+    leave.
     """
     from distributed import get_worker
 
     worker = get_worker()
     if worker.state.nthreads > 1:
-        # Seeds and thread counts belong to a process, so jobs in several of its threads would disturb each
-        # other.
+        # Random seeds and thread counts are set for a whole process, so jobs that run in several threads of
+        # one process would disturb each other.
         raise InputError(
             f"Dask worker {worker.address}",
             got=f"{worker.state.nthreads} threads",
@@ -135,8 +140,8 @@ def _require_alike(wanted: Facts, folder: str) -> None:
 def _keep_freed_memory() -> None:
     """Let a Dask worker reuse freed memory, as processes do by default.
 
-    Dask starts its workers with the environment variable MALLOC_TRIM_THRESHOLD_, so that every array above
-    128 KiB gets new memory pages. Providing these pages takes a third of the time of a build.
+    Dask starts its workers with the environment variable MALLOC_TRIM_THRESHOLD_, with which every array above
+    128 KiB gets new memory pages from the system. This would take a third of the time of a build.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)):
         for parameter, value in _MALLOC.values():

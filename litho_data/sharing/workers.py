@@ -38,9 +38,9 @@ _TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that run jobs. ``present`` returns the current number of workers. Each error type in ``lost``
-    means that a job was lost because its worker died, and ``fate`` says in messages what happened to this
-    worker.
+    """Running workers, to which ``submit`` gives a job. ``present`` returns the current number of workers. An
+    error of a type in ``lost`` means that a job was lost because its worker died; ``fate`` is the phrase with
+    which messages say what happened to the worker.
 
     ``tries`` is the maximum number of times that a job is started; ``restart`` is called before lost jobs are
     started again.
@@ -56,15 +56,17 @@ class Pool(NamedTuple):
 
 @dataclass(frozen=True)
 class Workers:
-    """Where jobs run: in this process, in local processes, or on a Dask cluster. Results are bit-identical if
-    every process has the same number of threads.
+    """Where jobs run: in this process, in local processes, or on a Dask cluster. Results are bit-identical
+    for all three choices if every process has the same number of threads.
 
     Attributes:
         processes: number of local processes, with one thread each unless the environment says otherwise; 1
             means that jobs run in this process.
         dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
-        known: objects that jobs use but that are not sent with them, because each worker makes them itself.
-        pool: workers that are already running; see ``kept_open``.
+        known: large objects that jobs use but that are not sent with them, because each worker makes them
+            itself.
+        pool: workers that are already running, as ``kept_open`` starts them; None to start workers for each
+            call of ``run_jobs``.
     """
 
     processes: int = 1
@@ -95,15 +97,16 @@ def run_jobs(
 ) -> Generator[tuple[J, R], None, None]:
     """Yield each job with its result, in the order in which the jobs finish.
 
-    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. If local
-    workers die, their jobs are run again, one at a time and at most twice. On a Dask cluster, the scheduler
-    decides how often such jobs are repeated.
+    At most two jobs per worker are submitted at a time, so memory does not grow with the number of jobs. If
+    local workers die, their jobs are run again, one at a time and at most twice. On a Dask cluster, the
+    scheduler decides how often such jobs are repeated.
 
     Args:
-        function: must be importable by name; jobs and results must be picklable.
-        name: returns the name of a job in messages.
-        apart: whether the function starts a separate process and waits for it. For such functions, local
-            workers are threads.
+        function: function that runs one job. It must be importable by name, and jobs and results must be
+            picklable.
+        name: function that returns the name by which messages refer to a job.
+        apart: whether the function itself starts a separate process and waits for it. If so, local workers
+            are threads instead of processes.
 
     Raises:
         InputError: there is no scheduler at the address, a worker has different software or several threads,
@@ -130,7 +133,9 @@ def run_jobs(
 def _tried(
     submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
 ) -> Iterator[tuple[int, R]]:
-    """Yield the number and the result of each job. Jobs whose worker died are tried again, one by one."""
+    """Run jobs number 0 to ``count - 1``, and yield the number and the result of each. Jobs whose worker died
+    are tried again, one by one.
+    """
     tries: Counter[int] = Counter()
 
     def begin(number: int) -> Future[R]:
@@ -188,8 +193,8 @@ def kept_open(workers: Workers) -> Iterator[Workers]:
 def _windowed(
     submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
 ) -> Iterator[tuple[J, Future[R]]]:
-    """Yield jobs as they finish. ``count()`` is the number of workers, and two jobs per worker are in
-    progress.
+    """Yield each job with its finished future, in the order in which the jobs finish. ``count()`` returns the
+    number of workers; at most two jobs per worker are submitted at a time.
     """
     waiting = iter(jobs)
     running: dict[Future[R], J] = {}
@@ -219,7 +224,7 @@ def _local(count: int, apart: bool) -> Iterator[Pool]:
     def opened() -> Executor:
         if apart:
             return ThreadPoolExecutor(count)
-        # Processes are spawned, because a forked copy of a process with threads may hang.
+        # Processes are spawned instead of forked, because a forked copy of a process with threads may hang.
         return ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
 
     def restart() -> None:
@@ -271,8 +276,8 @@ def _dask(address: str) -> Iterator[Pool]:
         _require_scheduler(address)
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, MemoryError) as error:
-        # A MemoryError means that another program answers at the address, and that its bytes were mistaken
-        # for the size of a message.
+        # A MemoryError occurs if another program answers at the address: Dask takes its bytes for the size of
+        # a message.
         said = str(error) or f"no answer in {_CONNECT_S:g} s"
         raise InputError(
             "Dask scheduler",
@@ -283,7 +288,7 @@ def _dask(address: str) -> Iterator[Pool]:
     def count() -> int:
         try:
             return len(client.nthreads())
-        except OSError:  # the jobs in progress report that the scheduler is gone
+        except OSError:  # the running jobs will report that the scheduler is gone
             return 0
 
     with client:
@@ -304,8 +309,8 @@ def _dask(address: str) -> Iterator[Pool]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Check that a scheduler answers at the address. If another program listens there, a Dask client would
-    wait for a long time and then crash.
+    """Raise InputError if no Dask scheduler answers at the address. Without this check, a Dask client would
+    wait for a long time and then crash if another program listens there.
     """
     from distributed.core import rpc
 
