@@ -149,7 +149,7 @@ class ScanFiles(Record):
     """The ``[scan]`` table: the scan files, and how to read them. ``size_um`` is the size of the field along
     y and x, for file formats that do not state it.
 
-    ``instrument`` is the kind of microscope. A ``confocal`` microscope has no tip. The files of a scanning
+    ``instrument`` is the kind of instrument. A ``confocal`` microscope has no tip. The files of a scanning
     electron microscope (``sem``) are pictures of a film of uniform height, the full height of the layout; the
     build measures where the edges of this film lie.
 

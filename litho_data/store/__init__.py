@@ -1,4 +1,4 @@
-"""The dataset store: schema, reading and writing."""
+"""The dataset store: its schema, and functions to read and write it."""
 
 from litho_data.store.read import PrintedScan, Store, open_store
 

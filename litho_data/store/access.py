@@ -1,4 +1,6 @@
-"""Access Zarr groups and arrays through typed functions that report damaged bytes as one clear error."""
+"""Access Zarr groups and arrays through typed functions that raise a clear InputError if stored bytes are
+damaged.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ def open_root(path: str | Path) -> zarr.Group:
 
 
 def group_of(parent: zarr.Group, name: str) -> zarr.Group:
-    """Return the child group with this name.
+    """Return the child group ``name`` of a group.
 
     Raises:
         InputError: there is no group with this name.
@@ -55,7 +57,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
 
 
 def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
-    """Return the child array with this name.
+    """Return the child array ``name`` of a group.
 
     Raises:
         InputError: there is no array with this name.
@@ -66,7 +68,7 @@ def array_of(parent: zarr.Group, name: str) -> zarr.Array[Any]:
 
 
 def has_child(parent: zarr.Group, name: str) -> bool:
-    """Return whether there is a child with this name.
+    """Return whether a group has a child group or array ``name``.
 
     Raises:
         InputError: the child exists, but its metadata is damaged.
@@ -75,7 +77,7 @@ def has_child(parent: zarr.Group, name: str) -> bool:
 
 
 def values_of(parent: zarr.Group, name: str) -> Array:
-    """Return all values of a child array.
+    """Return all values of the child array ``name`` of a group.
 
     Raises:
         InputError: there is no such array, or a stored chunk cannot be decoded.
@@ -84,10 +86,10 @@ def values_of(parent: zarr.Group, name: str) -> Array:
 
 
 def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
-    """Read a selection of an array.
+    """Read a selection of an array; error messages refer to the array as ``what``.
 
     Raises:
-        InputError: a stored chunk cannot be decoded; the message names its array.
+        InputError: a stored chunk cannot be decoded.
     """
     try:
         return np.asarray(array[selection])
@@ -98,7 +100,7 @@ def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
 
 
 def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
-    """Return all child groups by name.
+    """Return all child groups of a group, keyed by name.
 
     Raises:
         InputError: a child has damaged metadata.
@@ -109,7 +111,8 @@ def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
 
 
 def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """Read the one-dimensional arrays of a group as the columns of a table. The column ``first`` comes first.
+    """Read the one-dimensional arrays of a group as the columns of a table. The column named ``first`` comes
+    first, and the others follow in alphabetical order.
 
     Raises:
         InputError: metadata or chunks are damaged, or the columns have different lengths.

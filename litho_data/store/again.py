@@ -1,5 +1,5 @@
-"""Refer to scans of a store by their ids, so that other processes read these scans instead of receiving their
-arrays.
+"""References to scans of a store by their ids. They are sent to other processes, which read the scans from
+the store instead of receiving their arrays.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from litho_data.store.read import PrintedScan, Store, open_store
 
 @dataclass(frozen=True)
 class StoredScans:
-    """Some scans of a store: the path of the store, the hash of the dataset, and the ids of the scans."""
+    """A reference to some scans of a store: the path of the store, the hash of the dataset, and the ids of
+    the scans.
+    """
 
     path: str
     sha256: str
@@ -25,7 +27,7 @@ class StoredScans:
         return cls(str(store.path), store.sha256, tuple(scan.id for scan in scans))
 
     def read(self) -> list[PrintedScan]:
-        """Read the scans.
+        """Read the scans from the store.
 
         Raises:
             InputError: there is no store at the path, or the store contains another dataset.
@@ -40,5 +42,5 @@ class StoredScans:
         return [store.scan(scan_id) for scan_id in self.ids]
 
     def by_id(self) -> dict[str, PrintedScan]:
-        """Return a dict of the scans by id."""
+        """Read the scans from the store, and return them in a dict keyed by id."""
         return {scan.id: scan for scan in self.read()}

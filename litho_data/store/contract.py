@@ -1,4 +1,6 @@
-"""Check a store when it is opened: refuse it if a declared file is missing or a value is out of range."""
+"""Checks made when a store is opened. A store is refused if a file that its metadata declare is missing or a
+value is out of range.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,9 @@ def require_complete(path: Path) -> None:
 
 
 def missing_files(path: Path) -> Iterator[str]:
-    """Yield the files that a store declares but lacks: metadata documents and chunks."""
+    """Yield the names of metadata documents and chunks that the metadata of a store declare but that do not
+    exist.
+    """
     names = file_names(path)
     with damaged(f"metadata of {path}"):
         documents = {name: json.loads(content) for name, content in read_documents(path, names)}
@@ -79,11 +83,11 @@ def missing_files(path: Path) -> Iterator[str]:
 
 
 def _may_be_left_out(name: str, document: Facts) -> bool:
-    """Return whether a copy that xarray made may lack the chunk of this array.
+    """Return whether the chunk of this array may be missing because the store is a copy made by xarray.
 
-    A copy made by xarray has no groups, and it lacks chunks that contain only fill values, because xarray
-    does not write such chunks. Examples are the order of a single scan if it is 0, and a column that is empty
-    for all scans of the copy.
+    When xarray copies a store, it does not write groups or chunks that contain only fill values. Such a chunk
+    can occur in the column ``order`` if the copy has a single scan of order 0, and in an optional column that
+    is empty for all scans of the copy.
     """
     column = name.removesuffix(f"/{_DOCUMENT}")
     return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
@@ -108,7 +112,7 @@ def file_names(path: Path) -> set[str]:
 
 
 def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
-    """Yield the metadata documents among the files of a store, by name."""
+    """Yield pairs (name, content) for the metadata documents among the files of a store."""
     wanted = sorted(name for name in names if name.split("/")[-1] == _DOCUMENT)
     if path.is_dir():
         yield from ((name, (path / name).read_bytes()) for name in wanted)
@@ -118,7 +122,9 @@ def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
 
 
 def _chunks(document: Facts) -> Iterator[str]:
-    """Yield the names of the files of an array, relative to its folder."""
+    """Yield the names of the chunk files that an array with this metadata document has, relative to its
+    folder.
+    """
     sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
     encoding = document["chunk_key_encoding"]
     with_c = encoding["name"] == "default"
@@ -130,8 +136,8 @@ def _chunks(document: Facts) -> Iterator[str]:
 
 
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    """Return the name, pitch, level height, levels, write table and instrument of a store, and refuse invalid
-    values.
+    """Return the name, pitch, level height, number of levels, ``write`` table and instrument that a store
+    states in its attributes. Raise InputError if a value is invalid.
     """
     attributes = dict(root.attrs)
     name = str(attributes.get("name", path.name.partition(".")[0]))
@@ -152,7 +158,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
 
 
 def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
-    """Return a dict of the arrays over all scans. Refuse a store in which one of these arrays is missing or
+    """Return the arrays over all scans, keyed by name. Raise InputError if one of these arrays is missing or
     has a wrong shape, type or dimensions.
     """
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
@@ -178,13 +184,14 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copy whose coordinates show that rows or columns of pixels were removed or reordered.
+    """Refuse a copied store whose coordinates show that other rows or columns than the last ones were
+    removed, or that their order was changed.
 
-    Positions in the store, such as the transforms of the scans, refer to the first pixel, so rows and columns
-    may be removed only at the end.
+    Positions in the store, such as the transforms of the scans, are relative to the first pixel, so a copy
+    may leave out only the last rows and columns.
 
     Raises:
-        InputError: rows or columns were removed elsewhere than at the end, or their order was changed.
+        InputError: the copy is refused; the message names the coordinate.
     """
     for name, count in (
         (f"{axis}{unit}", n) for axis, n in zip("yx", shape, strict=True) for unit in ("_um", "")
@@ -198,8 +205,8 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
-    """Return the columns of a store by name: ``scan`` (the ids), ``print``, ``order`` and all optional
-    columns.
+    """Return the columns of a store, which have one value per scan, keyed by name: ``scan`` (the ids),
+    ``print``, ``order`` and all optional columns.
 
     Missing numbers are returned as None, and missing strings as "".
 
@@ -223,7 +230,7 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
         columns[name] = [None] * len(ids)
         if has_child(root, name):
             values = values_of(root, name).tolist()
-            # NaN is not equal to itself.
+            # The condition is false for NaN, which is not equal to itself.
             limits.require(f"{name} of {path}", [value for value in values if value == value])
             columns[name] = [float(value) if value == value else None for value in values]
     for name in TEXT_COLUMNS:
@@ -240,8 +247,8 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
 
 
 def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return the shape (ny, nx) of every scan without padding. Refuse a shape that is larger than the padded
-    array.
+    """Return the shape (ny, nx) of every scan without its padding. Raise InputError if a shape is larger than
+    that of the padded array.
     """
     if not has_child(root, "quality"):
         return [(padded[0], padded[1])] * count
@@ -257,11 +264,11 @@ def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...
 
 
 def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> None:
-    """Refuse a scan if a level or height is out of range, its transform is not invertible, or no pixel was
-    measured.
+    """Refuse a scan if one of its levels or heights is out of range, its transform to the layout is not
+    invertible, or none of its pixels was measured.
 
     Raises:
-        InputError: a value is refused; the message names it.
+        InputError: the scan is refused; the message names the value.
     """
     highest = int(samples["mask_level"].max())
     if highest >= levels:
@@ -281,7 +288,7 @@ def require_possible(samples: Mapping[str, Array], levels: int, what: str) -> No
 def require_manifest(manifest: Facts, path: Path) -> None:
     """Refuse a manifest that lacks entries that its readers need.
 
-    A manifest that contains only the table of files does not come from a build, and needs fewer entries.
+    A manifest that contains only the table of files was not written by a build, and needs fewer entries.
 
     Raises:
         InputError: an entry is missing or has the wrong type; the message names the first one.

@@ -1,4 +1,5 @@
-"""Choose the lock box: scans of a dataset that must not influence any choice of a model or an effect.
+"""Choose the lock box of a dataset: scans that are set aside for the final test, so they must not influence
+any choice of a model or an effect.
 
 The choice depends on a hash of the ids instead of a library's random generator, so the same ids always give
 the same lock box.
@@ -12,8 +13,8 @@ from litho_data.foundation import InputError
 
 
 class HasPrint(Protocol):
-    """Any object with the two properties of a scan that determine whether it is put into the lock box: its id
-    and its print.
+    """Protocol for objects that state the id and the print of a scan, which determine whether the scan is put
+    into the lock box.
     """
 
     @property
@@ -23,14 +24,15 @@ class HasPrint(Protocol):
 
 
 def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
-    """Choose the lock box of a dataset from all of its scans."""
+    """Return the ids of the scans in the lock box of a dataset. ``scans`` are all scans of the dataset."""
     return lock_box([scan.id for scan in scans], [scan.print_id for scan in scans])
 
 
 def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """Choose the lock box: a sixth of the scans, but at least one, from different prints if possible.
+    """Return the ids of the scans in the lock box: a sixth of all scans, but at least one, from different
+    prints if possible.
 
-    If there are only one or two scans, none is chosen.
+    If the dataset has only one or two scans, none is chosen.
 
     Args:
         ids: ids of the scans.
@@ -54,8 +56,8 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
 
 
 def drawing_key(name: str, seed: int) -> str:
-    """Return a key that sorts names in a random order. The order depends only on the seed, and it is the same
-    on every machine.
+    """Return a key by which names can be sorted into a random order. The order depends only on the names and
+    the seed, so it is the same on every machine.
     """
     return hashlib.sha256(f"{seed}:{name}".encode()).hexdigest()
 
@@ -72,5 +74,5 @@ def require_unique(ids: Sequence[str]) -> None:
 
 
 def ids_sha256(ids: Sequence[str]) -> str:
-    """Return the hex SHA-256 of a set of ids, sorted and written one per line."""
+    """Return the hex SHA-256 of a set of ids. The hash is that of the sorted ids, written one per line."""
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()

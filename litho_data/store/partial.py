@@ -1,8 +1,9 @@
 """Keep the finished scans of a store under construction, so that an interrupted build can resume.
 
-The folder ``.<name>.partial`` lies beside the store. When the store is complete, it is moved to its path. The
-record of a scan is written last, so a scan is finished if its record exists. A finished scan is reused only
-if its files, parameters and code are the same and its arrays still have the recorded hashes.
+A store is built in a folder ``.<name>.partial`` beside its path, and moved to this path when it is complete.
+The record of a scan is written after its arrays, so a scan is finished if its record exists. A resumed build
+reuses a finished scan only if the scan's files, parameters and code have not changed and its arrays still
+have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -30,14 +31,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """One finished scan: its arrays by name, and a record of plain data (``id``, ``key``, ``steps``, …)."""
+    """One finished scan: its arrays, keyed by name, and its record, which is plain data with the keys ``id``,
+    ``key``, ``steps`` and others.
+    """
 
     record: Facts
     arrays: Mapping[str, Array]
 
 
 def outputs_of(record: Facts) -> list[Facts]:
-    """Return all outputs of the steps in a scan's record. Each output states its name, hash, shape, etc."""
+    """Return the descriptions (name, hash, shape, etc.) of all arrays that the steps in a scan's record
+    made.
+    """
     return [output for step in record["steps"] for output in step["outputs"]]
 
 
@@ -55,7 +60,9 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
 
 
 class PartialStore:
-    """A store under construction: the finished scans on disk, and the Zarr group to which scans are added."""
+    """A store under construction, with methods to list the finished scans on disk, add scans, and publish the
+    store.
+    """
 
     def __init__(self, out: Path, folder: Path):
         self.out = out
@@ -64,28 +71,31 @@ class PartialStore:
         self._pieces = self.folder / "pieces"
 
     def open(self) -> zarr.Group:
-        """Return the root group to which scans are added, after removing everything except scans."""
+        """Remove everything except scans from the unfinished store, and return its root group, to which scans
+        are added.
+        """
         import zarr
 
         self._pieces.mkdir(exist_ok=True)
         if self.store.exists():
             others = [one for one in self.store.iterdir() if one.name != "scans"]
-            # If Zarr is interrupted while it writes, it leaves a temporary file.
+            # Zarr leaves temporary files if it is interrupted while it writes.
             others += [one for one in (self.store / "scans").glob("*") if one.is_file()]
             for child in others:
                 shutil.rmtree(child) if child.is_dir() else child.unlink()
         root = zarr.open_group(self.store, mode="a", zarr_format=3)
-        # The group must exist before several processes add scans to it.
+        # The group must exist before several processes add scans to it at the same time.
         root.require_group("scans")
         return root
 
     def finished(self, root: zarr.Group, keys: Facts) -> dict[str, dict[str, Any]]:
-        """Return the records of the scans that need not be computed again.
+        """Return the records of the finished scans that need not be computed again, keyed by id. Remove all
+        other scans.
 
         Args:
             root: the root group to which scans are added.
-            keys: maps each id to build to a function that returns the key of the scan. Scans with other ids
-                are removed.
+            keys: maps the id of each scan of the build to a function that returns the key of the scan, i.e. a
+                hash of everything that determines it.
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):
@@ -102,7 +112,9 @@ class PartialStore:
         return records
 
     def add(self, piece: Piece) -> None:
-        """Store one finished scan, and write its record last. Any process may call this."""
+        """Write one finished scan to disk, its record last. Several processes may call this at the same
+        time.
+        """
         import zarr
 
         scan_id = piece.record["id"]
@@ -116,7 +128,7 @@ class PartialStore:
             temporary.write_text(json.dumps(piece.record), encoding="utf-8")
 
     def samples(self, scan_id: str) -> dict[str, Array]:
-        """Return the arrays of one finished scan on the layout grid."""
+        """Return those arrays of one finished scan that lie on the layout grid, keyed by name."""
         with np.load(self._pieces / f"{scan_id}.npz", allow_pickle=False) as archive:
             return dict(archive)
 

@@ -1,4 +1,6 @@
-"""Define the record of one printed field that the whole project uses, and the hash of its content."""
+"""Class PrintedScan, the form in which the whole project handles one printed field, and the hash of its
+content.
+"""
 
 import math
 from collections.abc import Mapping
@@ -18,17 +20,18 @@ class PrintedScan:
     Args:
         id: name of the scan. ``print_id`` names the block of fields with which it was printed, and ``order``
             is its position in the writing order.
-        mask_level: level of each pixel of the layout, shape (ny, nx); uint8, or uint16 if there are more than
-            256 levels.
+        mask_level: level of each pixel of the layout (the layout is also called mask), shape (ny, nx); uint8,
+            or uint16 if there are more than 256 levels.
         height_um: measured height of each pixel in µm, shape (ny, nx), float32; NaN where not measured.
         valid: bool array of shape (ny, nx) that is True where the pixel was measured and lies inside the
             scan.
         pitch_um: pixel pitch of all three arrays, µm. ``level_height_um`` is the nominal height of a level,
             µm.
         levels: number of levels that the layout may use.
-        scan_to_layout: 3 x 3 matrix, float64, that maps (x_um, y_um, 1) from the scan's own frame to the
-            layout frame.
-        write: the card's ``[write]`` table; None if the card has none.
+        scan_to_layout: 3 x 3 matrix, float64, that maps homogeneous coordinates (x_um, y_um, 1) in the scan's
+            own frame to those in the layout frame.
+        write: the ``[write]`` table of the dataset card, which says how the printer wrote the fields; None if
+            the card has no such table.
         field_x_um, field_y_um: position of the scan in its write field, µm. ``dose`` is the relative dose.
             None means that the card does not state the value.
         turned_deg: rotation of the scan relative to the other scans. ``direction`` is 1 for trace and -1 for
@@ -39,15 +42,15 @@ class PrintedScan:
         tip_radius_um: radius of the microscope's tip, or an upper bound for it; None if the store has
             neither.
         height_sigma_um: standard uncertainty of ``height_um`` in µm, shape (ny, nx), float32; NaN where not
-            valid. It does not include the uncertainty of the scan's offset. None means that the store does
-            not contain it.
-        groups: values that the named groups of the card's id pattern have for this scan, such as the number
-            of the field. The group ``print`` is left out.
+            valid. It does not include the uncertainty of the scan's zero height. None means that the store
+            does not contain it.
+        groups: values that the named groups of the dataset card's id pattern capture from this scan's id,
+            such as the number of the field. The group ``print`` is left out.
         instrument: name of the instrument, if the card's table gives it. ``seen_by`` is the kind of
             instrument, which determines what the heights mean (see ``Instrument``).
         surround: what lies around the printed field. ``substrate`` means bare substrate, which the layout
-            shows as a rim of level 0. ``continues`` means more of the print, so the outermost pixels are not
-            valid. The default is ``unknown``.
+            shows as a rim of level 0. ``continues`` means more of the same print; because the layout does not
+            show it, the outermost pixels are not valid. The default is ``unknown``.
     """
 
     id: str
@@ -90,7 +93,9 @@ class PrintedScan:
 
     @property
     def quarter_turns(self) -> int:
-        """Return how many quarter turns (``rot90``, 0 to 3) rotate the layout's grid to that of the scan."""
+        """Return the number of quarter turns (``k`` of ``numpy.rot90``, 0 to 3) that rotate the layout's grid
+        to that of the scan.
+        """
         along = self.scan_to_layout[:2, 0]
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
@@ -111,8 +116,8 @@ class PrintedScan:
 
 
 def scan_sha256(scan: PrintedScan) -> str:
-    """Return a hash of all fields of a scan. It serves as the key of the scan in caches, resumed work and
-    dataset ids.
+    """Return a hash of all attributes of a scan. It identifies the scan in caches, resumed work and dataset
+    ids.
     """
     return record_sha256(_hashed(scan))
 
@@ -126,5 +131,5 @@ def _hashed(value: Any) -> Any:
         return {name: _hashed(inner) for name, inner in value.items()}
     if isinstance(value, np.generic):
         value = value.item()
-    # JSON has no NaN.
+    # JSON has no NaN, so floats are written as text.
     return repr(value) if isinstance(value, float) else value

@@ -1,4 +1,4 @@
-"""Read a dataset store, which is checked once when it is opened and then read one scan at a time."""
+"""Read a dataset store. It is checked once when it is opened, and then read one scan at a time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def open_store(path: str | Path) -> Store:
     root = open_root(path)
     require_complete(Path(path))
     store = Store(root, Path(path))
-    # Reading the hash and the manifest checks them.
+    # These properties are read only because they check the hash and the manifest.
     _ = store.sha256, store.manifest
     return store
 
@@ -103,7 +103,7 @@ class Store:
         return f"<p>{html.escape(repr(self))}</p>{scans.to_html(index=False, max_rows=_SHOWN_SCANS)}"
 
     def scan(self, scan_id: str) -> PrintedScan:
-        """Return one scan without padding.
+        """Read one scan, without its padding.
 
         Raises:
             InputError: there is no such id, or a stored chunk cannot be decoded.
@@ -136,8 +136,8 @@ class Store:
     def _groups(self, scan_id: str) -> dict[str, str]:
         """Return the named groups of the card's id pattern, except ``print``, with their values for one id.
 
-        A pattern with repetitions is not applied. In a store of unknown origin, matching such a pattern might
-        never finish.
+        If the pattern contains repetitions, return no groups: in a store of unknown origin, matching such a
+        pattern might never finish.
         """
         ids = (self.manifest.get("card") or {}).get("ids") or {}
         pattern = str(ids.get("print") or "")
@@ -155,8 +155,8 @@ class Store:
         return [self.scan(scan_id) for scan_id in self.ids]
 
     def sample(self, name: str, row: int) -> Array:
-        """Return one scan's part of an array over all scans, without padding. ``row`` is the position of the
-        scan in ``ids``.
+        """Read one scan's part of the array ``name`` over all scans, without its padding. ``row`` is the
+        position of the scan in ``ids``.
 
         Raises:
             InputError: a stored chunk cannot be decoded.
@@ -170,7 +170,8 @@ class Store:
         return values[:ny, :nx]
 
     def scan_frame(self, scan_id: str, name: str) -> Array:
-        """Return an array in the scan's own frame, such as ``raw_height_um`` or ``levelled_height_um``.
+        """Read an array that lies on the scan's own pixel grid instead of the layout's, such as
+        ``raw_height_um`` or ``levelled_height_um``.
 
         Raises:
             InputError: there is no such scan or array, or a stored chunk cannot be decoded.
@@ -179,18 +180,21 @@ class Store:
 
     @property
     def locked_ids(self) -> list[str]:
-        """Return the ids of the lock box, which is always the same sixth of the scans."""
+        """Return the ids of the scans in the lock box, which are set aside for the final test. It is always
+        the same sixth of the scans.
+        """
         return lock_box(self.ids, self._print_ids)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Return the hash of each scan's raw file, which does not depend on levelling or registration.
+        """Return the hashes of the scans' raw files, keyed by scan id. They do not depend on levelling or
+        registration.
 
-        A scan is omitted if the store does not list its file. Layouts are not hashed, because a layout may
-        be printed more than once.
+        A scan is omitted if the store does not list its file. The hashes of layout files are left out,
+        because a layout may be printed more than once.
         """
         wanted = set(ids)
         rows = [row for row in self.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
-        # Only files that were read as scans have facts from a reader.
+        # Only rows of files that were read as scans contain facts from a reader.
         return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
@@ -217,8 +221,8 @@ class Store:
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
-        """Return the manifest: the dataset card, the record of the build and one row per raw file. It is
-        empty if the store has no manifest.
+        """Return the manifest: the dataset card, the record of the build, and one row per raw file. Return an
+        empty dict if the store has no manifest.
         """
         if not has_child(self.root, "manifest"):
             return {}
@@ -229,8 +233,8 @@ class Store:
 
     @cached_property
     def quality(self) -> pd.DataFrame:
-        """Return a table with one row per scan that states how well it was registered and levelled, and its
-        noise.
+        """Return a table with one row per scan that states how well the scan was registered and levelled, and
+        how noisy it is.
 
         If the store has no such table, the rows contain only the ids.
         """
@@ -242,7 +246,9 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Return the hash of the dataset, which is computed once and does not depend on chunking."""
+        """Return the hash of the dataset, which does not depend on how the arrays are divided into chunks. It
+        is computed once.
+        """
         return self.computed_sha256()
 
     @property
@@ -272,7 +278,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """Return the bend of a scan in the scan's own frame, or None if no bend is stored."""
+        """Return the bend of a scan's lines, in the scan's own frame, or None if the store contains none."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

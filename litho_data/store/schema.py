@@ -1,4 +1,6 @@
-"""Define the arrays (``variables.toml``) and columns of a dataset store, and the hash of a dataset."""
+"""Define which arrays (listed in ``variables.toml``) and columns a dataset store has, and how the hash of a
+dataset is computed.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,11 +33,13 @@ class Variable:
 
     @property
     def sample_dims(self) -> tuple[str, ...]:
-        """Return the dimensions of one scan's part of the array."""
+        """Return the names of the dimensions of one scan's part of the array."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
     def stored_as(self, sample: Array) -> str:
-        """Return the type that these values have in the store."""
+        """Return the type in which the store holds these values: ``dtype``, or ``wider`` if ``dtype`` cannot
+        represent them.
+        """
         return self.wider if str(sample.dtype) == self.wider else self.dtype
 
     def sample_sha256(self, sample: Array) -> str:
@@ -59,7 +63,8 @@ heights, and arrays of single scans.
 """
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layout grid, including the uncertainty of the heights."""
-# An array with mixed units has no single unit; its hash uses the unit 1.
+# Maps each array whose elements have different units to a text that states these units. The hash of such an
+# array uses the unit 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = {
@@ -85,12 +90,13 @@ TEXT_COLUMNS = ("instrument", "surround")
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:
-    """Return the facts common to all scans that are part of the dataset's hash.
+    """Return the facts that all scans of a dataset have in common and that its hash includes.
 
     Args:
         geometry: an object with ``pitch_um``, ``level_height_um`` and ``levels``.
         instrument: kind of instrument.
-        write: the card's ``[write]`` table.
+        write: the ``[write]`` table of the dataset card, which says how the printer wrote the fields; None if
+            the card has no such table.
     """
     facts = {name: getattr(geometry, name) for name in ("pitch_um", "level_height_um", "levels")}
     kind = {} if instrument == "afm" else {"instrument": instrument}
@@ -100,10 +106,10 @@ def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[s
 def dataset_sha256(facts: Facts, scans: Sequence[Facts]) -> str:
     """Return the hash of all data of a dataset that a model can use.
 
-    The hash does not depend on chunking, padding or descriptive metadata.
+    The hash does not depend on padding, descriptive metadata, or how the arrays are divided into chunks.
 
     Args:
-        facts: see ``dataset_facts``.
+        facts: facts common to all scans, as ``dataset_facts`` returns them.
         scans: one dict per scan, in stored order. The keys of each dict are ``id``, ``print``, ``order``, the
             optional columns that are not NaN, and ``arrays``, which maps the name of each variable to its
             hash (:meth:`Variable.sample_sha256`).

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
 """Fill values that extend the arrays of smaller layouts to the size of the largest layout."""
-# The arrays that can serve as the OME-Zarr image of a scan, in order of preference.
+# Names of the arrays that can be shown as the OME-Zarr image of a scan, in order of preference.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 
@@ -34,13 +34,13 @@ _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 def write_scan_group(
     root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Write the arrays of one scan, in the scan's own frame, as the group ``scans/<id>``. The group is also
-    an OME-Zarr image.
+    """Write the arrays of one scan that lie on its own pixel grid as the group ``scans/<id>``. The group is
+    also an OME-Zarr image.
 
     Args:
-        root: an open group.
+        root: the open root group of the store.
         scan_id: name of the scan.
-        arrays: arrays by name. Arrays that do not belong to a single scan (see ``SCAN_VARIABLES``) are
+        arrays: arrays of the scan, keyed by name. Those that are not listed in ``SCAN_VARIABLES`` are
             ignored.
         use: use of the scan, as in the card's table.
         pitch_um: pixel pitch of the scan along y and x, µm.
@@ -56,8 +56,8 @@ def write_scan_group(
 
 
 def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
-    """Return the OME-NGFF 0.5 description of an image. The axes of the image have the same names as the
-    dimensions of the array.
+    """Return the OME-NGFF 0.5 description of an image. The axes of the image have the names of the array's
+    dimensions.
     """
     axes = [{"name": _OWN_FRAME[axis], "type": "space", "unit": "micrometer"} for axis in "yx"]
     scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
@@ -74,7 +74,7 @@ def write_samples(
     """Write the arrays over all scans, one scan at a time.
 
     Args:
-        root: an open group.
+        root: the open root group of the store.
         scans: one dict per scan with ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional
             numbers and words) and ``arrays`` (names of the arrays that were made from the scan).
         load: function that takes the id of a scan and returns the arrays of this scan on the layout grid.
@@ -110,12 +110,13 @@ def write_samples(
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "units": "um"}
         centres = pixel_centres_um(count, pitch_um)
         write_numbers(root, f"{axis}_um", centres, axis, attributes=described)
-        # The CF conventions allow only one of an array's coordinates to name an axis.
+        # By the CF conventions, only one of an array's coordinates per dimension may have the attribute
+        # ``axis``.
         write_numbers(root, axis, centres, axis, attributes={**described, "axis": axis.upper()})
 
 
 def pixel_centres_um(count: int, pitch_um: float) -> Array:
-    """Return the coordinates of pixel centres along one axis, µm."""
+    """Return the coordinates, in µm, of the centres of ``count`` pixels along one axis."""
     return (np.arange(count) + 0.5) * pitch_um
 
 
@@ -153,8 +154,8 @@ def _write(group: zarr.Group, name: str, values: Array, dim: str, dtype: Any, **
 def _array(group: zarr.Group, name: str, **described: Any) -> zarr.Array[Any]:
     """Create an array, compressed by Zstandard after a byte shuffle, with a checksum that reveals damage.
 
-    Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk, so
-    it would look like a lost chunk.
+    Chunks that contain only fill values are written too. By default, zarr writes no file for such a chunk,
+    and it could not be distinguished from a chunk that was lost.
     """
     from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -167,8 +168,8 @@ def consolidate(root: zarr.Group) -> None:
     import zarr
 
     with warnings.catch_warnings():
-        # zarr-python warns that other readers may not support the copy. Such readers use the separate
-        # documents.
+        # zarr-python warns that some readers may not support consolidated metadata. Such readers use the
+        # separate documents.
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(root.store)
 
@@ -179,7 +180,8 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
     attributes = {**unit, "long_name": variable.long_name}
     if variable.dims[:2] == ("scan", "y"):
         attributes["coordinates"] = "print order y_um x_um"
-    # A scan's own frame and the layouts differ in size, so their axes need different names within one tree.
+    # A scan's own pixel grid and the layout grid differ in size, so their dimensions need different names
+    # within one store.
     frame = {} if variable.dims[0] == "scan" else _OWN_FRAME
     names = tuple(frame.get(dim, dim) for dim in variable.dims)
     return _array(
@@ -194,8 +196,8 @@ def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.A
 
 
 def _padded(name: str, sample: Array, shape: Shape) -> Array:
-    """Return an array of the common shape, with the sample in the upper left corner and ``PADDING``
-    elsewhere.
+    """Pad one scan's array to the common shape: the array is in the upper left corner, and the value from
+    ``PADDING`` elsewhere.
     """
     if sample.shape == shape:
         return sample
