@@ -1,4 +1,6 @@
-"""Measure roughness, noise and step heights of scans, and how much roughness levelling removes."""
+"""Measure roughness, noise and step heights of scans, and compute how much of the roughness levelling
+removes.
+"""
 
 from litho_data.roughness.amplitude import (
     AmplitudeParameters,

@@ -10,15 +10,15 @@ from litho_data.foundation.results import Record
 
 
 class AmplitudeParameters(Record):
-    """Amplitude parameters about the mean height. They can be compared only between surfaces with the same
-    pitch, field of view and levelling.
+    """Amplitude parameters of the deviations from the mean height. Only values from surfaces with the same
+    pitch, field of view and levelling can be compared.
 
     Args:
-        sa_nm: mean absolute deviation.
-        sq_nm: root mean square.
+        sa_nm: mean absolute deviation, nm.
+        sq_nm: root mean square of the deviations, nm.
         ssk: skewness; 0 for a flat surface.
         sku: kurtosis; 3 for a Gaussian surface, 0 for a flat surface.
-        sz_nm: height of the highest pixel minus that of the lowest.
+        sz_nm: height of the highest pixel minus that of the lowest, nm.
         pixels: number of pixels used.
     """
 
@@ -33,8 +33,8 @@ class AmplitudeParameters(Record):
 def amplitude_parameters(height_um: Array, valid: Array | None = None) -> AmplitudeParameters:
     """Return Sa, Sq, Ssk, Sku and Sz of a levelled surface.
 
-    Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴, where h is the height about the
-    mean.
+    Sa = mean|h|, Sq² = mean h², Ssk = mean h³ / Sq³, Sku = mean h⁴ / Sq⁴, where h is the deviation of the
+    height from the mean height.
 
     Args:
         height_um: levelled heights in µm, of any shape; NaN is ignored.
@@ -49,7 +49,8 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
         raise InputError("surface", got="no valid pixel", wanted="at least one valid pixel")
     deviation = height_nm - height_nm.mean()
     sq_nm = float(np.sqrt(np.mean(deviation**2)))
-    # Rounding errors of the mean are 1e-16 of the height. A surface whose Sq is hardly larger is flat.
+    # Rounding errors of the mean are about 1e-16 of the height. A surface whose Sq is not much larger than
+    # these errors counts as flat.
     flat = sq_nm <= 1e-12 * max(1.0, float(np.abs(height_nm).max()))
     return AmplitudeParameters(
         sa_nm=float(np.abs(deviation).mean()),
@@ -62,10 +63,11 @@ def amplitude_parameters(height_um: Array, valid: Array | None = None) -> Amplit
 
 
 def autocorrelation(height_um: Array) -> Array:
-    """Return the normalised autocorrelation for lags from 0 to half the field.
+    """Return the autocorrelation of a surface, normalised to 1 at lag 0, for lags up to half the field.
 
-    The shape is (ny // 2, 2 (nx // 2) − 1). Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx //
-    2 − 1)`` columns. The sum at each lag is divided by the number of pixel pairs.
+    Element ``[i, j]`` of the result is the value at the lag of i rows and ``j − (nx // 2 − 1)`` columns. The
+    sum of products at each lag is divided by the number of pixel pairs with this lag. The result has shape
+    (ny // 2, 2 (nx // 2) − 1).
 
     Raises:
         InputError: the surface contains NaN, or its heights are constant.
@@ -86,17 +88,20 @@ def autocorrelation(height_um: Array) -> Array:
 
 
 def effective_samples(height_um: Array) -> float:
-    """Return how many independent heights would determine the variance as well as the correlated heights of a
-    field do: pixels / Σ ρ², where ρ is the autocorrelation.
+    """Return the effective number of samples of a surface, n_eff = pixels / Σ ρ², where ρ is the
+    autocorrelation. So many independent heights would determine the variance as precisely as the correlated
+    heights of the surface do.
 
-    For a Gaussian surface, the estimated mean square has the relative variance ``2 Σ ρ² / pixels``. The sum
-    excludes lags beyond a quarter of the field, because ρ² consists only of noise there.
+    The formula holds for Gaussian surfaces, whose estimated mean square has the relative variance ``2 Σ ρ² /
+    pixels``. The sum excludes lags beyond a quarter of the field, because the estimated ρ is nothing but
+    noise there.
     """
     correlation = autocorrelation(height_um)
     rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
     centre = correlation.shape[1] // 2
     near = correlation[:rows, centre - columns : centre + columns + 1]
-    # The half plane of negative row lags mirrors that of positive row lags.
+    # ρ is computed only for row lags of 0 and more. Its values at negative row lags mirror those at positive
+    # ones.
     total = 2 * np.sum(near**2) - np.sum(near[0] ** 2)
     return float(min(height_um.size, max(1.0, height_um.size / total)))
 
@@ -104,6 +109,6 @@ def effective_samples(height_um: Array) -> float:
 def sq_uncertainty_nm(height_um: Array) -> float:
     """Return the standard uncertainty of Sq, in nm, that is due to the finite field.
 
-    It is ``Sq / √(2 n_eff)`` for Gaussian heights.
+    For Gaussian heights it is ``Sq / √(2 n_eff)``, where n_eff is the result of ``effective_samples``.
     """
     return amplitude_parameters(height_um).sq_nm / float(np.sqrt(2 * effective_samples(height_um)))

@@ -1,5 +1,5 @@
-"""Find the period of a grating, first from the peak of its spectrum, then more precisely from the phase
-across the field.
+"""Measure the period of a grating: first roughly from the peak of its spectrum, then precisely from how the
+phase changes across the field.
 """
 
 from collections.abc import Sequence
@@ -11,22 +11,24 @@ from litho_data.foundation import YX, Array, InputError
 from litho_data.foundation.results import Record
 from litho_data.scan import Axis
 
-# An uncalibrated scanner may show a period that differs from the true period by up to this factor.
+# Range in which the period is searched, as a factor: an uncalibrated scanner may show a period that is wrong
+# by up to this factor.
 SEARCHED = 1.25
-# In a window of two periods, the mean and all harmonics cancel. The fit of the phases needs several windows
-# side by side.
+# Width of the windows in which phases are measured, and smallest accepted length of the scan, both in
+# periods. In a Hann window of two periods, the mean and all harmonics cancel. A line is fitted to the phases,
+# which needs several windows side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
 # Largest accepted scatter of the phases. Phases of pure noise scatter by 1.8 rad.
 _MOST_SCATTER_RAD = 0.5
-# Neighbouring windows overlap by half, so the noise of a window has the correlation 1/6 with that of the
-# window on either side.
+# Factor by which the overlap of the windows increases the variance of the fit. Neighbouring windows overlap
+# by half, so the noise of each window has the correlation 1/6 with that of the two windows beside it.
 _OVERLAP_VARIANCE = 1 + 2 / 6
 
 
 @dataclass(frozen=True)
 class Wave:
-    """The fundamental wave of a grating: its frequencies along x and y with their standard uncertainty, in
-    cycles/µm.
+    """The fundamental wave of a grating: its spatial frequencies along x and y, and their standard
+    uncertainty, all in cycles/µm.
     """
 
     x_per_um: float
@@ -35,7 +37,9 @@ class Wave:
 
 
 class Scale(Record):
-    """The factor that converts stated lengths to true lengths, and its standard uncertainty."""
+    """The scale of an axis: the factor that converts lengths stated by the microscope to true lengths, and
+    its standard uncertainty.
+    """
 
     factor: float
     uncertainty: float
@@ -44,15 +48,16 @@ class Scale(Record):
 def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> Wave:
     """Find the fundamental wave of a grating that repeats along an axis, or within 15° of this direction.
 
-    The phase is measured in Hann windows of two periods along the axis, over the whole length of the other
-    axis. The slope of the phase along the axis corrects the frequency. The scatter of the phases about a
-    straight line gives the combined uncertainty from noise, drift and a bent scanner axis.
+    The phase is measured in Hann windows that are two periods wide along the axis and extend over the whole
+    length of the other axis. The slope of a straight line fitted to the phases corrects the frequency. The
+    scatter of the phases about this line gives an uncertainty that includes noise, drift and a bent scanner
+    axis.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
         pitch_um: stated pixel pitch along y and x, µm.
-        period_um: known period. The search covers periods from ``period_um / SEARCHED`` to ``period_um *
-            SEARCHED``.
+        period_um: known period of the grating, µm. The search covers periods from ``period_um / SEARCHED`` to
+            ``period_um * SEARCHED``.
         axis: the axis along which the grating repeats.
 
     Raises:
@@ -86,8 +91,8 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
     """Measure how far the middle of a scan line is displaced along x relative to the ends of the line. Return
     the displacement and its standard uncertainty, in µm.
 
-    If the displacement is b, a pixel at x on a line of length L shows the surface at x + 4 b (x / L) (1 - x /
-    L), apart from shift and scale.
+    A displacement b means that the pixel at x on a line of length L shows the point x + 4 b (x / L) (1 - x /
+    L) of the surface, apart from a shift and a change of scale of the whole line.
 
     Args:
         height_um: heights of a grating that repeats along x, in µm, shape (ny, nx).
@@ -105,14 +110,17 @@ def line_bow(height_um: Array, pitch_um: YX, wave: Wave) -> tuple[float, float]:
 
 
 def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
-    """Return the scales of the axes whose gratings were measured, for a scanner without shear.
+    """Return the scales of the axes for which gratings were measured. The scanner is assumed to have no
+    shear.
 
-    If stated lengths are c times too short, a frequency is c times too high. The square of the true frequency
-    is therefore (x / c_x)² + (y / c_y)² for any angle of the grating.
+    If stated lengths along an axis are too short by the factor c, measured frequencies along this axis are
+    too high by the factor c. A grating with the measured frequencies x and y therefore has the true squared
+    frequency (x / c_x)² + (y / c_y)², whatever its angle.
 
     Args:
         waves: for each grating, the measured wave, the known period and its standard uncertainty (µm).
-        axes: for each grating, the axis that it calibrates. An axis without a grating keeps its stated scale.
+        axes: for each grating, the axis that it calibrates. An axis without a grating is assumed to have a
+            correct scale.
     """
     design = np.array([[wave.x_per_um**2, wave.y_per_um**2] for wave, _, _ in waves])
     known = np.array([1 / period_um**2 for _, period_um, _ in waves])
@@ -144,14 +152,15 @@ def _peak(flat: Array, pitch_um: YX, period_um: float) -> Array:
 
 
 def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]:
-    """Return the correction to a frequency (its components along and across the axis), the uncertainty of the
-    component along the axis, and the scatter of the phases in rad.
+    """Return the correction that is to be added to the frequency ``at`` (its components along and across the
+    axis), the uncertainty of the component along the axis, and the scatter of the phases in rad.
     """
     x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
     places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
     slope, error, scatter = _line(places, phases)
-    # Four bands across the axis are enough to measure a small angle. In each band, other waves average out.
+    # The angle of the grating is small, so the phases of four bands of rows are enough to measure it. Within
+    # each band, all other waves average out.
     window = np.hanning(len(x))
     bands = [band @ window for band in np.array_split(carried, 4)]
     centres = np.array([band.mean() for band in np.array_split(y, 4)])
@@ -176,8 +185,8 @@ def _line(places: Array, phases: Array) -> tuple[float, float, float]:
 
 
 def _last_weight(columns: list[Array], values: Array) -> tuple[float, float, float]:
-    """Fit values by a weighted sum of columns (least squares). Return the weight of the last column, the
-    standard uncertainty of this weight, and the scatter of the values about the fit.
+    """Fit values by a linear combination of columns (least squares). Return the coefficient of the last
+    column, the standard uncertainty of this coefficient, and the scatter of the values about the fit.
     """
     design = np.column_stack(columns)
     weights, *_ = np.linalg.lstsq(design, values, rcond=None)

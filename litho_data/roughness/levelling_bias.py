@@ -1,10 +1,10 @@
-"""Compute how much levelling lowers Sq, the rms roughness, because levelling also removes some of the
-roughness.
+"""Compute by how much levelling lowers the measured rms roughness Sq. It does so because the fitted
+background also follows some of the roughness.
 
-After a least-squares fit on a basis Q (orthonormal over the N pixels) is subtracted, a surface with
-correlation matrix C has the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. The formula is exact for any
-polynomial background and any autocorrelation (compare arXiv:2001.00433, which treats the same bias for
-polynomials).
+The background is a least-squares fit of basis functions that are orthonormal over the N pixels; they are the
+columns of a matrix Q. After the background is subtracted, a surface with variance σ² and correlation matrix C
+has the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. The formula is exact for any polynomial background and
+any autocorrelation. Compare arXiv:2001.00433, which treats the same bias.
 """
 
 from collections.abc import Callable
@@ -39,8 +39,8 @@ def retained_variance(
     To correct the Sq of a levelled surface, divide it by the square root of this share.
 
     Args:
-        shape: shape (ny, nx) of the field in pixels. For rows that are levelled separately, use (1, nx) and a
-            degree of (0, n).
+        shape: shape (ny, nx) of the field in pixels. If each row is levelled separately by a polynomial of
+            degree n, give the shape (1, nx) and the degree (0, n).
         pitch_um: pixel pitch, µm.
         correlation: normalised autocorrelation as a function of the lags along y and along x, µm.
         degree: the largest total degree (1 = plane), or the largest independent degrees along (y, x). Degree

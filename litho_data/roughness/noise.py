@@ -1,4 +1,6 @@
-"""Estimate the noise of pixels and of scan lines, separately from the print."""
+"""Estimate the noise of single pixels and the noise of whole scan lines, apart from the structure of the
+print.
+"""
 
 from math import comb
 
@@ -10,18 +12,18 @@ from litho_data.scan import Axis
 
 # The median absolute deviation of a Gaussian is 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
-# Differences of this order pass half of the amplitude at 0.84 of the Nyquist frequency, and a fiftieth of it
-# at 0.56 of the Nyquist frequency (0.28 cycles per pixel).
+# Order of the differences. A wave at 0.84 of the Nyquist frequency keeps half of its amplitude, and a wave at
+# 0.56 of it (0.28 cycles per pixel) keeps a fiftieth.
 _FINE_ORDER = 8
 
 
 def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, float]:
     """Estimate the white pixel noise and the line noise of a scan, in nm, without knowing what was printed.
 
-    A printer writes nothing finer than its spot, so high-order differences contain only noise. Differences
-    along both axes give the pixel noise. Differences of the line means along the slow axis give the line
-    noise. Noise that is correlated between lines (drift) and noise that the feedback smooths look like the
-    print, so they are not included.
+    A printer writes nothing finer than its spot, so differences of high order between neighbouring pixels
+    contain only noise. Differences along both axes give the pixel noise. Differences of the line means along
+    the slow axis give the line noise. Drift (noise that is correlated between lines) and noise that the
+    microscope's feedback has smoothed look like printed structures, so the estimates do not include them.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
@@ -45,9 +47,9 @@ def _fine(values: Array, axis: int) -> Array:
 
 
 def fine_differences(values: Array, order: int, axis: int) -> Array:
-    """Return the differences of the given order along an axis, scaled so that white noise keeps its variance.
-
-    The differences of polynomials of lower degree are zero.
+    """Return the differences of the given order along an axis. They are scaled so that the differences of
+    white noise have the variance of the noise itself. The differences of a polynomial whose degree is below
+    ``order`` are zero.
     """
     return np.diff(values, order, axis=axis) / comb(2 * order, order) ** 0.5
 
@@ -57,8 +59,8 @@ def _fine_sd(differences: Array) -> float:
 
 
 def robust_sd(values: Array) -> float:
-    """Estimate a standard deviation from the median absolute deviation. NaN is ignored; without other values,
-    the result is NaN.
+    """Estimate a standard deviation from the median absolute deviation. NaN is ignored; if there are no other
+    values, the result is NaN.
     """
     known = values[np.isfinite(values)]
     return float(_MAD_TO_SD * np.median(np.abs(known - np.median(known)))) if known.size else float("nan")

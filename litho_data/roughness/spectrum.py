@@ -1,4 +1,4 @@
-"""Compute power spectral densities whose integral is the variance."""
+"""Compute power spectral densities, normalised so that their integral over frequency is the variance."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -11,7 +11,7 @@ from litho_data.scan import Axis
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A one-sided spectrum at positive frequencies.
+    """A one-sided power spectrum, i.e. one that is defined at positive frequencies only.
 
     Args:
         frequency_per_um: frequencies in cycles/µm, ascending.
@@ -32,11 +32,12 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
         height_um: finite heights in µm, shape (ny, nx).
         pitch_um: pitch along the axis, in µm.
         axis: direction of the lines, ``x`` (along rows) or ``y`` (along columns).
-        window: whether to remove the slope and use the window. False is suitable for periodic or noise-like
-            surfaces.
+        window: whether to remove the slope of each line and apply the window. False is suitable for surfaces
+            that are periodic over the field or consist of noise.
 
     Raises:
-        InputError: the surface contains NaN, the lines are shorter than 8 pixels, or the axis is unknown.
+        InputError: the surface contains NaN, the lines are shorter than 8 pixels, or the axis is neither x
+            nor y.
     """
     from scipy.signal import periodogram
 
@@ -48,7 +49,9 @@ def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = T
 
 
 def hann(shape: Shape) -> Array:
-    """Return a two-dimensional Hann window of shape (ny, nx), without the zeros at its border."""
+    """Return a two-dimensional Hann window of shape (ny, nx). The zeros that a Hann window has at its border
+    are left out.
+    """
     ny, nx = shape
     return np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
 

@@ -9,8 +9,8 @@ from litho_data.foundation.results import Record
 from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
-# An edge must change the profile by more than this many times the median change. On a rough surface without a
-# step, the largest change is 4 to 5 times the median.
+# An edge counts only if the profile changes there by more than this many times the median change. On a rough
+# surface without a step, the largest change is 4 to 5 times the median change.
 _EDGE_SIGMA = 9.0
 
 
@@ -18,10 +18,10 @@ class StepHeight(Record):
     """The measured height of one step.
 
     Args:
-        height_nm: mean height over the lines.
-        line_sd_nm: standard deviation over the lines.
-        uncertainty_nm: standard uncertainty of the mean, from the standard deviation and the number of
-            independent lines. It does not include the calibration of the z scale.
+        height_nm: height of the step, averaged over the lines.
+        line_sd_nm: standard deviation of the heights of the single lines.
+        uncertainty_nm: standard uncertainty of ``height_nm``, computed from the standard deviation and the
+            number of independent lines. It does not include the uncertainty of the microscope's height scale.
         lines: number of lines that were fitted.
     """
 
@@ -35,9 +35,9 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     """Return the height of a ridge or groove of type A1 (ISO 5436-1) above its surroundings, positive for a
     ridge and negative for a groove.
 
-    ``z = a·x + b + h·δ`` is fitted to every line, with δ = 1 on the middle third of the feature and δ = 0 on
-    two reference arms. If W is the width of the feature, the arms cover the distances from W/3 to W outside
-    its edges, so the profile spans three widths.
+    ``z = a·x + b + h·δ`` is fitted to every line, where δ is 1 on the middle third of the feature and 0 on
+    two reference sections (arms) beside it. The fitted h is the height. If W is the width of the feature, the
+    arms cover the distances from W/3 to W outside its edges, so the profile spans three widths.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN is ignored.
@@ -66,11 +66,12 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
 def stair_steps(
     height_um: Array, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
 ) -> list[StepHeight]:
-    """Return the height of each step of a staircase, one step per edge. It is positive if the surface rises
-    along the axis.
+    """Return the heights of the steps of a staircase, one for each edge. A height is positive if the surface
+    rises along the axis.
 
-    On every line, one height per tread and one common slope are fitted to the middle thirds of the treads.
-    The height of a step is the difference between two neighbouring treads.
+    Treads are the flat parts between the edges. For every line, one height per tread and one slope common to
+    all treads are fitted to the middle thirds of the treads. The height of a step is the difference between
+    the heights of two neighbouring treads.
 
     Args:
         edges_um: positions of the edges along the axis in µm, in ascending order.
@@ -101,7 +102,9 @@ def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Arr
 
 
 def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[StepHeight]:
-    """Fit the heights of all treads and one slope to each line, and return the height of each step."""
+    """Fit the heights of all treads and one common slope to each line, and return the height of each step,
+    averaged over the lines.
+    """
     used = np.any(treads, axis=0)
     design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
         used
@@ -120,7 +123,8 @@ def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[St
 
 def _summary(step_nm: Array) -> StepHeight:
     sd_nm = float(step_nm.std(ddof=1))
-    # Neighbouring lines of a print share its roughness, so they do not count as independent.
+    # The roughness of a print is correlated between neighbouring lines, so not every line counts as
+    # independent.
     independent = _independent_lines(step_nm) if sd_nm > 0 else float(step_nm.size)
     return StepHeight(
         height_nm=float(step_nm.mean()),
@@ -131,7 +135,9 @@ def _summary(step_nm: Array) -> StepHeight:
 
 
 def _independent_lines(values: Array) -> float:
-    """Return the number of independent lines, n / (1 + 2 Σ ρ). The sum ends before the first negative ρ."""
+    """Return the effective number of independent lines, n / (1 + 2 Σ ρ), where ρ is the autocorrelation of
+    the values of n lines. The sum ends before the first lag at which ρ is negative.
+    """
     deviation = values - values.mean()
     correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
     negative = np.flatnonzero(correlation < 0)
@@ -145,8 +151,9 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
 
     The slope of the field is removed from the median profile. An edge is a place where the change of this
     profile is at least half as large as its largest change. ``stair_steps`` measures the heights of the
-    steps, and their absolute values are averaged. The steps of one scan share treads and are not independent,
-    so the mean is given the uncertainty of a single step.
+    steps, and their absolute values are averaged. Steps of one scan share treads, so their errors are not
+    independent. The stated uncertainty is therefore that of a single step, not that of a mean of independent
+    values.
 
     Raises:
         InputError: no edge stands out from the profile, or edges are closer than three pixels.

@@ -1,4 +1,6 @@
-"""Find the direction and the period of lines on a surface, and test whether they could occur by chance."""
+"""Find the direction and the period of lines on a surface, and test whether a surface without lines could
+show them by chance.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +12,15 @@ from litho_data.foundation import Array, InputError
 from litho_data.roughness.spectrum import hann
 
 FEWEST_LINES = 64
-# A peak is compared with the frequencies around it that lie outside its own width under a Hann window.
+# A peak is compared with the powers at up to this many frequencies on either side. The frequencies closest to
+# the peak are left out, because a Hann window spreads the peak over them.
 _AROUND = 16
 _OWN = 3
-# Share of the powers that are independent. Under a Hann window, powers that are 0, 1 or 2 frequencies apart
-# have a correlation of 1, 4/9 or 1/36.
+# Effective share of independent powers. With a Hann window, powers at frequencies that are 0, 1 or 2 steps
+# apart have a correlation of 1, 4/9 or 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
-# First frequency that is used. Lower frequencies contain the part of a bow that levelling did not remove.
+# Lowest frequency that is used, in cycles per field. Lower frequencies contain what levelling left of a bow.
 _FIRST = 3
 
 
@@ -26,11 +29,11 @@ class LineDirection:
     """Direction of the lines of a surface.
 
     Args:
-        angle_deg: angle of the lines to the rows, from -90 (excluded) to 90. An angle of 0 is along x;
-            positive angles are from x towards y.
-        strength: length of the mean double-angle vector of the power spectrum; 0 for an isotropic surface, 1
-            for lines that all have one direction.
-        p: probability that an isotropic surface has at least this strength by chance (Rayleigh's test).
+        angle_deg: angle between the lines and the rows in degrees, from -90 (excluded) to 90. Lines along x
+            have the angle 0; positive angles turn from x towards y.
+        strength: length of the mean double-angle vector of the power spectrum (see ``line_direction``); 0 for
+            an isotropic surface, 1 for lines that all have the same direction.
+        p: probability that an isotropic surface shows at least this strength by chance (Rayleigh's test).
     """
 
     angle_deg: float
@@ -40,16 +43,17 @@ class LineDirection:
 
 @dataclass(frozen=True)
 class LinePeriod:
-    """The strongest period of lines.
+    """The strongest period with which lines repeat.
 
     Args:
         period_um: period at the centre of the peak that rises furthest above the spectrum around it.
-        share: share of the power of the line means that lies in the peak.
-        p: probability that a smooth spectrum has such a peak at any frequency by chance.
-        amplitude_um: amplitude at this period, as a root mean square over the surfaces.
-        coherence: agreement of the phases at this period. Every surface has a phasor of unit length, and the
-            coherence is the length of the mean phasor. It is 1 if all surfaces have the same phase, and about
-            1 / √F if the phases of F surfaces are independent.
+        share: share of the power of the line means (the mean height of each line) that lies in the peak.
+        p: probability that a surface with a smooth spectrum shows such a peak at any frequency by chance.
+        amplitude_um: amplitude of the wave with this period, as a root mean square over the surfaces.
+        coherence: agreement between the surfaces in the phase of this wave. Each surface contributes a
+            complex number of modulus 1 that has its phase, and the coherence is the modulus of the mean of
+            these numbers. It is 1 if all surfaces have the same phase, and about 1 / √F if the phases of F
+            surfaces are independent.
     """
 
     period_um: float
@@ -62,10 +66,11 @@ class LinePeriod:
 def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """Find the direction in which surfaces change least, from their power spectra.
 
-    Each frequency (fx, fy) contributes a vector whose angle is twice that of the frequency and whose length
-    is the power. Each surface is scaled by its own variance. The powers of random surfaces are independent
-    and exponentially distributed. The mean vector of an isotropic surface is therefore normal with variance 1
-    / n, where n = (Σ P)² / Σ P² is the effective number of frequencies.
+    Each frequency (fx, fy) contributes a vector whose length is the power at this frequency and whose angle
+    is twice that of (fx, fy), so that opposite directions count as the same. Each surface is divided by its
+    own variance. The powers P of a random surface are independent and exponentially distributed. For an
+    isotropic surface, the mean vector is therefore normally distributed with variance 1 / n, where n = (Σ P)²
+    / Σ P² is the effective number of frequencies.
 
     Args:
         heights_um: levelled heights in µm, one array of shape (ny, nx) per surface. The pixels must be
@@ -76,7 +81,7 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
     """
     vectors, variances = zip(*(_mean_vector(height) for height in heights_um), strict=True)
     vector, variance = np.mean(vectors), np.mean(variances) / len(heights_um)
-    # In the spectrum, the power of lines lies in the direction across the lines.
+    # The power of lines lies at frequencies in the direction across the lines.
     across = 0.5 * float(np.degrees(np.angle(vector)))
     return LineDirection(
         angle_deg=across - 90 if across > 0 else across + 90,
@@ -86,8 +91,8 @@ def line_direction(heights_um: Sequence[Array]) -> LineDirection:
 
 
 def _mean_vector(height_um: Array) -> tuple[complex, float]:
-    """Return the mean double-angle vector of the power of a surface, and the variance that this vector would
-    have on an isotropic surface.
+    """Return the mean double-angle vector of the power spectrum of a surface, and the variance that this
+    vector would have if the surface were isotropic.
     """
     height = np.asarray(height_um, np.float64)
     if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
@@ -101,8 +106,8 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
-    # Beyond the Nyquist frequency of the axes, the spectrum consists only of its four corners, which would
-    # favour four directions.
+    # Frequencies beyond the Nyquist frequency of the axes exist only in the four corners of the spectrum.
+    # They would favour the directions of the corners.
     used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
     power, angle = power[used], np.arctan2(fy, fx)[used]
     total = power.sum()
@@ -113,16 +118,17 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
 
 
 def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None:
-    """Find the strongest period that the line means of all scans share. Return None if a scan has fewer than
-    64 lines.
+    """Find the strongest period that the line means (the mean height of each line) of all scans have in
+    common. Return None if a scan has fewer than 64 lines.
 
-    If lines are random, the mean periodogram of F scans, divided by its smooth level, is distributed as
-    Gamma(F) / F. The level is a parabola fitted to the logarithms of the power at the surrounding
-    frequencies, and its uncertainty is integrated out. The p-value of the largest peak is corrected for the
-    number of frequencies (Bonferroni).
+    If the line means are random, the mean periodogram of F scans, divided by the smooth spectrum from which
+    it scatters, is distributed as Gamma(F) / F. At each frequency, the smooth spectrum is estimated by a
+    parabola fitted to the logarithms of the powers at the surrounding frequencies. The p-value is averaged
+    over the uncertainty of this estimate. The p-value of the largest peak is corrected for the number of
+    frequencies that were searched (Bonferroni).
 
     Args:
-        means_um: mean height of each line, one array per scan; all arrays are cropped to the shortest.
+        means_um: line means in µm, one array per scan. All arrays are cropped to the length of the shortest.
         pitch_um: distance between lines, µm.
     """
     count, scans = min(len(own) for own in means_um), len(means_um)
@@ -132,7 +138,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
     spectra = np.stack(
         [np.abs(np.fft.rfft(taper * (own[:count] - own[:count].mean()))) ** 2 for own in means_um]
     )
-    # Scans differ in roughness, so each is divided by its own level.
+    # Scans differ in roughness, so the power of each is divided by its own mean level.
     floor = np.finfo(float).tiny
     spectra = (spectra / np.maximum(np.median(spectra, axis=1, keepdims=True), floor))[:, _FIRST:]
     power = np.maximum(spectra.mean(axis=0), floor)
@@ -154,8 +160,9 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
 
 
 def _against_surroundings(power: Array, scans: int) -> tuple[Array, Array]:
-    """For each frequency, return the power level given by the surrounding frequencies, and the probability
-    that the actual power exceeds this level so far by chance.
+    """For each frequency, return the power expected from the powers at the surrounding frequencies, and the
+    probability that the actual power exceeds the expected power by as much by chance. ``scans`` is the number
+    of scans over which the powers were averaged.
     """
     position = np.arange(len(power))
     logarithm = np.log(power) - digamma(scans) + np.log(scans)
