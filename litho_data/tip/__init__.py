@@ -1,4 +1,6 @@
-"""Estimate the radius of an AFM tip from scans, and find where the tip did not touch the surface."""
+"""Estimate the radius of an AFM tip from scans made with it, and find where the tip did not touch the
+surface.
+"""
 
 from litho_data.tip.certainty import reconstructed, tip_certain
 from litho_data.tip.estimate import TipEstimate, estimate_tip

@@ -1,10 +1,12 @@
-"""Find which pixels of a surface the tip touched, and reconstruct the surface from the image.
+"""Find which pixels of a surface the tip touched, and reconstruct the surface from the image that the tip
+produced.
 
-The height of an image pixel is determined by the point where the tip touches the surface. If a valley is more
-sharply curved than the tip, the contact jumps from one side of the valley to the other. The tip does not
-touch the surface in between. In the image, this part of the surface appears only as a single pixel at which
-the image is more sharply curved than the tip. If such an image pixel limits the height that the surface can
-have at another pixel, the tip did not touch the surface at that pixel (Villarrubia 1997, section 5).
+The height of an image pixel is determined by the point at which the tip touches the surface while it scans
+this pixel. If a valley is more sharply curved than the tip, the point of contact jumps from one side of the
+valley to the other, and the tip does not touch the surface in between. This part of the surface leaves only
+one trace in the image: a single pixel at which the image is more sharply curved than the tip. Call it a jump.
+If a jump is the pixel that limits the height which the surface can have at another place, the tip did not
+touch the surface at that place (Villarrubia 1997, section 5).
 """
 
 import numpy as np
@@ -21,24 +23,25 @@ from litho_data.tip.curvature import (
 )
 from litho_data.tip.morphology import paraboloid_erosion
 
-# Curvature of a valley in the image, in units of the tip's curvature. Above the first value, the contact may
-# jump there; above the second value, it does. With a tip of radius R, a valley of curvature k has the
-# curvature k / (1 − kR) in the image, so 0.6 of the tip's curvature in the image means 0.375 of it in the
-# surface. If noise requires a disc as wide as the valley, the disc underestimates the curvature. Noise alone
-# reaches 0.6 only at 3.5 standard deviations.
+# Limits for the curvature of a valley in the image, in units of the tip's curvature. Above the first value,
+# the point of contact may jump there; above the second value, it does jump. With a tip of radius R, a valley
+# of curvature k has the curvature k / (1 − kR) in the image, so 0.6 of the tip's curvature in the image
+# corresponds to 0.375 of it in the surface. Curvatures are fitted over a disc, and if noise requires a disc
+# as wide as the valley, the fit underestimates the curvature. Noise alone reaches 0.6 only at 3.5 standard
+# deviations.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
-# A jump also raises the curvature of discs whose centres are up to a disc radius away, but less. A pixel
-# belongs to the jump if its curvature exceeds this share of the maximum around it.
+# A jump also raises, by less, the curvatures fitted to discs whose centres are up to a disc radius away. A
+# pixel counts as part of the jump if its curvature exceeds this share of the maximum around it.
 _CORE = 0.55
 _SMOOTHING = 0.25
 
 
 def tip_certain(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
     """Return a bool array of shape (ny, nx) that is True at the pixels that the tip certainly touched.
-    Untouched regions are widened by a margin of one pixel.
+    Regions that the tip did not touch are widened by one pixel on all sides.
 
-    If the radius is only an upper bound, some pixels that the tip touched are also marked as untouched.
-    Unmeasured pixels are False.
+    If the given radius is only an upper bound, the result is also False at some pixels that the tip touched.
+    It is always False at unmeasured pixels.
 
     Args:
         height_um: heights of the image in µm, shape (ny, nx); NaN where not measured.
@@ -71,9 +74,9 @@ def reconstructed(height_um: Array, pitch_um: YX, radius_um: float) -> Array:
     """Erode an image by the tip. Return the highest surface from which the tip would produce this image, in
     µm, shape (ny, nx).
 
-    The result equals the true surface where the tip touched it, and lies above it elsewhere. Noise is treated
-    as part of the surface: erosion widens each downward spike of the noise to the width of the tip, which
-    lowers the result by up to the amplitude of the noise.
+    The result equals the true surface where the tip touched it, and lies above it elsewhere. Noise is not
+    removed before the erosion. The erosion widens each downward spike of the noise to the width of the tip,
+    which lowers the result by up to the amplitude of the noise.
 
     Args:
         height_um, pitch_um, radius_um: as for ``tip_certain``.

@@ -1,4 +1,4 @@
-"""Estimate the noise of a scan, the curvatures of the scan over small discs, and the noise of these
+"""Estimate the noise of a scan, the curvatures of its surface over small discs, and the noise of these
 curvatures.
 """
 
@@ -10,15 +10,18 @@ import numpy as np
 from litho_data.foundation import YX, Array
 from litho_data.roughness.noise import fine_differences, robust_sd
 
-# Radii of the discs in pixels. Each disc has more pixels than the one before.
+# Radii, in pixels, of the discs over which curvatures are fitted. Each disc contains more pixels than the one
+# before.
 DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
-# Largest acceptable noise of a curvature, as a share of the curvature of the tip.
+# Largest accepted standard deviation of a measured curvature, as a share of the curvature of the tip.
 QUIET = 0.17
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations, in µm, of white pixel noise and of the offsets of whole rows or columns."""
+    """The noise of a scan: standard deviations, in µm, of the white noise of single pixels and of the offsets
+    of whole rows or columns.
+    """
 
     pixel_um: float
     line_um: float
@@ -28,8 +31,9 @@ class Noise:
 def noise_of(height_um: Array) -> Noise:
     """Estimate the noise of a scan from fourth differences of its heights. ``height_um`` has shape (ny, nx).
 
-    Fourth differences vanish on the parabolas that a tip leaves in the image. If the noise is larger along
-    the columns than along the rows, the excess is attributed to offsets of whole rows, and vice versa.
+    The fourth differences of a parabola are zero, so the parabolas that a tip leaves in the image do not
+    affect them. If the differences along the columns are larger than those along the rows, the excess is
+    attributed to offsets of whole rows, and vice versa.
     """
     rows, columns = (np.nan_to_num(robust_sd(fine_differences(height_um, 4, axis))) for axis in (0, 1))
     pixel, other = min(rows, columns), max(rows, columns)
@@ -40,8 +44,9 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
     """Fit a quadratic surface to a disc around each pixel, and return the highest principal curvature of each
     fit in 1/µm. The result has shape (ny, nx).
 
-    The result is exact for a quadratic surface, and has the least noise of all linear estimates on the disc.
-    It is NaN where the disc extends beyond the scan or contains an unmeasured pixel.
+    The fits are exact for a quadratic surface, and the fitted second derivatives have the least noise of all
+    linear estimates from the heights on the disc. The result is NaN where the disc extends beyond the scan or
+    contains an unmeasured pixel.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
@@ -64,10 +69,10 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
 
 def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
-    """Return the standard deviation, in 1/µm, of the curvatures that ``highest_curvature`` measures on a flat
-    surface with this noise.
+    """Return the standard deviation, in 1/µm, that the given noise of the heights causes in the curvatures of
+    a flat surface as measured by ``highest_curvature``.
 
-    The value is computed along each axis, and the larger one is returned.
+    The standard deviation is computed for the curvatures along x and along y, and the larger one is returned.
     """
     largest = 0.0
     for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
@@ -79,8 +84,9 @@ def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
 
 @lru_cache(maxsize=64)
 def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
-    """Return the weights of the heights on a disc that give the second derivatives of a quadratic fit. The
-    result has shape (3, n, n) and the unit 1/µm².
+    """Return three sets of weights for the heights on a disc. The weighted sums of the heights are the second
+    derivatives of the quadratic surface that fits them best. The result has shape (3, n, n) and the unit
+    1/µm².
 
     The order of the derivatives is xx, xy, yy.
     """
@@ -95,7 +101,9 @@ def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
 
 
 def disc(radius_px: float) -> Array:
-    """Return a bool array of shape (n, n), with n odd, that is True at the pixels inside a disc."""
+    """Return a bool array that is True at the pixels inside a disc around the middle pixel. Its shape is (n,
+    n) with an odd n.
+    """
     half = int(radius_px)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
     return x**2 + y**2 <= radius_px**2 + 1e-9

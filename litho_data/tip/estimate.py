@@ -1,5 +1,5 @@
-"""Estimate the radius of the tip, or an upper bound, from scans, and find where the tip did not touch the
-surface.
+"""Estimate the radius of the tip or an upper bound for it from scans, and find where the tip did not touch
+the surface.
 """
 
 import math
@@ -23,9 +23,10 @@ _SAME_PITCH = 1e-3
 class ScanUnderTip(Record):
     """The effect of the tip on one scan.
 
-    ``certain_fraction`` is the share of pixels that the tip touched. ``resolution_um`` is the wavelength
-    below which the scan may show the shape of the tip instead of the surface. If the scans set no bound on
-    the radius of the tip, both are None. If the tip does not limit the resolution, ``resolution_um`` is None.
+    ``certain_fraction`` is the share of pixels that the tip certainly touched. ``resolution_um`` is the
+    wavelength below which the scan may show the shape of the tip instead of the surface; it is None if the
+    tip does not limit the resolution. Both values are None if the scans set no bound on the radius of the
+    tip.
     """
 
     name: str
@@ -34,20 +35,23 @@ class ScanUnderTip(Record):
 
 
 class TipEstimate(RunFacts, Result):
-    """The tip as estimated from its scans.
+    """The radius of a tip as estimated from scans made with it, and how the estimate was obtained.
 
     Args:
-        kind: ``estimate`` if many places in the scans show the same end of the tip, else ``upper bound``.
+        kind: ``estimate`` if many places in the scans show the shape of the same tip end, otherwise ``upper
+            bound``.
         radius_um: radius of the end of the tip, or its upper bound; None if the scans set no bound.
         radius_sd_um: standard uncertainty of the estimate; None if the radius is only a bound.
         reason: why the radius is only a bound; empty if it is an estimate.
         depth_um: range of heights, after removal of tilt and bow, in the scan from which the radius was
             determined.
-        reach_px: √(2 R depth) in pixels, which is the radius of the image of a spike.
-        pixel_noise_nm, line_noise_nm: noise of the scans, root mean square.
+        reach_px: radius, in pixels, of the image that the tip produces of a spike as high as ``depth_um``; it
+            is √(2 R depth_um) for the tip radius R.
+        pixel_noise_nm, line_noise_nm: standard deviations of the noise of single pixels and of whole lines,
+            averaged over the scans as a root mean square.
         window_px: side length of the windows in which curvatures were measured; None if there is no bound.
         share: share of the sharp peaks that are about as sharp as the sharpest one. The share is high if the
-            tip limits the sharpness.
+            tip limits how sharp peaks appear.
         pitch_um: pixel pitch of the scans along y and x, µm.
         scans: results for each scan.
     """
@@ -72,13 +76,13 @@ class TipEstimate(RunFacts, Result):
 def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     """Estimate the radius of the tip that recorded one or more scans, such as all scans of one day.
 
-    The radius comes from the sharpest peaks, because no peak in an image is more sharply curved than the end
-    of the tip. If many peaks share the same maximum curvature and the valleys are more sharply curved, the
-    result is an estimate. Otherwise, the tip may be sharper than anything that it scanned, and the result is
-    only an upper bound.
+    The radius is computed from the sharpest peaks, because no peak in an image is more sharply curved than
+    the end of the tip. The result is an estimate if many peaks have the same maximum curvature and the
+    valleys are more sharply curved. Otherwise, the tip may be sharper than anything that it scanned, and the
+    result is only an upper bound.
 
     Args:
-        scans: scans that all have the same pitch. Levelling has little influence.
+        scans: scans that all have the same pitch. It matters little whether they are levelled.
 
     Raises:
         InputError: there is no scan, a scan has no pitch, the pitches differ, or a scan has fewer than 64 ×

@@ -1,5 +1,5 @@
-"""Reconstruct a surface from its image. The image is the surface dilated by the tip, and eroding the image by
-the tip restores the surface wherever the tip touched it.
+"""Reconstruct a surface from the image that a tip produced of it. The image is the surface dilated by the
+shape of the tip. Eroding the image by the same shape restores the surface wherever the tip touched it.
 
 Unmeasured pixels (NaN) are ignored.
 """
@@ -12,8 +12,8 @@ from litho_data.foundation import YX, Array
 
 
 class Eroded(NamedTuple):
-    """A reconstructed surface of shape (ny, nx). For each surface pixel, the int32 arrays ``row`` and
-    ``column`` give the position of the image pixel that limits its height.
+    """A reconstructed surface of shape (ny, nx). For each pixel of the surface, the int32 arrays ``row`` and
+    ``column`` contain the position of the image pixel that limits the height of the surface there.
 
     Unmeasured image pixels (NaN) are ignored.
     """
@@ -26,9 +26,9 @@ class Eroded(NamedTuple):
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
     """Return the highest surface from which a paraboloid tip would produce an image of shape (ny, nx) in µm.
 
-    ``radius_um`` is the radius of the end of the tip. A paraboloid is the sum of a parabola in x and one in
-    y, so the minimum over the image is taken along one axis after the other. Pixels that are NaN in the image
-    stay NaN.
+    ``radius_um`` is the radius of the end of the tip. Pixels that are NaN in the image are NaN in the result.
+    The erosion is a minimum over all image pixels. A paraboloid is the sum of a parabola in x and one in y,
+    so the minimum is taken first along one axis and then along the other.
     """
     rows = np.broadcast_to(np.arange(image.shape[0], dtype=np.int32)[:, None], image.shape)
     measured = np.isfinite(image)
@@ -48,7 +48,8 @@ def _erode_rows(
     position of the minimum.
     """
     lowest, owner = heights.copy(), places.copy()
-    # Beyond this distance, the tip has risen by more than the range of heights in the image.
+    # At larger distances than this, the tip has risen by more than the range of heights in the image, so no
+    # pixel there can be the minimum.
     reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)
     for step in range(1, reach + 1):
         rise = (step * pitch_um) ** 2 / (2 * radius_um)

@@ -1,10 +1,11 @@
-"""Estimate the radius of the end of a tip from the sharpest peaks in its images.
+"""Estimate the radius of the end of a tip from the sharpest peaks in the images that it produced.
 
-With a paraboloid tip, the image plus x²/2R is convex along every line. No peak has a curvature above 1/R, and
-every corner and spike that is sharper than the tip appears with exactly this curvature. The distribution of
-the curvatures in an image therefore has an upper edge. If the tip limits the curvatures, the edge of the
-distribution is sharp. If the surface limits the curvatures, the distribution ends in a thin tail. Curvatures
-are measured along the scan lines, because the offset of a line does not change the curvature along it.
+A paraboloid tip with the radius R produces images that become convex along every line if x²/2R is added. In
+such an image, no peak has a curvature above 1/R, and every corner and spike that is sharper than the tip
+appears with exactly the curvature 1/R. The distribution of the curvatures in an image therefore ends at an
+upper edge. The edge is sharp if the tip limits the curvatures. If the surface limits them, the distribution
+ends in a thin tail. Curvatures are measured along the scan lines, because a height offset of a line does not
+change the curvature along it.
 """
 
 from collections.abc import Sequence
@@ -16,31 +17,35 @@ from litho_data.foundation import YX, Array
 from litho_data.register.topography import remove_bow
 from litho_data.tip.curvature import QUIET, noise_of
 
-# Half sides of the square windows in which a parabola is fitted, pixels.
+# Half side lengths, in pixels, of the square windows in which curvatures are measured.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# The reach is the radius of the image of a spike. A window whose half side is a third of the reach averages
-# over as many pixels as still fit on the image of an edge. Half sides of up to 0.45 of the reach are allowed.
+# Half side lengths of windows as shares of the reach, i.e. of the radius of the image of a spike: the
+# preferred one and the largest allowed one. A window of the preferred size is about the largest that still
+# fits on the image of an edge.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
-# The upper edge of the distribution of curvatures is placed so that 98 % of the curvatures above half the
-# edge lie below the edge. Noise raises it by 1.4 standard deviations of the noise.
+# The upper edge of the distribution of curvatures is the 98 % quantile of the sharp curvatures, i.e. of those
+# above half of the 50th highest. Noise raises this quantile by 1.4 standard deviations of the noise, which
+# are subtracted.
 _EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
 _FEWEST_TOPS = 50
 # Share of a line that is excluded at each end, because the scan is unreliable near the turning points.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Peaks above 0.8 of the edge must make up at least this share of the peaks above 0.4 of the edge. On
-# surfaces that no tip limits, the share is at most 0.16.
+# Of the curvatures above 0.4 of the edge, at least this share must lie above 0.8 of the edge. On surfaces
+# whose sharpness no tip limits, the share is at most 0.16.
 _TIP_SHARE = 0.25
-# The tip is the same everywhere in a scan, but the sharpest peaks of a surface are in a few places. The share
-# is therefore multiplied by the share of the scan's 5 x 5 parts whose own edge exceeds 0.9 of the whole
-# scan's edge, and the product must reach 0.13. Among the estimates that are more than 10 % too large, this
-# limit rejects most of those from rounded bumps, but only one in twenty of those from steep walls and spikes.
+# The tip is the same everywhere in a scan, but the sharpest peaks of a surface are in a few places. The scan
+# is therefore divided into 5 x 5 parts, and the share of the parts whose own edge exceeds 0.9 of the whole
+# scan's edge is computed. The product of this share and the share of sharp peaks above must reach 0.13. Among
+# the estimates that are more than 10 % too large, this limit rejects most of those from rounded bumps, but
+# only one in twenty of those from steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# If the tip limits the image, valleys are sharper than peaks. On other surfaces and in most noise, they are
-# not.
+# If the tip limits how sharp peaks appear, valleys are sharper than peaks by at least this factor. If the
+# surface limits it, and in most noise, they are not.
 _SHARPER_VALLEYS = 1.2
-# Relative scatter of the estimates for known tips, beyond the scatter among the parts of a scan, and number
-# of standard uncertainties that are added to the radius to give a bound.
+# The first value is the relative error of the method, i.e. the scatter of the estimates for known tips that
+# the scatter among the parts of a scan does not explain. The second is the number of standard uncertainties
+# that are added to the radius to give an upper bound.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 
@@ -50,8 +55,8 @@ class PeakRadius:
     """The radius of a tip, µm: an estimate or an upper bound, or None if there is no bound.
 
     ``reason`` says why the radius is only a bound, and is empty for an estimate. ``sd_um`` is the standard
-    uncertainty. A bound is the measured radius plus twice this uncertainty. ``depth_um`` is the range of
-    heights. ``window_px`` and ``share`` are explained in ``TipEstimate``.
+    uncertainty of the measured radius; a bound is the measured radius plus twice this uncertainty.
+    ``depth_um``, ``window_px`` and ``share`` are explained in ``TipEstimate``.
     """
 
     radius_um: float | None
@@ -67,7 +72,8 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
     bound.
 
     Args:
-        height_um: heights in µm, shape (ny, nx); NaN where not measured. Tilt and bow have little influence.
+        height_um: heights in µm, shape (ny, nx); NaN where not measured. Tilt and bow of the scan affect the
+            result little.
         pitch_um: pixel pitch along y and x, µm.
     """
     depth_um = float(np.subtract(*np.nanpercentile(remove_bow(height_um), _SPAN[::-1])))
@@ -97,11 +103,11 @@ def peak_radius(height_um: Array, pitch_um: YX) -> PeakRadius:
 
 
 def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
-    """Combine the results of several scans with one tip. Return the mean of the estimates, or the lowest
-    bound if there is no estimate.
+    """Combine the results of several scans that were made with the same tip. Return the mean of the
+    estimates, or the lowest bound if no scan gave an estimate.
 
-    Estimates far above the lowest estimate come from rounded surfaces and are discarded. If the lowest bound
-    lies clearly below the mean of the estimates, this bound is returned instead of the mean.
+    Estimates far above the lowest one are discarded, because they come from scans of rounded surfaces. If the
+    lowest bound lies clearly below the mean of the estimates, this bound is returned instead of the mean.
     """
     known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
     estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
@@ -120,8 +126,9 @@ def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
 
 @dataclass(frozen=True)
 class _Tops:
-    """Curvatures of a scan in windows of one size, in 1/µm; positive at peaks, NaN where no window fits.
-    ``edge`` is the upper edge of their distribution.
+    """Curvatures of a scan, measured in windows of one size, in 1/µm. They are positive at peaks, and NaN
+    where a window contains an unmeasured pixel. ``edge`` is the upper edge of their distribution, and
+    ``noise`` is their standard deviation due to noise.
     """
 
     half_px: int
@@ -135,7 +142,9 @@ class _Tops:
         return near / max(sharp, 1)
 
     def edges(self, count: int) -> list[float]:
-        """Divide the scan into count x count parts, and return the edge of the curvatures in each part."""
+        """Divide the scan into ``count`` x ``count`` parts, and return the upper edge of the distribution of
+        the curvatures in each part.
+        """
         return [
             _edge(part, self.noise)
             for rows in np.array_split(self.curvature, count, axis=0)
@@ -146,7 +155,7 @@ class _Tops:
         return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
 
     def doubt(self, depth_um: float, pitch_um: YX) -> str:
-        """Return the reason why the edge may not come from the tip, or an empty string if there is no such
+        """Return a reason to doubt that the tip determines the edge, or an empty string if there is no such
         reason.
         """
         reach = self.reach_px(depth_um, pitch_um)
@@ -182,7 +191,8 @@ class _Tops:
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     from scipy.signal import savgol_coeffs
 
-    # These weights give the second derivative of the parabola that fits the window best.
+    # The sum of the heights in a window with these weights is the second derivative of the parabola that fits
+    # them best.
     weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)
@@ -190,7 +200,8 @@ def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops
 
 
 def _along_lines(lines: Array, weights: Array) -> Array:
-    """Return the second derivative along the scan lines, averaged over the lines in each window.
+    """Return the second derivative of the heights along the scan lines, averaged over the lines of a square
+    window around each pixel. Pixels whose window would extend beyond the scan are left out.
 
     The result is NaN where the window contains an unmeasured pixel.
     """
@@ -208,9 +219,9 @@ def _along_lines(lines: Array, weights: Array) -> Array:
 
 
 def _edge(curvatures: Array, noise: float) -> float:
-    """Return the upper edge of the distribution of the curvatures, minus the part that noise adds.
+    """Return the upper edge of a distribution of curvatures, after subtracting what noise adds to it.
 
-    The result is 0 or less if there is only noise.
+    A result of 0 or less means that the curvatures are nothing but noise.
     """
     curvatures = curvatures[np.isfinite(curvatures)]
     if len(curvatures) <= _FEWEST_TOPS:

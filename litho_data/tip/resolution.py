@@ -1,26 +1,27 @@
-"""Compute the lateral resolution to which a tip limits a scan."""
+"""Compute the lateral resolution of a scan as limited by the tip."""
 
 import numpy as np
 
 from litho_data.foundation import YX, Array
 
-# Artefacts begin where peaks reach half of the tip's curvature (Sanner et al. 2022).
+# Artefacts of the tip begin at wavelengths at which peaks reach this share of the tip's curvature (Sanner et
+# al. 2022).
 _SHARE = 0.5
 
 
 def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> float | None:
     """Return the wavelength, µm, below which the scan may show the shape of the tip instead of the surface.
 
-    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is computed from
-    heights that are λ/2 apart, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes. The result
-    is the largest λ at which this curvature reaches half of 1/R (Sanner et al., Scale-dependent roughness
-    parameters for topography analysis, arXiv:2106.16103). Noise peaks are not distinguished from peaks of the
-    surface, so the result is an upper bound.
+    Peaks of an image are at most as sharp as the tip. For each wavelength λ, the curvature of the sharpest
+    peak is computed along both axes from heights that are λ/2 apart: ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) /
+    (λ/2)²``. The result is the largest λ at which this curvature reaches half of the tip's curvature 1/R
+    (Sanner et al., Scale-dependent roughness parameters for topography analysis, arXiv:2106.16103). Peaks
+    that are due to noise are not distinguished from peaks of the surface, so the result is an upper bound.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
         pitch_um: pixel pitch along y and x, µm.
-        radius_um: radius of the tip.
+        radius_um: radius of the end of the tip, µm.
 
     Returns:
         The wavelength. None means that no peak reaches this curvature at any distance, so the tip does not
