@@ -1,9 +1,10 @@
 """Turn raw AFM files and layouts into a dataset that records the origin of every array.
 
-For one scan, call ``read_scan`` → ``level_scan`` → ``register_scan`` → ``resample_to_layout``. For a whole
-dataset, call ``build_dataset`` with a dataset card (the TOML file that describes the raw files), then
-``open_store``. ``fetch`` downloads the files of a known dataset. ``simulate`` writes such raw files for
-simulated prints, as a virtual printer and microscope would deliver them.
+To process one scan, call ``read_scan``, ``level_scan``, ``register_scan`` and ``resample_to_layout`` in this
+order. To build a whole dataset, call ``build_dataset`` with a dataset card (the TOML file that describes the
+raw files), and read the result with ``open_store``. ``fetch`` downloads the files of a known dataset.
+``simulate`` writes such raw files for simulated prints, as a virtual printer and microscope would deliver
+them.
 """
 
 from typing import TYPE_CHECKING

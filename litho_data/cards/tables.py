@@ -18,8 +18,8 @@ from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
 READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
-"""Columns of the table that say how to read a single scan. They replace the entries with the same names in
-the card's ``[scan]`` table.
+"""Columns of the card's CSV table that say how to read a single scan. Their values take precedence over the
+entries with the same names in the card's ``[scan]`` table.
 """
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
 _NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")

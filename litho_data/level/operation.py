@@ -16,7 +16,7 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
-"""The steps that a recipe can contain, by the name of the operation."""
+"""The classes of the steps that a recipe can contain, keyed by the name of the operation."""
 # Arguments whose values come with the scan, so they are not settings of a step. The values are the phrases
 # with which messages name these arguments.
 _OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}

@@ -22,7 +22,9 @@ from litho_data.store.schema import SCAN_VARIABLES, VARIABLES
 
 _HASH_DIGITS = 12
 Recorded = dict[str, list[tuple[str, Step]]]
-"""The steps of every scan in order, each with its recorded id."""
+"""The recorded processing steps of every scan, keyed by scan id. Each list contains pairs (recorded id of the
+step, step), in the order in which the steps were run.
+"""
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
@@ -93,7 +95,9 @@ def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
 
 
 def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
-    """Find the folder of a store's raw files; return None if it cannot be found.
+    """Return the folder of a store's raw files. If ``data_dir`` is None, the folder that the build recorded
+    and the known folders of the dataset are tried; the result is None if none of them contains any of the
+    files.
 
     Raises:
         InputError: ``data_dir`` is given but is not a folder.

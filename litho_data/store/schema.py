@@ -14,7 +14,9 @@ from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
 WRITE = "write_"
-"""Prefix of the root attributes that contain the card's ``[write]`` table."""
+"""Prefix of the names of the root attributes that contain the entries of the dataset card's ``[write]``
+table.
+"""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ SAMPLE_VARIABLES, (SIGMA,), SCAN_VARIABLES = (
     tuple(Variable(name, tuple(dims.split()), *rest) for name, (dims, *rest) in table.items())
     for table in table_beside(__file__, "variables.toml").values()
 )
-"""All arrays of a store, as ``variables.toml`` defines them: arrays over all scans, the uncertainty of the
-heights, and arrays of single scans.
+"""The arrays that a store can contain, as ``variables.toml`` defines them, in three groups: arrays over all
+scans, the uncertainty of the heights, and arrays of single scans.
 """
 LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
 """The arrays over all scans on the layout grid, including the uncertainty of the heights."""
@@ -76,8 +78,8 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Optional numbers per scan from the card's table, with their ranges. Where a row of the table is empty, the
-number is NaN.
+"""Columns of optional numbers, one per scan, that the card's CSV table may contain, with the allowed range of
+each. Where a row of the table is empty, the number is NaN.
 """
 Instrument = Literal["afm", "profilometer", "confocal", "sem"]
 """Kind of instrument. Heights are measured by a probe (``afm``, ``profilometer``) or by light (``confocal``).
@@ -86,7 +88,9 @@ from the film's edges in an electron micrograph.
 """
 Surround = Literal["substrate", "continues", "unknown"]
 TEXT_COLUMNS = ("instrument", "surround")
-"""Optional words per scan from the card's table. Where a row of the table is empty, the word is empty."""
+"""Columns of optional words, one per scan, that the card's CSV table may contain. Where a row of the table is
+empty, the word is an empty string.
+"""
 
 
 def dataset_facts(geometry: Any, instrument: str, write: Facts | None) -> dict[str, Any]:

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     import zarr
 
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
-"""Fill values that extend the arrays of smaller layouts to the size of the largest layout."""
+"""Values with which the arrays of smaller layouts are padded to the size of the largest layout, keyed by
+array name.
+"""
 # Names of the arrays that can be shown as the OME-Zarr image of a scan, in order of preference.
 SHOWN = ("micrograph", "levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
