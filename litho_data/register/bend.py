@@ -1,5 +1,5 @@
-"""Describe the bend of a scan: the smooth difference between the true and the nominal positions of its
-points, which a nonlinear scanner causes.
+"""Describe the bend of a scan. A nonlinear scanner causes a bend, which is the smooth displacement from the
+nominal to the true positions of the scan's points.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ CREEP_DEGREE = 6
 # ``Bend.undo`` iterates until its steps are below this share of half the scan's side, which is far less than
 # a thousandth of a pixel.
 _SETTLED = 1e-9
-# Largest number of these steps. A bend with a slope of 0.1 takes 10 steps, one with a slope of 0.9 takes 200.
+# Largest number of steps in ``Bend.undo``. A bend with a slope of 0.1 takes 10 steps, one with a slope of 0.9
+# takes 200.
 _STEPS = 400
 # Number of points along each side of the frame at which the size of a bend is evaluated.
 _GRID = 65
@@ -30,10 +31,10 @@ class Bend:
 
     ``amount`` has shape (2, 3), with one row for the displacement along x and one for that along y. Its
     columns are the coefficients of u² - 1/3, uv and v² - 1/3. For a scanner that creeps, ``amount`` has shape
-    (2, 11). The further columns are the coefficients of the Legendre polynomials P₃(u), P₃(v), P₄(u), …
-    P₆(v). All terms are centred, so the best affine fit to a bend over the frame is zero. ``middle`` and
-    ``half`` contain the centre (x, y) and half the size (x, y) of the frame, in the unit of ``amount``, so
-    that u = (x - middle) / half.
+    (2, 11). Columns 3 to 10 are then the coefficients of the Legendre polynomials P₃(u), P₃(v), P₄(u), …
+    P₆(v). The mean of every term over the frame is zero, and no term contains a linear part. The affine map
+    that fits a bend best over the frame is therefore zero. ``middle`` and ``half`` contain the centre (x, y)
+    and half the size (x, y) of the frame, in the unit of ``amount``, so that u = (x - middle) / half.
     """
 
     amount: Array
@@ -50,8 +51,8 @@ class Bend:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Return the figures of the bend for the quality record: its largest displacement and its six
-        quadratic coefficients, in µm.
+        """Return the values that describe the bend in the quality record. They are its largest displacement
+        and its six quadratic coefficients, in µm.
 
         For example, ``bend_x_by_xx_um`` is the coefficient of u² - 1/3 in the displacement along x.
         """
@@ -61,23 +62,24 @@ class Bend:
 
     @classmethod
     def none_yet(cls, shape: Shape) -> Bend:
-        """Return a bend of zero displacement, in the index frame of a scan with the given shape (ny, nx)."""
+        """Return a bend of zero displacement for a scan of shape (ny, nx). Its frame is in pixel indices."""
         ny, nx = shape
         return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
 
     def in_pixels(self, pitch_um: YX) -> Bend:
-        """Return a bend in µm, converted to the index frame of a scan with the given pitch (y, x)."""
+        """Convert this bend from µm to pixel indices of a scan with the given pitch (y, x), and return the
+        result.
+        """
         pitch_x_y = np.array(pitch_um[::-1])
         return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
 
     def scaled(self, factor: float) -> Bend:
-        """Return the same bend in another unit of length, in which all lengths are ``factor`` times as
-        large.
-        """
+        """Return the same bend in another unit of length. All of its lengths are multiplied by ``factor``."""
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the displacements along x and along y of points of the scan at the nominal positions (x, y).
+        """Return the displacements, along x and along y, of the scan's points at the nominal positions (x,
+        y).
 
         A point outside the frame has the displacement of the nearest point of the frame.
         """
@@ -87,8 +89,8 @@ class Bend:
         return along_x, along_y
 
     def straighten(self, points: Array) -> Array:
-        """Return the true positions of points of the scan. Both are arrays of shape (n, 2) with columns x,
-        y.
+        """Return the true positions of points whose nominal positions are given. The given array and the
+        result have shape (n, 2), with columns x and y.
         """
         return points + np.stack(self.shift(*points.T), axis=1)
 
@@ -112,13 +114,13 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """Return the largest change of the displacement per unit of length, over the frame.
+        """Return the largest change of the displacement per unit of length that occurs anywhere in the frame.
 
         It is the spectral norm of the displacement's gradient, and bounds the local stretch and rotation. A
         bend with a slope of 1 or more may fold the scan.
         """
-        # The gradient is computed by differences on a grid. These are exact for a quadratic bend, and
-        # accurate to a thousandth for creep.
+        # The gradient is computed by differences on a grid. The differences are exact for a quadratic bend,
+        # and accurate to a thousandth for creep.
         spacing = 2 * self.half[::-1] / (_GRID - 1)
         gradient = np.array([np.gradient(one, *spacing, edge_order=2) for one in self._field()])
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
@@ -162,10 +164,10 @@ def fit_bent_affine(
         points: positions (x, y), shape (n, 2).
         images: the positions to which the points are mapped, shape (n, 2).
         middle, half: centre (x, y) and half the size (x, y) of the bend's frame.
-        degree: degree of the bend: 2, or 6 for creep.
+        degree: degree of the bend's polynomial: 2 for a quadratic bend, 6 for creep.
 
     Returns:
-        The 3×3 matrix of the affine map, and the bend.
+        The 3×3 matrix of the affine map, and the fitted bend.
 
     Raises:
         numpy.linalg.LinAlgError: the points do not determine all coefficients, because they are too few or

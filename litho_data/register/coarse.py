@@ -1,5 +1,5 @@
-"""Find the orientation and polarity of a scan, and a warp that is accurate to a few pixels, by matching
-keypoints or by correlation.
+"""Find the orientation and polarity of a scan, and a warp that is accurate to a few pixels. Keypoints are
+matched, or the scan is correlated with the layout.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,8 @@ from litho_data.register.geometry import (
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
 
 CLEAR_MARGIN = 0.1
-# Above this correlation, the upright hypothesis is chosen even if another one fits slightly better.
+# If the upright hypothesis (scan not rotated, mirrored or inverted) has a correlation above this value, it is
+# chosen even if another hypothesis correlates slightly better.
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
@@ -32,9 +33,9 @@ class CoarseFit:
     """The orientation, polarity and position of the scan, to within a few pixels.
 
     ``layout_to_oriented`` is a 3×3 matrix. It maps pixel indices of the layout to pixel indices of the
-    oriented scan, ``orient(scan, orientation) * polarity``. ``points`` contains the matched keypoints. It is
-    None if keypoints were not used or too few of them match. The matrix is then the shift with the highest
-    correlation.
+    oriented scan, ``orient(scan, orientation) * polarity``. ``points`` contains the matched keypoints. If
+    keypoints were not used, or too few of them match, ``points`` is None and the matrix is the shift with the
+    highest correlation.
     """
 
     orientation: str
@@ -60,7 +61,7 @@ def find_coarse(
 
     Args:
         scan: heights at the layout's pitch, with the bow removed, shape (ny, nx), NaN where not measured.
-        layout_level: integer levels, shape (ny, nx).
+        layout_level: integer level of every layout pixel, shape (ny, nx).
         smooth_layout: topography predicted from the layout with a blur of ``SEARCH_BLUR_PX``, shape (ny, nx).
         features: whether to match keypoints. It should be false for a layout that repeats itself, because its
             keypoints match in many places.
@@ -78,8 +79,8 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """Return the best hypothesis. If the upright one fits about as well, as it does on a symmetric layout,
-    return the upright one.
+    """Return the best hypothesis. If the upright hypothesis fits about equally well, which happens on a
+    symmetric layout, return the upright hypothesis.
     """
     best = hypotheses[0]
     for hypothesis in hypotheses:
@@ -109,8 +110,8 @@ def _families(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str,
 def _fit_features(
     scan: Array, layout_level: Array, orientation: str, polarity: int, seed: int
 ) -> CoarseFit | None:
-    """Fit a warp to matched keypoints. Return None if too few of the matches agree with the warp (inliers),
-    or if these matches cover too small a part of the field.
+    """Fit a warp to matched keypoints. Matches that agree with the warp are inliers. Return None if there are
+    too few inliers, or if they cover too small a part of the field.
     """
     points = match_features(polarity * orient(scan, orientation), layout_level, seed)
     if points is None or points.inlier.sum() < MIN_INLIERS:

@@ -1,9 +1,9 @@
 """Register scans whose scanner bends the image or creeps. No straight warp fits such scans.
 
-A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling:
-it displaces its lines, along both axes, by a smooth function of the position along the slow axis alone. A
-straight warp absorbs the linear part of creep. The nonlinear part distorts the print by about a tenth of the
-creep, and can only be seen in this distortion.
+A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling.
+Creep displaces the scan lines along both axes, by a smooth function of the position along the slow axis
+alone. A straight warp absorbs the linear part of creep. The nonlinear part, about a tenth of the creep,
+distorts the image of the print. Only this distortion reveals it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
 
 Curve = int | Literal["quadratic"] | None
-"""What is fitted besides an affine map: the number of the slow axis (0 = x, 1 = y) stands for creep along it,
-``quadratic`` for a bend, and None for nothing.
+"""The distortion that is fitted in addition to an affine map. The number of the slow axis (0 = x, 1 = y)
+stands for creep along this axis, ``quadratic`` stands for a bend, and None for no distortion.
 """
-# Only every second row and column is used at full resolution, because they locate the print as accurately as
-# all rows and columns do.
+# At full resolution, only every second row and column is used, because these locate the print as accurately
+# as all rows and columns do.
 _EVERY = 2
 _ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
-# Creep is accepted if the probability that held-out blocks favour it by chance is below this.
+# Creep is accepted if the p-value of the test on held-out blocks is below this value. The p-value is the
+# probability that the blocks favour creep by chance.
 _CHANCE = 0.01
 _BACKGROUND = 6
 
@@ -38,20 +39,20 @@ _BACKGROUND = 6
 def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Curve) -> FineFit | None:
     """Refine a straight warp by adding a bend or creep.
 
-    Return None if the fit fails, or if held-out blocks reject creep.
+    Return None if the fit fails, or if creep was fitted and the held-out blocks do not confirm it.
 
-    The displacement by creep, along x and along y, is a polynomial of degree 6 in the coordinate along the
-    slow axis. It adds ten numbers to the affine map. Creep is accepted only if it predicts held-out blocks
-    better than the straight warp does. For this test, the field is divided into two halves, like the black
-    and white squares of a chequerboard with squares of 64 px. The warps with and without creep are fitted to
-    each half, and each fit predicts the other half.
+    Creep displaces the image, along x and along y, by polynomials of degree 6 in the coordinate along the
+    slow axis. The two polynomials add ten coefficients to those of the affine map. Creep is accepted only if
+    it predicts held-out blocks better than the straight warp does. For this test, the field is divided into
+    two halves, like the black and the white squares of a chequerboard whose squares have sides of 64 px. The
+    warps with and without creep are fitted to each half, and each fit predicts the other half.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
         straight: the result of ``refine_pyramid``. The position error of its warp, at a quarter of the
             resolution, may be as large as the width of the printed structures.
-        curve: ``quadratic`` for a bend. For creep, it is the slow axis of the oriented scan (0 = x, 1 = y),
-            which runs across the scan's lines.
+        curve: the distortion to fit: ``quadratic`` for a bend, or, for creep, the number of the oriented
+            scan's slow axis (0 = x, 1 = y). The slow axis runs across the scan lines.
     """
     shape = layout_level.shape
     affine = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -86,12 +87,13 @@ def _from_coarse_to_fine(
 
 
 def _without_own_bow(scan: Array, topography: Array, grid: tuple[Array, Array]) -> Array:
-    """Subtract from the scan the quadratic surface in its heights that the topography does not explain.
+    """Subtract from the scan the quadratic surface that its heights contain and the topography does not
+    explain.
 
-    The bow of the scan is quadratic in the scan's frame. In the layout's frame it is not, because the scan is
-    straightened there, so a quadratic background in that frame could not describe it, and the fit of the bend
-    would be distorted. If the print itself contains a quadratic surface that the topography does not explain,
-    this surface is subtracted as well.
+    The bow of the scan is quadratic in the scan's frame. In the layout's frame, the scan is straightened, so
+    its bow is no longer quadratic. A quadratic background in the layout's frame could not describe this bow,
+    and would distort the fit of the bend. If the print itself contains a quadratic surface that the
+    topography does not explain, this surface is subtracted as well.
     """
     from scipy.ndimage import map_coordinates
 
@@ -124,17 +126,20 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # A rank test is used because creep fades along the scan, so that a few blocks have most of the gain.
+    # A rank test is used because creep fades along the scan. A few blocks therefore contribute most of the
+    # gain.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
 
 class _Images:
-    """A scan and the topography with which it is compared. Warps can be fitted to any selection of pixels."""
+    """A scan and the topography with which it is compared. Warps can be fitted to any selection of the
+    topography's pixels.
+    """
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """Prepare the images. Only one row and one column in ``every`` of the topography is used, and pixel
-        indices refer to this coarser grid.
+        """Prepare the images. Of the topography, only one row and one column in ``every`` is used. Pixel
+        indices of the layout refer to this coarser grid.
         """
         from scipy.ndimage import spline_filter
 
@@ -179,7 +184,8 @@ class _Images:
         return None
 
     def squares(self, matrix: Array, bend: Bend, fitted: Array) -> Array:
-        """Return the squared misfit of every pixel for a given warp and bend.
+        """Return the squared misfit (scan minus fitted topography and background) of every pixel for a given
+        warp and bend.
 
         The gain and the background of the heights are fitted to the pixels in the mask ``fitted`` only. The
         misfit is NaN outside the scan.
@@ -201,8 +207,8 @@ class _Images:
 
 
 def _flow(bend: Bend, x: Array, y: Array, curve: Curve) -> Array:
-    """Return the terms of which the displacement along an axis is a sum, at the given points of the scan.
-    They are 1, u, v, and the terms of the bend or the creep.
+    """Return, at the given points of the scan, the terms whose weighted sum is the displacement along an
+    axis. They are 1, u, v, and the terms of the bend or the creep.
     """
     u, v = unit = bend.unit(x, y)
     flows = [np.ones_like(u), u, v]

@@ -1,8 +1,8 @@
 """Find areas where a scan does not show the print, because of dust, collapsed or missing parts, or lifted
 film.
 
-Such an area can shift a warp that is fitted by least squares by whole pixels. A defect is a connected area
-where the heights differ from what the layout predicts by many times the usual difference.
+If a warp is fitted by least squares, such an area can shift the warp by whole pixels. A defect is a connected
+area where the heights differ from what the layout predicts by many times the usual difference.
 """
 
 from dataclasses import replace
@@ -17,28 +17,30 @@ from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 # Limits of the misfit (heights minus prediction), in units of its robust standard deviation. An area is
-# suspected if its misfit exceeds the first value somewhere. It extends to where the misfit falls to the
+# suspected if its misfit exceeds the first value somewhere. The area extends to where the misfit falls to the
 # second value. The area is a defect if its misfit still reaches the third value after the warp has been
 # fitted without the area. Printer effects that a Gaussian blur does not describe stay below the third value:
 # on the measured prints, they reach 13.5.
 SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
 SMALLEST_AREA_PX = 30
 MARGIN_PX, POCKET_PX = 4, 12
-# If suspected areas cover more than this share of the field, they cannot be told from the print, and nothing
-# is marked as a defect.
+# If suspected areas cover more than this share of the field, they cannot be distinguished from the print, and
+# no area is marked as a defect.
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
 _FEWEST_PX = 60
-# Smallest sigma, as a share of the standard deviation of the scan.
+# Lower limit of sigma, the robust standard deviation of the misfit, as a share of the standard deviation of
+# the scan's heights.
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
 # Tolerance of the fit without the masked pixels. From step to step, pixels at the edge of the mask enter and
 # leave the fit, so the steps do not fall below a thousandth of a pixel.
 _TOLERANCE_PX = 0.01
-# Suspected areas that cover at least this share of the field may have distorted the fit so much that their
-# own misfit is small. The warp is therefore fitted without them in any case.
+# Suspected areas that cover at least this share of the field may have distorted the warp so much that the
+# misfit in them is small. The warp is therefore fitted without these areas even if their misfit is below the
+# third limit.
 _WORTH_A_FIT = 0.005
 # If the correlation is below this, the fit to the whole print may be wrong. The measured prints reach 0.945
 # or more.
@@ -51,7 +53,7 @@ _PASSES = 8
 def refine_around_defects(
     plain: FineFit, scan: Array, layout_level: Array, start: Array, model: Model
 ) -> tuple[FineFit, Array | None]:
-    """Find defects, and fit the warp again without them.
+    """Find defects, and fit the warp again to the pixels outside the defects.
 
     This is done in several rounds. Each round finds the defects with the warp of the round before, and fits a
     new warp to all other pixels, starting from the coarse warp ``start``. The rounds end when the positions
@@ -62,8 +64,8 @@ def refine_around_defects(
         scan, layout_level, start, model: as in ``refine_pyramid``.
 
     Returns:
-        The fit without the defects, and a bool mask of the defects on the layout's pixels, of shape (ny, nx).
-        If there are no defects, the plain fit and None.
+        The fit to the pixels outside the defects, and a bool mask of shape (ny, nx) that is true at the
+        layout pixels that are defects. If there are no defects, the result is ``plain`` and None.
     """
     fine, defects = plain, None
     for attempt in range(_ROUNDS):
@@ -91,7 +93,7 @@ def refine_around_defects(
 
 
 def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
-    """Find the places where the scan does not show the print, and the largest misfit there.
+    """Find the areas where the scan does not show the print, and the largest misfit in these areas.
 
     The misfit is the height of the scan, on the layout's pixels, minus a prediction. The prediction is a free
     function of the predicted topography (piecewise linear with 8 knots) plus a quadratic background, fitted
@@ -99,13 +101,13 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     3 sigma everywhere and 8 sigma somewhere.
 
     Args:
-        scan: smoothed heights, including those of defects, shape (ny, nx), in the same frame as
-        ``fine.scan``.
-        fine: the fit of the warp, which may have been made without some defects.
+        scan: smoothed heights with shape (ny, nx), in the same frame as ``fine.scan``. Heights at defects are
+            included.
+        fine: the fit of the warp. Defects that were found earlier may have been left out of this fit.
 
     Returns:
-        A bool mask of the areas, each widened by a margin, on the layout's pixels, of shape (ny, nx); and the
-        largest misfit in the areas, in units of its robust standard deviation.
+        A bool mask of shape (ny, nx) that is true at the layout pixels in the areas, each widened by a
+        margin; and the largest misfit in the areas, in units of the misfit's robust standard deviation.
     """
     from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
 
@@ -126,8 +128,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
         return nowhere
-    # Inside an area where the print is missing, some pixels may have the right height by chance. They are
-    # marked as well.
+    # Inside an area where the print is missing, some pixels may have the right height by chance. These pixels
+    # are marked as well.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
 
@@ -135,8 +137,8 @@ def find_defects(scan: Array, fine: FineFit) -> tuple[Array, float]:
 def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array:
     """Return a copy of the scan with NaN at the defects.
 
-    ``scan`` has shape (ny, nx), ``defects`` is a mask on the layout's pixels, and ``layout_to_scan`` is the
-    3×3 matrix between their pixel indices.
+    ``scan`` has shape (ny, nx), and ``defects`` is a bool mask on the layout's pixels. ``layout_to_scan`` is
+    the 3×3 matrix from pixel indices of the layout to those of the scan.
     """
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
@@ -145,7 +147,7 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Return the heights of the scan minus those that the layout explains, on the layout's pixels.
+    """Return, on the layout's pixels, the heights of the scan minus the heights that the layout explains.
 
     The result has the shape of the layout, and is NaN at its border and where nothing was measured. It is
     None if the scan covers almost nothing of the layout.
@@ -175,8 +177,8 @@ def _misfit(scan: Array, fine: FineFit) -> Array | None:
 def _robust(design: Array, values: Array) -> Array:
     """Return coefficients fitted robustly, by least squares with repeatedly updated weights.
 
-    In the first half of the passes, the weights fall slowly with the residual. In the second half, they are
-    Tukey's weights, which ignore large residuals.
+    In the first half of the passes, the weights fall slowly as the residual grows. In the second half, they
+    are Tukey's weights, which are zero for large residuals.
     """
     weights = np.ones(len(values))
     coefficients = np.zeros(design.shape[1])

@@ -1,5 +1,5 @@
-"""Estimate the uncertainty of a registration, from blocks held out of the fit, a bootstrap and a
-correlation.
+"""Estimate the uncertainty of a registration, from the errors in blocks held out of the fit, from a
+bootstrap, and from the correlation of scan and layout.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# The shifts of the blocks along an axis count as a curve if their means at different positions differ by
-# more than the first value, in pixels, and by more than the second value, in standard errors. On straight
-# scans they differ by no more than 0.2 px and 4 standard errors.
+# The shifts of the blocks are averaged at every position along an axis. They count as a curve if these means
+# differ by more than the first value, in pixels, and by more than the second value, in standard errors. On
+# straight scans they differ by no more than 0.2 px and 4 standard errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
@@ -26,9 +26,9 @@ class BlockShifts:
     """The shifts of the blocks of the field relative to the warp. All arrays have shape (n, 2), with columns
     x and y, in layout pixels.
 
-    ``middle_px`` contains the centres of the blocks. ``shift_px`` is the displacement of a block's content
-    from the position that the warp predicts. ``held_out_px`` is the displacement from the position that a
-    warp predicts which was fitted without the block.
+    ``middle_px`` contains the centres of the blocks. ``shift_px`` contains, for every block, the displacement
+    of its content from the position that the warp predicts. ``held_out_px`` contains the displacement from
+    the position that another warp predicts, which was fitted without the block.
     """
 
     middle_px: Array
@@ -36,30 +36,29 @@ class BlockShifts:
     held_out_px: Array
 
     def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
-        """Return percentiles of the target registration error, which is the length of ``held_out_px``. They
-        are NaN if there are no blocks.
+        """Return the given percentiles of the target registration error. This error is the length of a
+        block's vector in ``held_out_px``. The percentiles are NaN if there are no blocks.
         """
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Return how much the mean shift of the blocks varies with their position, from its lowest to its
-        highest value.
+        """Return the range (highest minus lowest value) of the blocks' mean shift as a function of position.
 
         Args:
             axis: the axis of the shifts (0 = x, 1 = y).
             along: the axis of the positions. The shifts of all blocks at the same position are averaged.
 
-        With a linear scanner and a sufficient kind of warp, the shifts vary only by noise. A larger variation
-        means that the scanner's axis is not linear or that the scanner creeps, which no warp of ``LADDER``
-        describes.
+        If the scanner is linear and the kind of warp is general enough, the shifts vary only by noise. A
+        larger variation means that the scanner's axis is not linear or that the scanner creeps, which no warp
+        of ``LADDER`` describes.
         """
         means = [shifts.mean() for shifts in self._by_place(axis, along)]
         return float(np.ptp(means)) if len(means) >= 3 else float("nan")
 
     def bends_along(self, along: int) -> bool:
-        """Return whether the shifts of the blocks vary with the position along this axis by a relevant
-        amount, and clearly more than by their scatter.
+        """Return whether the mean shift of the blocks varies with the position along this axis by a relevant
+        amount, and by clearly more than the scatter of the shifts explains.
         """
         for axis in (0, 1):
             groups = self._by_place(axis, along)
@@ -128,7 +127,7 @@ def match_blocks_of_field(
 
 
 def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> float:
-    """Return the standard deviation of the position, in px, of the corner that is most uncertain. It is
+    """Return the standard deviation, in px, of the position of the layout's most uncertain corner. It is
     computed by a bootstrap over the blocks, and is NaN if there are fewer than four blocks.
     """
     blocks = refinement.blocks()
@@ -145,8 +144,8 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 def height_correlation(height: Array, layout_level: Array) -> float:
     """Return the Pearson correlation of the layout with the heights, which are smoothed with sigma = 1 px.
 
-    Both have shape (ny, nx), and heights may be NaN. Only pixels with a height that lie at least 8 px from
-    the layout's border are used.
+    Layout and heights have shape (ny, nx), and heights may be NaN. A pixel is used only if its height is
+    known and it lies at least 8 px from the layout's border.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:
@@ -155,8 +154,8 @@ def height_correlation(height: Array, layout_level: Array) -> float:
 
 
 def _peak(score: Array) -> Array:
-    """Return the position (x, y) of the largest score. Unless it lies on the border, it is refined to a
-    fraction of a pixel.
+    """Return the position (x, y) of the largest score. A position that does not lie on the border is refined
+    to a fraction of a pixel.
     """
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=float)

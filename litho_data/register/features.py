@@ -37,7 +37,8 @@ class Correspondence:
     hull_px2: float
 
     def coverage(self, overlap: Array) -> float:
-        """Return the area of the inliers' convex hull, as a share of the overlap of scan and layout.
+        """Return the area of the inliers' convex hull, as a share of the area in which scan and layout
+        overlap.
 
         ``overlap`` is the bool mask of the overlap on the layout's pixels.
         """

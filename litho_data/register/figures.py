@@ -1,4 +1,6 @@
-"""Compute the quality figures of a registration from its fit and from the images that the fit compared."""
+"""Compute the values in a registration's quality record, from its fit and from the images that the fit
+compared.
+"""
 
 from typing import Any
 
@@ -14,8 +16,8 @@ from litho_data.register.topography import quadratic_basis
 
 
 def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    """Return the figures that say how the warp was found, and how well it explains the matched keypoints and
-    the heights.
+    """Return the quality values that say how the warp was found, and how well it explains the matched
+    keypoints and the heights. The keys are the names in ``RegistrationQuality``.
     """
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     overlap = overlap_of(warp, fine.topography.shape, np.isfinite(fine.scan), bend)
@@ -37,7 +39,7 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 
 def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float) -> dict[str, Any]:
     """Return the shift, the scales and the rotation of the warp at the layout's centre. For a bent scan,
-    these figures describe the affine part of the warp.
+    these values describe the affine part of the warp.
 
     The shift is the position of the layout's centre in the scan minus its position in the layout.
     """
@@ -56,9 +58,9 @@ def figures_of_warp(layout_to_scan: Array, layout_shape: Shape, pitch_um: float)
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
-    """Return the figures that say how certain the warp is, and the shifts of the field's blocks.
+    """Return the quality values that say how certain the warp is, and the shifts of the field's blocks.
 
-    The figures are computed from blocks held out of the fit, from a bootstrap over the blocks, and from the
+    The values are computed from blocks held out of the fit, from a bootstrap over the blocks, and from the
     correlation of scan and layout at other shifts and in other orientations.
     """
     warp, shape = fine.refinement.layout_to_scan, fine.topography.shape

@@ -1,6 +1,6 @@
-"""Define the generators of every kind of warp, and the velocities (flows) of points under them.
+"""Define the generators of every kind of warp, and the velocities (flows) that the generators give to points.
 
-The kinds of warp form a ladder, on which each kind contains all simpler ones.
+The kinds of warp form a ladder: each kind contains all kinds before it.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# The number of generators of each kind of warp. Every kind uses the first generators of the list below, so it
+# The number of generators of each kind of warp. Every kind uses the first of the ``GENERATORS``, so it
 # contains all kinds before it.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
@@ -22,13 +22,14 @@ GENERATORS[4, 0, 0], GENERATORS[4, 1, 1] = 1.0, -1.0
 GENERATORS[5, 0, 1] = GENERATORS[5, 1, 0] = 1.0
 GENERATORS[6, 2, 0] = GENERATORS[7, 2, 1] = 1.0
 # Number of flows of an affine map together with a bend: six affine and six quadratic flows. The two
-# generators of perspective are combinations of the quadratic flows, so only four further flows are needed.
+# generators of perspective are combinations of the quadratic flows, so only four flows are added to the eight
+# generators.
 BENT_COUNT = 12
 
 
 def normalisation(shape: Shape) -> Array:
-    """Return the 3×3 matrix from pixel indices to normalised coordinates. These are zero at the centre, have
-    the same scale on both axes, and run from -1 to 1 along the longer side.
+    """Return the 3×3 matrix from pixel indices to normalised coordinates. Normalised coordinates are zero at
+    the centre, have the same scale on both axes, and run from -1 to 1 along the longer side.
     """
     scale = 2.0 / (max(shape) - 1)
     ny, nx = shape
@@ -36,8 +37,8 @@ def normalisation(shape: Shape) -> Array:
 
 
 def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return the velocities along x and along y of the points (x, y) under a generator. The points are in
-    normalised coordinates, and x and y are broadcast.
+    """Return the velocities, along x and along y, that a generator gives to the points (x, y). The points are
+    in normalised coordinates, and the arrays x and y are broadcast against each other.
     """
     coordinates = (x, y, np.ones(1, dtype=x.dtype))
     zero = np.zeros(1, dtype=x.dtype)
@@ -48,9 +49,10 @@ def _flow(generator: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def flows(count: int, x: Array, y: Array) -> Iterator[tuple[Array, Array]]:
-    """Yield the velocities along x and along y of the points (x, y) under the first ``count`` generators.
+    """Yield, for each of the first ``count`` generators, the velocities along x and along y of the points (x,
+    y).
 
-    If ``count`` is ``BENT_COUNT``, yield those under all affine and quadratic flows.
+    If ``count`` is ``BENT_COUNT``, yield the velocities of all affine and quadratic flows.
     """
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)

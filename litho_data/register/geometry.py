@@ -1,7 +1,8 @@
 """Convert positions between pixel indices, micrometres, and rotated or mirrored images.
 
 Points are rows ``(x, y)`` of an array. Matrices are 3×3 and act on ``(x, y, 1)``. In the *index* frame of an
-image, pixel centres lie at 0, 1, 2, … In its micrometre frame, they lie at ``(i + 0.5) * pitch_um``.
+image, pixel centres lie at 0, 1, 2, … In the image's micrometre frame, pixel centres lie at ``(i + 0.5) *
+pitch_um``.
 """
 
 import numpy as np
@@ -11,8 +12,8 @@ from litho_data.register.bend import Bend
 from litho_data.scan import Axis
 
 # For each name, three flags tell whether to transpose the scan, then whether to reverse the order of its
-# rows, then whether to reverse the order of its columns. The operation gives the scan the layout's
-# orientation.
+# rows, then whether to reverse the order of its columns. These operations give the scan the orientation of
+# the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -66,8 +67,8 @@ def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
 
 
 def nearest_orientation(linear: Array) -> str:
-    """Return the orientation whose matrix is closest to a 2×2 matrix, in the Frobenius norm. The 2×2 matrix
-    is first scaled to a determinant of ±1.
+    """Return the name of the orientation whose matrix is closest, in the Frobenius norm, to the given 2×2
+    matrix. The given matrix is first scaled to a determinant of ±1.
     """
     unit = linear / np.sqrt(abs(np.linalg.det(linear)))
 
@@ -84,11 +85,12 @@ def apply_transform(matrix: Array, points: Array) -> Array:
 
 
 def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[Array, Array]:
-    """Return the positions in a target image to which a 3×3 matrix maps the pixels of an image of this shape.
+    """Map the pixels of an image of the given shape by a 3×3 matrix, and return their positions in a target
+    image.
 
     The matrix acts on pixel indices. The result is a pair of arrays: the rows and the columns of the
     positions. If ``bend`` is given, the target image is bent, and the matrix gives the true positions of its
-    points. The function then returns their nominal positions, where they appear in the bent image.
+    points. The function then returns the nominal positions, at which the points appear in the bent image.
     """
     y = np.arange(shape[0], dtype=float)[:, None]
     x = np.arange(shape[1], dtype=float)[None, :]
@@ -101,8 +103,8 @@ def warped_grid(matrix: Array, shape: Shape, bend: Bend | None = None) -> tuple[
 def overlap_of(
     layout_to_scan: Array, layout_shape: Shape, measured: Array, bend: Bend | None = None
 ) -> Array:
-    """Return a bool mask of the layout pixels whose centres fall on measured pixels of the scan. Its shape is
-    ``layout_shape``.
+    """Return a bool mask of shape ``layout_shape`` that is true at layout pixels whose centres fall on
+    measured pixels of the scan.
     """
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape

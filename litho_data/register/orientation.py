@@ -29,7 +29,7 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """Correlate low-resolution copies of scan and layout in every orientation and polarity.
+    """Correlate a low-resolution copy of the scan, in every orientation and polarity, with one of the layout.
 
     Args:
         scan: heights at the layout's pitch, shape (ny, nx), NaN where not measured.
@@ -47,11 +47,12 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
         correlation, overlap = masked_correlation(small_topography, moving)
         if np.isnan(correlation).all():
             continue
-        # Among shifts with nearly equal correlation, as on a repeating layout, this term prefers the shift
-        # with the larger overlap.
+        # On a layout that repeats itself, several shifts have nearly equal correlation. This term prefers the
+        # shift with the largest overlap.
         handicap = TIE * (1 - overlap / overlap.max())
-        # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the size is
-        # not a multiple of the factor, rotating a scan moves the remainder to the other side.
+        # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the scan's
+        # size is not a multiple of the factor, rotating the scan moves the cropped rows and columns to the
+        # other side.
         cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
         for polarity in (1, -1):
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
@@ -67,11 +68,12 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
 
 
 def rival_alignment(registered: Array, topography: Array) -> float:
-    """Return the largest correlation at a competing shift, divided by the correlation without a shift.
+    """Return the largest correlation of scan and topography at a competing shift, divided by their
+    correlation without a shift.
 
-    A competing shift is a local maximum of the correlation, at a distance of at least a sixteenth of the
-    field. If the topography is passed in place of the registered scan, the result says how strongly the
-    layout repeats itself.
+    A competing shift is a local maximum of the correlation that lies at least a sixteenth of the field away
+    from zero shift. If the topography is passed in place of the registered scan, the result says how strongly
+    the layout repeats itself.
     """
     from scipy.ndimage import maximum_filter
 
@@ -88,8 +90,8 @@ def rival_alignment(registered: Array, topography: Array) -> float:
 
 
 def rival_orientation(registered: Array, topography: Array) -> float:
-    """Return the largest correlation with the topography, over all shifts, of the registered scan in any
-    other orientation or polarity.
+    """Return the largest correlation of the topography with the registered scan after the scan has been
+    rotated, mirrored or inverted. All shifts are tried.
     """
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
@@ -106,8 +108,8 @@ def rival_orientation(registered: Array, topography: Array) -> float:
 def reduce_image(image: Array, factor: int) -> Array:
     """Return the means of an image over blocks of ``factor`` × ``factor`` pixels.
 
-    A block is NaN if half of its pixels or more are missing. Rows and columns at the end that do not fill a
-    block are cropped.
+    The mean is NaN if at least half of a block's pixels are missing. Rows and columns at the end that do not
+    fill a block are cropped.
     """
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
@@ -119,16 +121,15 @@ def reduce_image(image: Array, factor: int) -> Array:
 
 def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
     """Return the Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` for every shift (sy,
-    sx), over the pixels where both are measured.
+    sx), over the pixels that are measured in both images.
 
     D. Padfield, Masked object registration in the Fourier domain, IEEE Trans. Image Process. 21 (2012),
     doi:10.1109/TIP.2011.2181402, eq. 11.
 
     Returns:
-        Two arrays: the correlation, and the number of overlapping pixels. Both are indexed by the shift
-        modulo
-        their shape. The correlation is NaN if less than the share ``MIN_OVERLAP`` of the smaller image
-        overlaps, or if one image is constant in the overlap.
+        Two arrays: the correlation, and the number of overlapping pixels. Both arrays are indexed by the
+        shift modulo their shape. The correlation is NaN if less than the share ``MIN_OVERLAP`` of the smaller
+        image overlaps, or if one image is constant in the overlap.
     """
     from scipy.fft import irfft2, next_fast_len
 

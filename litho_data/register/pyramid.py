@@ -25,8 +25,8 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """A refinement, with the two images that it compared. These are the smoothed scan and the topography that
-    is predicted from the layout with a blur of sigma ``blur_px``.
+    """A refined warp, with the two images that the refinement compared. The images are the smoothed scan and
+    the topography predicted from the layout with a Gaussian blur of sigma ``blur_px``.
     """
 
     refinement: Refinement
@@ -53,7 +53,8 @@ def refine_pyramid(
         model: the kind of warp. At reduced resolution, an affine map is fitted in place of a homography.
         tolerance_px: tolerance of the refinement at full resolution.
 
-    If the fit at full resolution does not converge, the coarse warp is returned and marked as not converged.
+    If the fit at full resolution does not converge, the result contains the coarse warp and is marked as not
+    converged.
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, layout_level.shape)
@@ -79,16 +80,15 @@ def _from_coarse_to_fine(scan: Array, layout_level: Array, matrix: Array, model:
 
 
 def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Array, Array]]:
-    """Yield (factor, scan, predicted topography) with both images at a quarter of the resolution, and then at
-    half of it.
+    """Yield (factor, scan, predicted topography), with both images first at a quarter of the resolution and
+    then at half of it.
 
     ``factor`` is 4 or 2. A resolution at which the images would be too small is skipped.
     """
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
-        # A coarse fit may be wrong by a few pixels. The refinement still converges, because of the extra
-        # blur.
+        # A coarse fit may be wrong by a few pixels. The extra blur makes the refinement converge from there.
         small_scan = _smooth(scan, factor)[::factor, ::factor]
         yield factor, small_scan, predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
 
@@ -120,8 +120,8 @@ def match_blur(
 def project_to_model(matrix: Array, model: Model, shape: Shape) -> Array:
     """Return the warp of the kind ``model`` that approximates a given warp best.
 
-    An affine map agrees with the given warp to first order at the centre of the field. A simpler warp is
-    fitted to the positions to which the given warp maps the corners.
+    If ``model`` is affine, the result agrees with the given warp to first order at the centre of the field.
+    For a simpler kind, the result is fitted to the positions to which the given warp maps the corners.
     """
     if model == "homography":
         return matrix
@@ -180,11 +180,11 @@ def climb(fine: FineFit) -> FineFit:
 
 
 def held_out_energy(refinement: Refinement) -> Array:
-    """Return the residual energy of every block under a fit that did not use the block. The result has shape
-    (blocks,).
+    """Return, for every block, the residual energy (sum of squared residuals) of a fit that did not use the
+    block. The result has shape (blocks,).
 
-    The blocks are divided into four folds, each spread over the whole field. A block's residual energy is
-    that of a fit to the blocks of the other three folds.
+    The blocks are divided into four folds, each spread over the whole field. The fit for a block uses the
+    blocks of the other three folds.
     """
     blocks = refinement.blocks()
     rows, columns = np.indices(blocks.shape[:2])

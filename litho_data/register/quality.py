@@ -8,9 +8,9 @@ from litho_data.register.bend import Bend
 
 @dataclass(frozen=True)
 class RegistrationQuality:
-    """The quality figures of one registration. A figure that could not be computed is NaN.
+    """The quality record of one registration. A value that could not be computed is NaN.
 
-    Lengths in px count layout pixels. The figures in nm are the same lengths, converted with the layout's
+    Lengths in px are in layout pixels. The values in nm are the same lengths, converted with the layout's
     pitch.
     """
 
@@ -18,7 +18,7 @@ class RegistrationQuality:
     reason: str  # why the registration failed; empty if it passed
     warning: str  # what the user should know about the registration, even if it passed
     model: str
-    method: str  # how the coarse fit was found: by keypoints (orb) or by correlation (correlation)
+    method: str  # how the coarse fit was found: orb (matched keypoints) or correlation
     dihedral: str  # the rotation or reflection that gives the scan the orientation of the layout
     polarity: int  # -1 if heights fall where the layout's levels rise, otherwise 1
     converged: bool
@@ -59,7 +59,7 @@ class RegistrationQuality:
 MIN_OVERLAP, MIN_ECC = 0.5, 0.7
 TRE_MEDIAN_WARNING_PX, MAX_TRE_MEDIAN_PX, MAX_CORNER_SD_PX = 1.0, 1.5, 1.5
 # If the sigma of the print's blur exceeds this, the limits MAX_TRE_MEDIAN_PX and MAX_CORNER_SD_PX are
-# multiplied by the ratio of the two.
+# multiplied by the ratio of that sigma to this value.
 BLUR_OF_LIMITS_PX = 8.0
 SINGULAR_RANGE, SINGULAR_WARNING_RANGE = (0.90, 1.10), (0.95, 1.05)
 MAX_LAYOUT_REPEATS, MAX_SECOND_ALIGNMENT, MIN_ORIENTATION_MARGIN = 0.9, 0.9, 0.1
@@ -68,12 +68,12 @@ MAX_BEND_SLOPE = 1.0
 
 
 def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) -> tuple[bool, str, str]:
-    """Compare the figures of one registration with the limits, and return (passed, reason, warning).
+    """Compare the quality values of one registration with the limits, and return (passed, reason, warning).
 
     The reason names every limit that is not met.
 
     Args:
-        figures: the quality figures of the registration, by the names in ``RegistrationQuality``.
+        figures: the quality values of the registration, keyed by the names in ``RegistrationQuality``.
         blur_px: sigma, in layout pixels, of the blur that makes the layout most similar to the scan.
         bend_um: the bend of the scan in its own frame, or None if none was fitted.
     """
@@ -92,7 +92,7 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
     how = "a quadratic distortion was fitted"
     if bend_um is not None and bend_um.kind == "creep":
         how = "its lines creep along the slow axis, and the creep was corrected"
-    # Some conditions are written as "not >=", so that a figure that could not be computed (NaN) fails them.
+    # Some conditions are written as "not >=", so that a value that could not be computed (NaN) fails them.
     failures = {
         f"the correlation of scan and layout is {ecc:.2f}, but must be at least {MIN_ECC}": not fits,
         f"ambiguous: the layout repeats itself (correlation {repeats:.2f} with a shifted copy)": repeating,
@@ -131,7 +131,9 @@ def judge(figures: dict[str, Any], blur_px: float, bend_um: Bend | None = None) 
 
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
-    """Return the record of a scan that could not be fitted at all. It contains the reason but no figures."""
+    """Return the quality record of a scan that could not be fitted at all. It contains the reason but no
+    values.
+    """
     empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
     figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
     return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

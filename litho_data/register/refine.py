@@ -33,13 +33,13 @@ class Refinement:
     """A refined warp, with the sums from which its uncertainty is computed.
 
     ``layout_to_scan`` is the 3×3 matrix from pixel indices of the layout to pixel indices of the scan. For a
-    scan with a ``bend``, the latter refer to the straightened scan. ``warped`` is the scan on the layout's
-    pixels with gaps filled, a float32 array of shape (ny, nx).
+    scan with a ``bend``, the pixel indices of the scan are those of the straightened scan. ``warped`` is the
+    scan on the layout's pixels, with its gaps filled. It is a float32 array of shape (ny, nx).
 
-    For every cell of the field, with sides of about ``CELL_PX`` pixels, ``gram`` contains the matrix of inner
-    products of the regressors with each other and with the scan. Its shape is (cells_y, cells_x, k, k). The
-    regressors are ordered gain, background, warp, and the scan comes last. These sums suffice to fit the warp
-    again to any part of the field.
+    The field is divided into cells with sides of about ``CELL_PX`` pixels. For every cell, ``gram`` contains
+    the matrix of inner products of the regressors with each other and with the scan. Its shape is (cells_y,
+    cells_x, k, k). The first regressor is that of the gain, then come those of the background and of the
+    warp, and the scan comes last. These sums suffice to fit the warp again to any part of the field.
     """
 
     model: Model
@@ -91,10 +91,9 @@ def refine(
             the scan. It must be of the kind ``model``. Its position error may be as large as the width of
             the printed structures.
         model: the kind of warp.
-        bend: bend of the scan. If it is given, ``start`` must be an affine map, and warp and bend are
-            evaluated without being refined.
-        max_iterations: largest number of Gauss-Newton steps. With 0, ``start`` is evaluated without being
-            refined.
+        bend: bend of the scan. If a bend is given, ``start`` must be an affine map, and warp and bend are
+            evaluated but not refined.
+        max_iterations: largest number of Gauss-Newton steps. With 0, ``start`` is evaluated but not refined.
         tolerance_px: the search ends when a step moves no corner of the layout by this many pixels or more.
     """
     from scipy.linalg import expm
@@ -142,7 +141,7 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
         aligned: the scan on the layout's pixels, shape (ny, nx), NaN where not measured.
         topography: topography predicted from the layout, shape (ny, nx).
         count: number of generators of the warp, from ``LADDER`` or ``BENT_COUNT``.
-        further: additional regressors, each of shape (ny, nx).
+        further: regressors in addition to those of ``Refinement``, each of shape (ny, nx).
     """
     shape = topography.shape
     inside = interior_of(shape) & np.isfinite(aligned)
@@ -154,8 +153,8 @@ def in_blocks(gram: Array) -> Array:
     """Sum the inner products over blocks of two by two cells. The result has shape (blocks_y, blocks_x, k,
     k).
 
-    An error of the predicted topography extends over one or two printed features. Therefore, a block is taken
-    as the smallest area whose errors are independent of those elsewhere.
+    An error of the predicted topography extends over one or two printed features. A block is therefore
+    assumed to be the smallest area whose errors are independent of those elsewhere.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
@@ -168,8 +167,8 @@ def solve_gram(gram: Array) -> Array:
     """
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge as small as the float32 precision of the regressors keeps coefficients near zero that the layout
-    # does not determine.
+    # If the layout does not determine a coefficient, a ridge term keeps this coefficient near zero. The term
+    # is as small as the float32 precision of the regressors.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
@@ -203,7 +202,7 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
 
 
 def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
-    """Return a bool mask of shape (ny, nx) that is true for all pixels except those in the border.
+    """Return a bool mask of shape (ny, nx) that is true at all pixels outside the border.
 
     The border is ``border_px`` wide, but not wider than a sixteenth of the shorter side.
     """
@@ -238,7 +237,7 @@ def _cell_grams(regressors: Array, warped: Array, inside: Array) -> Array:
     gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
     for i, (top, bottom) in enumerate(pairwise(rows)):
         for j, (left, right) in enumerate(pairwise(columns)):
-            # The sums use float64, so that the order in which BLAS adds does not matter for the result.
+            # The sums use float64, so that the order in which BLAS adds does not change the result.
             cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(float)
             gram[i, j] = cell @ cell.T
     return gram

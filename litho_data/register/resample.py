@@ -10,8 +10,8 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# The sub-pixel positions over which effects of resampling are averaged, and the scan pixels, relative to such
-# a position, whose weights are computed.
+# Sub-pixel positions over which effects of resampling are averaged; and the scan pixels whose weights are
+# computed, counted relative to such a position.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -71,7 +71,8 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Return the share of its variance that noise, independent from pixel to pixel, keeps in resampling.
+    """Return the share of its variance that white noise (independent from pixel to pixel) keeps when a scan
+    is resampled.
 
     The share is a mean over sub-pixel positions.
     """
@@ -80,8 +81,8 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the share of their variance that line offsets, independent from line to line, keep in
-    resampling.
+    """Return the share of their variance that offsets of the scan lines keep when the scan is resampled. The
+    offsets are assumed to be independent from line to line.
 
     ``pitch_um`` is the pitch of the scan across its lines.
     """
@@ -90,12 +91,12 @@ def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
 
 @lru_cache
 def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Array]:
-    """Return spatial frequencies, and the squared errors that resampling causes in waves of these
-    frequencies.
+    """Return spatial frequencies, and the squared error that resampling causes in a wave of each frequency.
 
-    Both have shape (n,). The frequencies, in cycles/µm, run up to the Nyquist frequency of the scan. The
-    squared error of a wave is relative to its squared amplitude, and averaged over sub-pixel positions. The
-    average of a finely sampled scan over a layout pixel is intended and does not count as an error.
+    Both arrays have shape (n,). The frequencies, in cycles/µm, run up to the Nyquist frequency of the scan.
+    The squared error of a wave is relative to its squared amplitude, and averaged over sub-pixel positions.
+    If the scan is sampled more finely than the layout, its heights are averaged over a layout pixel. This
+    average is intended and does not count as an error.
     """
     frequency = np.linspace(0, 0.5, 129)
     lags = _LAGS[None, :] + _PHASES[:, None]
@@ -107,8 +108,8 @@ def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[Array, Arra
 
 @lru_cache
 def _weights(pitch_um: float, layout_pitch_um: float) -> Array:
-    """Return the weights with which the pixels of a scan contribute to one pixel of the layout, along one
-    axis.
+    """Return, along one axis, the weights with which the pixels of a scan contribute to one pixel of the
+    layout.
 
     The weights have shape (phases, lags). The distance of a scan pixel from the layout pixel is lag + phase,
     in scan pixels.

@@ -33,8 +33,8 @@ from litho_data.scan import Axis, Scan
 MIN_SIZE_PX = 32
 # One picometre is below the resolution of any instrument, but above rounding errors.
 SMALLEST_STRUCTURE_UM = 1e-6
-# The models with which a bend may be fitted. A bend is fitted together with an affine map, so no bend is
-# fitted if the caller chose a model with fewer parameters than an affine map.
+# The kinds of warp for which a bend may be fitted. A bend is fitted together with an affine map. If the
+# caller chose a kind with fewer parameters than an affine map, no bend is fitted.
 BENDABLE = ("affine", "homography", "ladder")
 # A bend is accepted if the error on held-out blocks is at most this share of the error without the bend. A
 # real bend removes nearly all of the error, so the limit separates real bends from spurious ones.
@@ -52,7 +52,7 @@ class Registration:
 
     ``bend_um`` describes how the scanner bent the scan, and is None for a scan that is not bent. For a bent
     scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` acts
-    on these. This matrix is the affine map closest to the whole mapping from scan to layout.
+    on these. This matrix is the affine map closest to the mapping from scan to layout, bend included.
 
     ``defects`` is a bool array of shape (ny, nx) on the layout's pixels. It marks where the scan shows
     something other than the print, such as dust, or collapsed or lifted parts. It is None if nothing is
@@ -85,10 +85,11 @@ def register_scan(
         layout_level: integer levels of the layout, shape (ny, nx).
         layout_pitch_um: pitch of the layout in µm.
         scan_pitch_um: pitch (y, x) of the scan in µm. It is needed if ``scan`` is an array.
-        model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or
-            ``homography``, each of which contains the one before it. With ``ladder``, the simplest kind is
-            used for which no later kind is better on held-out blocks.
-        fast_axis: axis along which the tip moved fast, if the scan does not state it; None counts as ``x``.
+        model: the kind of warp: ``translation``, ``euclidean``, ``similarity``, ``affine`` or ``homography``,
+            each of which contains the one before it. With ``ladder``, every kind is fitted, and the simplest
+            kind is used for which no later kind is better on held-out blocks.
+        fast_axis: the axis along which the tip moved fast. It is used only if the scan does not state it.
+            None counts as ``x``.
         seed: seed of the robust estimator and of the bootstrap.
 
     Raises:
@@ -159,15 +160,15 @@ def register_scan(
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
-    """Return whether the fit with a bend passed and its error on held-out blocks is at most half of that of
-    the straight fit.
+    """Return True if the fit with a bend passed, and its error on held-out blocks is at most half that of the
+    straight fit.
     """
     return bent.passed and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
 
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan with its layout. ``known`` contains the quality figures that are the same for every warp."""
+    """One scan with its layout. ``known`` contains the quality values that are the same for every warp."""
 
     height_um: Array
     layout: Array
@@ -178,7 +179,7 @@ class _Case:
     known: Mapping[str, float]
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
-        """Convert a fit to µm, and compute its quality figures and verdict.
+        """Convert a fit to µm, compute its quality values, and judge whether it passes.
 
         Return the registration, and the shifts of the field's blocks relative to the warp.
         """
@@ -213,8 +214,8 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # In the frame of the scan as it was read, which may be rotated or mirrored, the bend has other
-        # coefficients. They are fitted to a grid of points and the images of these points in the layout.
+        # The scan as it was read may be rotated or mirrored. In its frame, the bend has other coefficients.
+        # They are fitted to a grid of points and the images of these points in the layout.
         points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
@@ -222,7 +223,8 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # As for the matrix, only the digits of the bend that have a physical meaning are kept.
+        # Only the digits of the bend that have a physical meaning are kept, as in ``_rounded`` for the
+        # matrix.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -286,8 +288,8 @@ def _shape_at(layout_pitch_um: float, scan_shape: Shape, scan_pitch_um: YX) -> t
 
 
 def _rounded(matrix: Array) -> Array:
-    """Round the matrix to the digits that have a physical meaning, because further digits may differ from
-    computer to computer.
+    """Round the matrix to the digits that have a physical meaning. The digits that are dropped may differ
+    from computer to computer.
     """
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)

@@ -1,5 +1,5 @@
-"""Prepare layout and scan for their comparison: predict a topography from the layout, and smooth the heights
-of the scan, fill their gaps and remove their bow.
+"""Prepare layout and scan for their comparison. A topography is predicted from the layout. The heights of the
+scan are smoothed, their gaps are filled, and their bow is removed.
 """
 
 from functools import lru_cache
@@ -33,8 +33,8 @@ def smooth_measured(height: Array, sigma_px: float) -> Array:
         sigma_px: sigma of the Gaussian, in pixels.
 
     Returns:
-        The smoothed heights as float64 of shape (ny, nx). Gaps are filled from their surroundings. A pixel is
-        NaN only if no measured pixel lies within 4 sigma.
+        The smoothed heights as float64 of shape (ny, nx). In a gap, they are means of the measured pixels
+        around it. A pixel is NaN only if no measured pixel lies within 4 sigma.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -73,7 +73,7 @@ def fill_gaps(height: Array) -> Array:
 def remove_bow(height: Array) -> Array:
     """Return the heights minus the quadratic surface that fits them best (least squares).
 
-    This is done only to copies of the heights that are compared with the layout.
+    The bow is removed only from copies of the heights that are compared with the layout.
     """
     basis = quadratic_basis(height.shape)
     measured = np.isfinite(height)

@@ -2,8 +2,8 @@
 to the print.
 
 Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-The spread of these fits includes the influence of effects that the topography does not explain, as far as
-these effects differ from block to block.
+Some effects in the heights are not explained by the topography. As far as these effects differ from block to
+block, the spread of the fits includes their influence.
 """
 
 from dataclasses import dataclass
@@ -25,17 +25,17 @@ _CLEAR = 6.0**0.5
 # adjacent blocks, the jackknife would not show the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
 # Near the layout's border, a print has other surroundings than in the interior. Their effect is the same in
-# all blocks at the border, so it changes the fitted magnification by more than the jackknife says. The
-# change is found by a fit without the outermost cells. This requires at least so many cells along each side
-# that two thirds of the area remain.
+# all blocks at the border, so it changes the fitted magnification by more than the jackknife says. The change
+# is found by a fit without the outermost cells. Such a fit is made only if there are at least this many cells
+# along each side, so that two thirds of the area remain.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
 
 @dataclass(frozen=True)
 class WarpError:
-    """The error of the warp between a scan and its layout, and the quadratic surface that the heights contain
-    in addition to the print, with its error.
+    """The error of the warp between a scan and its layout. The record also contains the quadratic surface
+    that the heights contain in addition to the print, and the error of this surface.
 
     Attributes:
         covariance: covariance matrix, of shape (k, k), of the coefficients of the warp's generators (see
@@ -60,8 +60,8 @@ class WarpError:
         On average, the mean square of a fitted surface exceeds that of the true surface by the variance of
         the fit. For heights that were not levelled, this variance is therefore subtracted, and the result is
         0 if the surface is not significant. Levelling also removes a quadratic surface that belongs to the
-        print and its roughness, and the error of the fit is an estimate of this missing surface. For levelled
-        heights, the two mean squares are therefore added.
+        print and its roughness. The error of the fit estimates this missing surface. For levelled heights,
+        the mean squares of the fitted surface and of its error are therefore added.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
@@ -127,7 +127,7 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
 
 def _around(topography: Array, reach_px: float) -> Array:
     """Return the mean of the topography around each pixel, weighted by a Gaussian of sigma ``reach_px``.
-    Beyond the border, the topography is continued by reflection.
+    Beyond the border, the topography is extended by reflection.
     """
     import cv2
 
@@ -137,7 +137,7 @@ def _around(topography: Array, reach_px: float) -> Array:
 
 @lru_cache(maxsize=4)
 def _products(shape: Shape) -> Array:
-    """Return the covariances, over the field, of the five terms x, y, x², xy and y² of a quadratic surface.
+    """Return the covariance matrix, over the field, of the terms x, y, x², xy and y² of a quadratic surface.
     The result has shape (5, 5).
     """
     return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
