@@ -1,4 +1,6 @@
-"""Simulate the microscope with its tip, feedback, drift, line offsets, tilt, bow, datum and quantisation."""
+"""Simulate the microscope: the shape of its tip, the lag of its feedback, drift, line offsets, tilt, bow, the
+datum (height zero) and the quantisation of heights.
+"""
 
 import numpy as np
 import scipy.ndimage
@@ -24,14 +26,14 @@ def scan_surface(
     """Return the heights, in µm, that the microscope reports for a surface.
 
     The fast axis is x, and the top line is scanned first. Lines run from left to right in trace, and from
-    right to left in retrace. With smaller pixels, the tip moves more slowly, so that the same time lag causes
-    a shorter lag in position.
+    right to left in retrace. If the pixels are smaller, the tip moves more slowly, so the same time lag of
+    the feedback shifts the heights by a shorter distance.
 
     Args:
         surface_um: true heights at the pixels of the scan, in µm.
         frame: position and pitch of the scan.
         noise: standard deviations of the default noise.
-        knobs: the effects beyond plain printing.
+        knobs: the effects that are added to plain printing and scanning.
         job: the field that is scanned, the direction of the lines, and the tip.
         rng: random generator for the default noise of this scan.
     """
@@ -93,8 +95,8 @@ def _dilate_columns(height: Array, pitch_um: float, radius_um: float) -> Array:
 
 
 def _follow_surface(height: Array, pitch_um: float, lag_um: float) -> Array:
-    """Return the heights that a first-order feedback reports along the lines. It follows falling edges more
-    slowly than rising edges.
+    """Return the heights that a first-order feedback reports along the scan lines. The feedback follows
+    falling edges more slowly than rising edges.
     """
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
@@ -137,8 +139,8 @@ def _additive_nm(
 
 
 def _scar(height: Array, scars_per_row: float, rng: np.random.Generator) -> Array:
-    """Return the heights with scars along the fast axis and spikes of a single pixel, each with a random
-    sign.
+    """Return a copy of the heights to which scars along the fast axis and spikes of a single pixel are added.
+    Each scar and each spike has a random sign.
     """
     scarred = height.copy()
     ny, nx = height.shape

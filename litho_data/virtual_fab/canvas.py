@@ -1,5 +1,5 @@
-"""Define the canvas, which is the simulated area of a layout and its surroundings, and blurs that are
-computed on it from spectra.
+"""Define the canvas, which is the simulated area of a layout and its surroundings. The module also computes
+blurs on the canvas, by multiplying spectra.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class Canvas:
     """A layout with a guard frame around it, and its place in the write field.
 
     Args:
-        level: levels as uint8, with the layout of shape (ny, nx) in the middle. The shape is
-            (ny + 2·GUARD_PX, nx + 2·GUARD_PX).
+        level: levels of the layout and its guard frame, a uint8 array of shape (ny + 2·GUARD_PX, nx +
+            2·GUARD_PX). The layout itself has shape (ny, nx) and lies in the middle.
         pitch_um: pitch of the pixels in µm.
         field_um: centre (y, x) of the layout, in µm from the centre of the write field.
         write_field_um: side of the write field in µm.
@@ -31,13 +31,15 @@ class Canvas:
 
     @property
     def y_um(self) -> Array:
-        """Return the y of the centres of all rows, in µm in the layout's frame, with shape (rows, 1)."""
+        """Return the y coordinates of the centres of all rows, in µm in the layout's frame. The shape is
+        (rows, 1).
+        """
         return ((np.arange(self.level.shape[0]) - GUARD_PX + 0.5) * self.pitch_um)[:, None]
 
     @property
     def x_um(self) -> Array:
-        """Return the x of the centres of all columns, in µm in the layout's frame, with shape (1,
-        columns).
+        """Return the x coordinates of the centres of all columns, in µm in the layout's frame. The shape is
+        (1, columns).
         """
         return ((np.arange(self.level.shape[1]) - GUARD_PX + 0.5) * self.pitch_um)[None, :]
 
@@ -56,7 +58,7 @@ class Canvas:
 
 
 def frame_layout(level: Array) -> Array:
-    """Return a layout with a guard frame around it, in which the outermost levels are repeated."""
+    """Return the layout with a guard frame around it. The frame repeats the outermost levels of the layout."""
     return np.pad(level, GUARD_PX, mode="edge")
 
 

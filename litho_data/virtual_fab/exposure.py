@@ -1,5 +1,5 @@
-"""Simulate the exposure of the resist in hatch lines and slices, with effects of the beam, the galvo scanner
-and the write field.
+"""Simulate the exposure of the resist, which is written in hatch lines and slices. Effects of the beam, the
+galvo scanner and the write field are included.
 """
 
 import numpy as np
@@ -36,13 +36,13 @@ def accumulate_dose(
     """Return the two-photon dose on the canvas. It is 1 in the middle of a wide block of the highest level.
 
     Each row of the canvas is one hatch line. In slice k, the laser is on where the level is at least k.
-    Absorption is proportional to the squared intensity of the spot. The sum over all slices is therefore
-    ``level`` convolved with the squared intensity.
+    Absorption is proportional to the squared intensity of the spot. The dose, summed over all slices, is
+    therefore the array of levels convolved with the squared intensity.
 
     Args:
         canvas: the canvas that is written.
-        printer: the spot and the slices.
-        knobs: the effects beyond plain printing.
+        printer: the printer, whose spot and number of levels are used.
+        knobs: the effects that are added to plain printing.
         relative_dose: two-photon dose of this print relative to the nominal dose.
         order: position in the order of printing, from −0.5 (first) to 0.5 (last).
         scan_index: number of the print. Random draws that differ from print to print depend on it.
@@ -87,14 +87,15 @@ def accumulate_dose(
 
 
 def _unevenly_written(nominal: Array, canvas: Canvas, strength: float) -> Array:
-    """Return the nominal dose with every point x of a hatch line written at x + strength·x(1 − x/L) instead.
+    """Return the nominal dose if every point x of a hatch line is written at x + strength·x(1 − x/L) instead
+    of x.
 
-    Here, x runs from 0 to L, the side of the write field.
+    The coordinate x runs from 0 to L, where L is the side of the write field.
     """
     side_um = canvas.write_field_um
     at_um = canvas.field_offset_um()[1] + side_um / 2
-    # The point x that is written at ``at`` solves the equation x + strength·x(1 − x/L) = at. Of its two
-    # roots, x is the one that is 0 for at = 0.
+    # The point x that is written at ``at`` solves the equation x + strength·x(1 − x/L) = at. Of the
+    # equation's two roots, x is the one that is 0 for at = 0.
     onwards = 1 + strength
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
@@ -113,7 +114,8 @@ def field_starts(size_px: int, side_px: int) -> list[int]:
 
 
 def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -> Array:
-    """Return the nominal dose if every write field is displaced. Where fields overlap, their doses add up.
+    """Return the nominal dose that results if every write field is displaced by its own offset. Where
+    displaced fields overlap, their doses add up.
 
     Args:
         nominal: nominal dose on the canvas.
@@ -133,7 +135,7 @@ def write_in_fields(nominal: Array, starts: list[list[int]], offset_px: Array) -
 
 
 def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
-    """Return the dose over the write field, relative to that at its centre."""
+    """Return the dose at every pixel, relative to the dose at the centre of the write field."""
     if not (strength := knobs["vignetting"]):
         return 1.0
     y_um, x_um = canvas.field_offset_um()
@@ -142,8 +144,8 @@ def _field_response(canvas: Canvas, knobs: KnobBoard) -> Array | float:
 
 
 def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the transfer function of the spot's squared intensity, with the effects of ellipticity, ghost
-    spot and galvo lag.
+    """Return the transfer function of the spot's squared intensity. It includes the ellipticity of the spot,
+    a ghost spot and the lag of the galvo scanner.
     """
     frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
     # The square of a Gaussian is a Gaussian that is narrower by a factor of √2.
@@ -164,7 +166,9 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Return the effective dose in a resist in which each slice must exceed the threshold by its own dose."""
+    """Return the effective dose if doses of different slices do not add up. Each slice is then exposed only
+    where its own dose exceeds the threshold.
+    """
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):
@@ -183,8 +187,8 @@ def _soft_step(dose: Array) -> Array:
 
 
 def _earlier_lines(dose: Array, pitch_um: float, decay_um: float) -> Array:
-    """Return, for every line, the mean dose of the lines above it, which were written earlier. The weights
-    fall exponentially with the distance, with the decay length ``decay_um``.
+    """Return, for every hatch line, the weighted mean dose of the lines above it, which were written earlier.
+    The weights fall exponentially with the distance of these lines, with the decay length ``decay_um``.
     """
     memory = np.exp(-pitch_um / decay_um)
     return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

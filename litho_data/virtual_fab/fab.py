@@ -1,5 +1,5 @@
-"""Define the virtual fab (a printer and a microscope with their knobs and noise), and simulate the print and
-the scan of one field.
+"""Define the virtual fab, which consists of a printer and a microscope with their knobs and noise. The module
+also simulates the print and the scan of one field.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 @dataclass(frozen=True)
 class Fab:
-    """A virtual fab: a printer, a microscope, their knobs and noise, and the seed of all random draws.
+    """A virtual fab: a printer, a microscope, their knobs (effects that can be added) and noise, and the seed
+    of all random draws.
 
     ``cause`` is an optional effect of your own that is not a knob.
     """
@@ -38,7 +39,8 @@ class FabScan:
         job: the field that was printed and scanned.
         frame: the position of the scan on the layout.
         height_um: heights that the microscope reports, in µm, float64 with the shape (ny, nx) of the scan.
-        noiseless_um: the same heights without the default noise.
+        noiseless_um: heights that the microscope would report without the default noise and without
+            roughness, in µm.
         clean_um: heights of the print without roughness, on the layout's grid, in µm.
         surface_um: heights of the print with its roughness, on the layout's grid, in µm.
     """
@@ -52,7 +54,9 @@ class FabScan:
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
-    """Print and scan one field. The result depends only on the fab and the job, and not on other fields."""
+    """Print and scan one field. The result depends only on the fab and the job. It does not depend on the
+    other fields of a run.
+    """
     geometry_seed, _, instrument_seed = _seeds(fab, job.index)
     roughness_seed = _seeds(fab, job.printed)[1]
     frame = place_scan(
@@ -84,7 +88,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
 
 
 def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
-    """Return three seeds for the scan or print with the number ``index``: for the scan's position, for the
-    roughness of the surface, and for the noise of the microscope.
+    """Return three seeds for the scan or print with the number ``index``. The first is for the scan's
+    position, the second for the roughness of the surface, and the third for the noise of the microscope.
     """
     return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

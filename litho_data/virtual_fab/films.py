@@ -1,9 +1,9 @@
-"""Simulate films that are exposed by an electron beam or through a lens, then etched, and imaged in a
+"""Simulate films that are exposed by an electron beam or through a lens, then etched, and finally imaged in a
 scanning electron microscope.
 
 The simulation shares no code with the models that are tested on it. Electron scattering is a convolution,
-computed as a product of spectra. The image behind a lens is the mean of the images that the single points of
-the light source make. Etching shifts all edges by the same distance.
+computed as a product of spectra. The image behind a lens is the mean of the images that the individual points
+of the light source produce. Etching shifts all edges by the same distance.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# Number of pixels per layout pixel, along each axis, in the micrograph and in the image in which edges are
-# located, and the number of pixels by which this image is padded.
+# First value: number of pixels per layout pixel, along each axis, in the micrograph and in the image in which
+# edges are located. Second value: number of pixels by which the latter image is padded.
 _FINER, _AROUND = 4, 64
 # Width, in px, of the rim without film around a random layout.
 _RIM_PX = 12
 _RESIST = 30.0
-# Number of points across the light source. With 9 points, the numerical error displaces edges by 1.5 nm; with
-# 21 points, by 0.5 nm.
+# Number of source points along the diameter of the light source. With 9 points, the numerical error displaces
+# edges by 1.5 nm; with 21 points, by 0.5 nm.
 _SOURCE_POINTS = 21
 _CARD = """name = "virtual-{process}"
 title = "Simulated films of the process {process}, with simulated micrographs"
@@ -58,7 +58,8 @@ class FilmKnobs:
     """The effects that can be added to the plain process of a film. Lengths are in µm.
 
     Attributes:
-        backscatter: dose from backscattered electrons (or from stray light), relative to the direct dose.
+        backscatter: dose from backscattered electrons, or from stray light in projection, relative to the
+            direct dose.
         backscatter_um: range of the backscattered electrons, as the standard deviation of a Gaussian.
         diffusion_um: standard deviation of the diffusion of the exposed species in the resist.
         etch_bias_um: outward shift of every edge by etching.
@@ -81,14 +82,15 @@ class FilmPrinter:
     """A machine that prints films, and its resist.
 
     Attributes:
-        process: exposure by an electron beam or by projection through a lens.
+        process: how the resist is exposed: ``e-beam`` for an electron beam, ``projection`` for light through
+            a lens.
         pitch_um: pitch of the layout's pixels.
         spot_um: standard deviation of the electron beam.
         film_um: thickness of the film.
         threshold: dose above which film remains, relative to the dose of a large exposed area.
-        wavelength_um: wavelength of the light, for projection.
+        wavelength_um: wavelength of the light. It is used only for projection.
         na: numerical aperture of the lens.
-        source: radius of the light source relative to the aperture of the lens (partial coherence).
+        source: radius of the light source divided by that of the lens aperture (partial coherence factor).
     """
 
     process: Literal["e-beam", "projection"]
@@ -115,8 +117,8 @@ FILM_PRINTERS = {
 class FilmTruth(Result):
     """The record ``films.json`` of simulated films.
 
-    In the same folder, a file ``<id>.npy`` for each film contains the distances from the edge of the film, in
-    layout pixels.
+    For each film, the file ``<id>.npy`` in the same folder contains the signed distance of every point from
+    the film's edge, in layout pixels.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-films/1"
@@ -146,10 +148,10 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
 
 
 def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Array:
-    """Return the distance from the nearest edge of the film, at 4 × 4 points in each pixel of a layout of 0
-    and 1.
+    """Return the signed distance from the nearest edge of the film, at 4 × 4 points in each pixel of a
+    layout. The layout contains the levels 0 and 1.
 
-    Distances are in layout pixels and positive on the film. The layout is continued periodically.
+    Distances are in layout pixels and positive on the film. The layout is extended periodically.
     """
     pitch = printer.pitch_um
     written = np.asarray(level, float)
@@ -165,7 +167,7 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
         turned = 1 / (1 + np.exp(-_RESIST * (field - threshold)))
         field, threshold = blur(turned, pitch, knobs.diffusion_um), 0.5
     fine = zoom(field, _FINER, order=3, mode="grid-wrap", grid_mode=True) > threshold
-    # The nearest edge may lie beyond the border, because the layout continues there.
+    # The image is padded because the nearest edge may lie beyond its border, in the periodic extension.
     fine = np.pad(fine, _AROUND, mode="wrap")
     inside, outside = distance_transform_edt(fine), distance_transform_edt(~fine)
     distance = np.where(fine, inside - 0.5, 0.5 - outside)[_AROUND:-_AROUND, _AROUND:-_AROUND]
@@ -173,8 +175,8 @@ def edge_distance_px(level: Array, printer: FilmPrinter, knobs: FilmKnobs) -> Ar
 
 
 def micrograph(distance_px: Array, knobs: FilmKnobs, rng: np.random.Generator) -> Array:
-    """Return the electron micrograph of a film as uint8. It has bright rims, a change of brightness along x
-    by charging, and noise.
+    """Return the electron micrograph of a film as uint8. The micrograph has bright rims and noise, and
+    charging changes its brightness along x.
     """
     film = 1 / (1 + np.exp(-_FINER * distance_px / 0.5))
     grey = 70 + film * (70 + 60 * np.exp(-np.maximum(_FINER * distance_px, 0) / 12))
@@ -202,7 +204,7 @@ def simulate_films(
         count: number of films.
         size_px: side of each layout in pixels.
         seed: seed of all random draws.
-        knobs: effects beyond the plain process.
+        knobs: the effects that are added to the plain process.
 
     Raises:
         InputError: the process is unknown, or the folder contains a run with other settings or other files.
@@ -217,7 +219,7 @@ def simulate_films(
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)
-        # Bare ground around each field keeps its periodic copies so far away that they do not matter.
+        # Bare ground is added around each field, so that its periodic copies are too far away to affect it.
         longest_um = max(8 * printer.resolved_um, 3 * knobs.backscatter_um * (knobs.backscatter > 0))
         bare_px = math.ceil(longest_um / 2 / printer.pitch_um)
         inner = (slice(_FINER * bare_px, -_FINER * bare_px),) * 2
@@ -238,10 +240,11 @@ def simulate_films(
 
 
 def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, finer: int = 0) -> Array:
-    """Return a random layout of 0 and 1 as uint8 of the given shape (ny, nx). It has a rim of 0, and features
-    that the process can resolve.
+    """Return a random layout with the levels 0 and 1, a uint8 array of the given shape (ny, nx). The layout
+    has a rim of level 0. Its features are large enough for the process to resolve.
 
-    A larger ``finer`` makes the features smaller. The films of a run use 0, 1 and 2 in turn.
+    A larger value of ``finer`` makes the features smaller. The films of a run use the values 0, 1 and 2 in
+    turn.
     """
     cutoff_per_um = 1 / (printer.resolved_um * (7 - finer))
     inner = tuple(length - 2 * _RIM_PX for length in shape)
@@ -253,7 +256,7 @@ def random_film(shape: Shape, printer: FilmPrinter, rng: np.random.Generator, fi
 
 def _imaged(mask: Array, printer: FilmPrinter, defocus_um: float) -> Array:
     """Return the intensity of a mask's image behind the lens, averaged over the points of a round light
-    source. For an open mask, the intensity is 1.
+    source. For a mask that is open everywhere, the intensity is 1.
     """
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n, printer.pitch_um) for n in mask.shape), indexing="ij")
     spectrum, total = np.fft.fft2(mask), np.zeros(mask.shape)

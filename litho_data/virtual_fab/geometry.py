@@ -48,13 +48,13 @@ def place_scan(
     turned_deg: float = 0.0,
     pixel_size: float = 1.0,
 ) -> ScanFrame:
-    """Return the frame of a scan. The scan is centred on the layout except for a small random shift, and has
-    a small random rotation, shear and scale error along each axis.
+    """Return the size and the position of a scan. The scan is centred on the layout except for a small random
+    shift. It also has a small random rotation and shear, and a random scale error along each axis.
 
     Args:
         layout_shape: shape (ny, nx) of the layout.
         pitch_um: pitch of the layout in µm.
-        microscope: the largest random errors, and the margin of the scan.
+        microscope: the microscope, whose settings state the largest random errors and the margin of the scan.
         rng: random generator for the errors.
         turned_deg: rotation of the print under the microscope, in addition to the random rotation.
         pixel_size: size of the scan's pixels, in pixels of the layout.
@@ -80,7 +80,7 @@ def place_scan(
 def sample_surface(
     surface: Array, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
 ) -> Array:
-    """Return the heights of a surface, given on the canvas, at the pixels of the scan. The result has the
+    """Interpolate a surface, which is given on the canvas, at the pixels of the scan. The result has the
     shape ``frame.shape``.
     """
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
@@ -101,12 +101,12 @@ def sample_surface(
 
 
 def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> Array:
-    """Draw a random polynomial of degree 2 without an affine part, at the pixels of the scan. Its mean square
-    is 1 on average.
+    """Draw a random polynomial of degree 2 that has no affine part, and return its values at the pixels of
+    the scan. On average, its mean square over the scan is 1.
     """
     y, x = frame.unit_axes
     c = rng.standard_normal(3)
-    # Over the square, each of the two Legendre terms has a variance of 1/5, and the product xy has one of
-    # 1/9.
+    # Over the square from −1 to 1, each of the two Legendre terms has a variance of 1/5, and the product xy
+    # has a variance of 1/9.
     terms = (c[0] * (1.5 * x**2 - 0.5) * 5**0.5, c[1] * (1.5 * y**2 - 0.5) * 5**0.5, c[2] * 3 * x * y)
     return (terms[0] + terms[1] + terms[2]) / 3**0.5

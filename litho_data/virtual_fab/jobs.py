@@ -1,5 +1,5 @@
-"""Make the jobs of a run, one for each field to print and scan. The layouts are random or come from a card,
-and reference fields for a noise analysis can be added.
+"""Make the jobs of a run, one for each field to print and scan. The layouts are random or come from a dataset
+card. Reference fields for a noise analysis can be added to random layouts.
 """
 
 import re
@@ -35,7 +35,7 @@ class Plan:
         size_px: shape (ny, nx) of each layout, in pixels.
         fields_per_print: number of fields in each print.
         write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
-            field lies at the centre of a write field of its own.
+            field has its own write field and lies at its centre.
         references: whether to add print 0, which consists of a bare substrate, a flat print and a staircase
             of five steps.
     """
@@ -57,8 +57,8 @@ class Plan:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
 
     def scan_id(self, block: int, field: int) -> str:
-        """Return the name of a field. Its numbers are padded with zeros, so that sorted names are in the
-        order of printing.
+        """Return the name of a field. The numbers in the name are padded with zeros, so that the alphabetical
+        order of the names is the order of printing.
         """
         blocks = -(-self.count // self.fields_per_print)
         return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
@@ -125,7 +125,8 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
 
 
 def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
-    """Make the jobs that print and scan the layouts of a dataset card, in the way that its table states.
+    """Make the jobs that print and scan the layouts of a dataset card, in the way that the card's table
+    states.
 
     The table may state for each scan how it was made, in the columns ``turned_deg``, ``direction``, ``tip``
     and ``pixel_size``. Rows with the same print and the same layout are then scans of one printed field.
@@ -133,7 +134,7 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     Args:
         path: path of the card.
         first: number of the first scan. The random draws for a scan or a print depend on its number.
-        printer: the printer; None stands for the default printer.
+        printer: the printer that prints the layouts. None stands for the default printer.
 
     Raises:
         InputError: the card is invalid or has no layout files, or the pitch or level height in the card

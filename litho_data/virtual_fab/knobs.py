@@ -1,5 +1,5 @@
-"""Define the knobs, which are the effects that the virtual fab can add to plain printing. Each has a unit, a
-range and a name in the catalogue of effects.
+"""Define the knobs, which are the effects that the virtual fab can add to plain printing. Each knob has a
+unit, a largest strength and the name of its effect in the catalogue of effects.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ OFF_CATALOGUE = "off-catalogue"
 
 @dataclass(frozen=True)
 class Knob:
-    """One effect that the virtual fab can add. With strength 0, the result is exactly that without the knob.
+    """One effect that the virtual fab can add. With strength 0, the result is exactly the same as without the
+    knob.
 
     Args:
         name: name of the knob on the command line and in the truth file.
         effect: name of the effect in the catalogue of effects, or `off-catalogue` if it is not listed there.
         stage: the stage of printing or scanning at which the effect acts.
-        role: what causes the effect: the process, the measurement, chance (``nuisance``), or an unknown one
-            of the first two (``undetermined``).
+        role: what causes the effect: the process, the measurement, or chance (``nuisance``). ``undetermined``
+            means that it is either the process or the measurement, but not known which.
         unit: unit of the strength.
         limit: largest strength that is accepted.
-        meaning: what the strength means, and what the seed draws.
+        meaning: text that says what the strength means, and what is drawn with the seed.
         nuisance_span: True if the offset, gain, plane and bow fitted to each scan absorb nearly all of the
             effect.
         refit_absorbs: True if other parameters of the plain model of printing can imitate most of the effect.
@@ -49,7 +50,7 @@ class Knob:
 
     @property
     def limit_with_unit(self) -> str:
-        """Return the largest strength as text with its unit, or without a unit if the unit is 1."""
+        """Return the largest strength as text, followed by its unit. If the unit is 1, it is left out."""
         return f"{self.limit:g}" if self.unit == "1" else f"{self.limit:g} {self.unit}"
 
 
@@ -84,7 +85,7 @@ def checked(setting: KnobSetting) -> KnobSetting:
     """Return the setting unchanged if it is valid.
 
     Raises:
-        InputError: there is no knob of this name, or its strength or seed is out of range.
+        InputError: there is no knob of this name, or the strength or seed in the setting is out of range.
     """
     knob = KNOBS.get(setting.name)
     if knob is None:
@@ -99,7 +100,9 @@ def checked(setting: KnobSetting) -> KnobSetting:
 
 
 class KnobBoard:
-    """The knobs of one run: their strengths, and a separate stream of random numbers for each."""
+    """The knobs of one run. The board holds their strengths, and a separate stream of random numbers for each
+    knob.
+    """
 
     def __init__(self, settings: Iterable[KnobSetting], run_seed: int):
         self.settings = tuple(checked(setting) for setting in settings)

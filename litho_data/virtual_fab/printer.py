@@ -31,16 +31,16 @@ class Job:
         dose: two-photon dose relative to the nominal dose.
         field_um: centre (y, x) of the layout in its write field, in µm from the write field's centre.
         write_field_um: side of the write field in µm. With None, the write field is as large as the layout.
-        use: purpose of the scan. For ``substrate`` and ``grating`` (a calibration standard), nothing is
-            printed.
+        use: purpose of the scan. If it is ``substrate`` (a bare substrate) or ``grating`` (a calibration
+            standard), nothing is printed.
         grating_um: period of the grating in µm.
-        print_index: number of the print in its set, for prints that are scanned more than once. With None,
-            the number of the print is ``index``.
+        print_index: number of the print in its set. It is given if a print is scanned more than once. With
+            None, the number of the print is ``index``.
         turned_deg: rotation of the print under the microscope in degrees, a multiple of 90.
         direction: direction of the scan lines, 1 for trace and -1 for retrace.
         tip: number of the tip. Tip 1 is as blunt as the knobs state; every later tip is new and sharp.
-        pixel_size: size of the scan's pixels, in pixels of the layout. The scan spends the same time on a
-            pixel of any size.
+        pixel_size: size of the scan's pixels, in pixels of the layout. The tip spends the same time on every
+            pixel, whatever its size.
     """
 
     id: str
@@ -60,8 +60,8 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Return the number of the print. The random draws for the print depend on this number, and those for
-        the scan on ``index``.
+        """Return the number of the print. The random draws for the print depend on this number. Those for the
+        scan depend on ``index``.
         """
         return self.index if self.print_index is None else self.print_index
 
@@ -76,8 +76,8 @@ class Job:
 class Cause:
     """Base class for effects of your own that are not knobs. The base class itself changes nothing.
 
-    A subclass overrides one or more of the methods. Their results may depend only on their arguments, because
-    a field may be printed and scanned more than once.
+    A subclass overrides one or more of the methods. The result of a method may depend only on its arguments,
+    because a field may be printed and scanned more than once.
     """
 
     def on_dose(self, dose: Array, canvas: Canvas, job: Job) -> Array:

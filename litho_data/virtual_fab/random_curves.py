@@ -5,21 +5,21 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
 
-# The spectrum of the fine structure in the measured prints that models do not explain. Across the hatch
-# lines, it consists of a band around a period of 0.45 µm and a part with longer periods. Along the hatch
-# lines, both parts vary slowly.
+# Spectrum of the fine structure that was found in measured prints and that no model explains. Across the
+# hatch lines, it consists of a band around a period of 0.45 µm and a part with longer periods. Along the
+# hatch lines, both parts vary slowly.
 _BAND_PER_UM = 2.2
 _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# Sigma of a blur along the lines, because a spot of 0.2 µm writes no finer structure there.
+# Sigma of a blur along the hatch lines. A spot of 0.2 µm writes no finer structure along a line.
 _SMOOTH_UM = 0.06
 
 
 def line_roughness(shape: Shape, pitch_um: float, rng: np.random.Generator) -> Array:
-    """Draw roughness shaped like lines along x, with the given shape (ny, nx). Its variance is 1 on
-    average.
+    """Draw a map of roughness that looks like lines along x. The map has the given shape (ny, nx), and its
+    variance is 1 on average.
     """
     return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
 
@@ -66,8 +66,8 @@ def perlin_curve(position_um: Array, period_um: float, rng: np.random.Generator)
 
 
 def smooth_map(y_um: Array, x_um: Array, period_um: float, rng: np.random.Generator) -> Array:
-    """Draw a sum of eight plane waves with random directions and phases, and periods near ``period_um``. Its
-    variance is 1 on average.
+    """Draw a smooth map: the sum of eight plane waves with random directions and phases, and with periods
+    near ``period_um``. On average, the variance of the map is 1.
     """
     waves = 8
     direction = rng.uniform(0, 2 * np.pi, waves)

@@ -13,16 +13,17 @@ _NARROW_UM = 1.5
 
 
 def develop(dose: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the heights, in µm, of the developed and dried print above the zero of the scans, on the canvas.
+    """Return the heights of the developed and dried print on the canvas, in µm above the height zero of the
+    scans.
 
-    The conversion of a column of resist is a logistic function of its dose. When the print dries, a denser
-    polymer network shrinks less.
+    The conversion of a column of resist is a logistic function of its dose. When the print dries, a column in
+    a denser polymer network shrinks less.
 
     Args:
         dose: two-photon dose on the canvas; the full dose is 1.
         canvas: the canvas that was written.
         printer: the properties of the resist.
-        knobs: the effects beyond plain printing.
+        knobs: the effects that are added to plain printing.
     """
     conversion = _convert(dose, printer, knobs["threshold-softness"])
     if strength := knobs["diffusion-blur"]:
@@ -59,8 +60,8 @@ def _convert(dose: Array, printer: Printer, extra_steepness: float) -> Array:
 
 
 def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
-    """Return the sum of a random tilt and a random bow over the write field, scaled so that it does not
-    exceed 1 there.
+    """Return the sum of a random tilt and a random bow over the write field. The sum is scaled so that its
+    magnitude does not exceed 1 in the write field.
     """
     rng = knobs.machine_rng("field-curvature")
     y_um, x_um = canvas.field_offset_um()

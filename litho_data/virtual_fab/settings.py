@@ -1,5 +1,5 @@
-"""Define the settings of the virtual fab without knobs (printer, microscope and default noise), and named
-presets of runs.
+"""Define the settings of the virtual fab's printer, microscope and default noise, and presets, which are
+named settings for whole runs. Knobs are defined in ``virtual_fab.knobs``.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ class Printer:
             proportional to the squared intensity, whose standard deviation is smaller by a factor of √2
             (0.2 µm by default).
         threshold_dose: dose at which the conversion of the resist rises fastest, as a share of the full dose.
-        threshold_steepness: steepness of the logistic curve of conversion against dose, per full dose.
+        threshold_steepness: steepness of the logistic curve of conversion against dose. The dose is in units
+            of the full dose.
         network_reach_um: standard deviation of the Gaussian neighbourhood whose mean conversion determines
             how much a column shrinks.
-        loose_retention: share of its height that a column keeps if nothing around it is converted. Where
-            everything around it is converted, a column keeps its whole height.
+        loose_retention: share of its height that a column keeps if no resist around it is converted. If all
+            resist around it is converted, a column keeps its whole height.
         base_um: height of the base layer's surface above the zero of the scans.
         stitch_field_um: side of the write fields into which a larger layout is divided. The knob
             ``stitching`` displaces these fields.
@@ -51,8 +52,8 @@ class Printer:
 
 @dataclass(frozen=True)
 class Microscope:
-    """A microscope, whose scans have a margin around the layout and a small affine error that is drawn for
-    each scan.
+    """The settings of a microscope. Each scan extends beyond the layout by a margin, and has a small affine
+    error that is drawn at random.
 
     Args:
         margin_px: number of pixels by which a scan extends beyond the layout on each side, for a layout of
@@ -61,8 +62,8 @@ class Microscope:
         scale: largest relative error of the scale of each axis.
         shear: largest random shear.
         shift_um: largest random shift along each axis, in µm.
-        files: format of the scans' files. ``text-matrix`` contains only heights, in metres; ``gsf`` also
-            contains the size and the unit.
+        files: format of the scans' files. Files in the format ``text-matrix`` contain only heights, in
+            metres. Files in the format ``gsf`` also contain the size of the scan and the unit.
     """
 
     margin_px: float = 14.0
@@ -84,15 +85,16 @@ class Microscope:
 class Noise:
     """The standard deviations of the default noise, in nm.
 
-    On a flat print, the total noise is the root of the sum of the squares of ``roughness_nm``, ``line_nm``
-    and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of ``roughness_nm``.
+    On a flat print, the standard deviation of the total noise is the root of the sum of the squares of
+    ``roughness_nm``, ``line_nm`` and ``pixel_nm``. On a bare substrate, ``substrate_nm`` takes the place of
+    ``roughness_nm``.
 
     Args:
         roughness_nm: roughness of printed surfaces, shaped like hatch lines.
         substrate_nm: roughness of the bare substrate.
-        line_nm: offsets of single scan lines.
+        line_nm: height offsets of individual scan lines.
         pixel_nm: noise that is independent from pixel to pixel.
-        datum_nm: offsets of whole scans.
+        datum_nm: height offsets of whole scans.
     """
 
     roughness_nm: float = 15.9

@@ -1,5 +1,5 @@
-"""Run the virtual fab. It writes raw files as a laboratory would deliver them, and in a separate folder the
-truth about them.
+"""Run the virtual fab. It writes raw files as a laboratory would deliver them. The truth about these files is
+written to a separate folder.
 """
 
 import re
@@ -50,16 +50,17 @@ def simulate(
     ``out/raw/card.toml``.
 
     The folder ``out/raw`` contains what a laboratory would deliver: the card, its table, the layouts and the
-    scans. The folder ``out/truth`` contains what only a simulation knows: ``truth.json``, and the heights of
-    the prints without and with roughness. Scans are made one at a time, so the memory used does not grow with
-    their number.
+    scans. The folder ``out/truth`` contains what only a simulation knows: the record ``truth.json``, and the
+    heights of every print, once without and once with roughness. Scans are made one at a time, so the memory
+    used does not grow with their number.
 
     Args:
         out: folder of the run.
         count: number of scans with random layouts.
         size_px: size of each layout in pixels, as one number for both sides or as (ny, nx).
         seed: seed of all random draws of the run.
-        knobs: effects beyond plain printing, as settings or as texts ``name=strength[@seed]``.
+        knobs: effects that are added to plain printing and scanning, given as settings or as texts
+            ``name=strength[@seed]``.
         cause: an effect of your own that is not a knob. The truth does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
         microscope: ``default`` (scans with a margin and small affine errors), ``aligned`` (scans with a
@@ -161,8 +162,8 @@ def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
         write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
-# The values in the columns SCANNING of a usual scan: not rotated, in trace, with the first tip, and with
-# pixels as large as those of the layout.
+# The values that a usual scan has in the columns SCANNING. Such a scan is not rotated, is made in trace with
+# the first tip, and has pixels as large as those of the layout.
 AS_EVER = (0.0, 1.0, 1.0, 1.0)
 
 
@@ -201,8 +202,8 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
 
 
 def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
-    """Write the card's table. The columns that state how scans were made are written only if some scan was
-    made in another way than usual.
+    """Write the card's table. The columns in SCANNING are written only if at least one scan differs from a
+    usual scan in them.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
@@ -226,8 +227,8 @@ def simulate_plan(plan: str | Path, fab: str | Path, out: str | Path, *, seed: i
     """Print and scan planned layouts in the virtual fab of an earlier run, and return the path of the new
     card.
 
-    The fab is that of the earlier run: its printer, microscope, noise and knobs with their seeds. What varies
-    from print to print or from scan to scan is drawn anew.
+    The printer, the microscope, the noise and the knobs with their seeds are those of the earlier run.
+    Properties that vary from print to print or from scan to scan are drawn anew.
 
     Args:
         plan: folder with ``card.toml``, layouts and ``scans.csv``, as ``litho-models next-print`` writes it.

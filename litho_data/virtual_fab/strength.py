@@ -1,4 +1,6 @@
-"""Measure how much a knob changes the scans, and find the strength that causes a given change."""
+"""Measure how much a knob (an effect that the virtual fab adds) changes the scans, and find the strength of
+the knob that causes a given change.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,7 +24,8 @@ _MAX_STEPS = 40
 class KnobStrength:
     """A setting of a knob, and the rms change of the scans in nm that it causes.
 
-    ``rms_nm`` is smaller than requested if the request exceeds what the knob's largest strength causes.
+    If the requested change exceeds the change at the knob's largest strength, the setting has the largest
+    strength, and ``rms_nm`` is smaller than requested.
     """
 
     setting: KnobSetting
@@ -36,7 +39,7 @@ def strength_for_rms(
     jobs: Sequence[Job] | None = None,
     seed: int = 0,
 ) -> KnobStrength:
-    """Find the strength at which a knob changes scans without noise by ``rms_nm``.
+    """Find the strength at which a knob changes noise-free scans by ``rms_nm``.
 
     The change is computed by ``knob_rms_nm``. It grows with the strength, so an interval search within the
     range of the knob finds the strength.
@@ -110,12 +113,13 @@ def search_strength(
 
 
 def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | None = None) -> float:
-    """Return the rms change, in nm, that a knob causes in scans without noise, apart from the per-scan terms.
+    """Return the rms change, in nm, that a knob causes in noise-free scans. The part of the change that the
+    per-scan terms absorb is not counted.
 
     The per-scan terms are offset, gain, plane and bow: {1, P, x, y, x², xy, y²}, where P is the scan without
     the knob. They are fitted to the change of each scan by least squares and subtracted. The pixels of the
-    scans coincide with those of the layout, so a knob that displaces the scan is measured by the changes of
-    height that it causes.
+    scans coincide with those of the layout. A knob that displaces the scan is therefore measured by the
+    height changes that the displacement causes at these pixels.
     """
     mean_squares = []
     for job in jobs:
@@ -126,9 +130,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Return the residual after a gain times ``prediction`` and a quadratic surface are fitted to
-    ``change``.
-    """
+    """Fit a gain times ``prediction``, plus a quadratic surface, to ``change``, and return the residual."""
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )

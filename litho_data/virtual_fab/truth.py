@@ -1,5 +1,5 @@
-"""Define the record of the truth about a simulated run: its knobs, the positions of its scans, and the noise
-in them. A build of the run's dataset must not read this record.
+"""Define the record of the truth about a simulated run. It contains the knobs of the run, the positions of
+its scans, and the noise in the scans. The build of a dataset from the run must not read this record.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class KnobTruth(Record):
 
     @classmethod
     def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
-        """Return the record of a knob's setting. Its seed is the one that was used, if need be that of the
-        run.
+        """Return the record of a knob's setting. If the setting has no seed, the record contains the seed of
+        the run, which was used in its place.
         """
         knob = KNOBS[setting.name]
         return cls(
@@ -51,8 +51,8 @@ class KnobTruth(Record):
 
 
 class ScanTruth(Record):
-    """The record of one scan: its position, its datum, and the error that would remain even with perfect
-    models of printer and AFM (the noise floor).
+    """The record of one scan. It contains the scan's position, its datum (height offset), and its noise
+    floor, i.e. the error that would remain even with perfect models of printer and AFM.
     """
 
     id: str
@@ -90,10 +90,11 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: Array) -> dict[str, float]:
-    """Return the offset of the noise in one scan, and its mean absolute and root mean square values, in nm.
+    """Return the offset of the noise in one scan, and the mean absolute value and the root mean square of the
+    noise, in nm.
 
-    The values named ``floor`` are those without the offset, and the values named ``floor_full`` are those
-    without offset, tilt and bow.
+    Values whose names begin with ``floor_full`` are computed after offset, tilt and bow have been removed.
+    For the other values named ``floor``, only the offset has been removed.
     """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
