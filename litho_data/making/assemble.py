@@ -1,4 +1,6 @@
-"""Complete a store whose scans are finished: write the samples, tables, manifest, attributes and hashes."""
+"""Complete a store to which all finished scans have been written. The samples, tables, manifest, attributes
+and hashes are added.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import zarr
 
-# The group that lists the scans for OME-Zarr tools.
+# Name of the group that lists the scans for OME-Zarr tools.
 IMAGES = "o"
 
 
@@ -29,11 +31,11 @@ IMAGES = "o"
 class Source:
     """Everything from which a store is made.
 
-    ``files`` maps each id to its raw files, and ``standards`` contains the raw files of the calibration. Both
-    map the names of the files in the record to their paths. ``recipe`` is the levelling recipe in canonical
-    form. ``assumptions`` lists what was assumed because the card does not state it. ``unpaired`` maps the ids
-    that lack a scan or a layout to the reasons, and ``refused`` maps the ids of unusable files to the
-    reasons.
+    ``files`` contains, for each id, a mapping from the recorded names of its raw files to their paths.
+    ``standards`` maps the recorded names of the calibration standards' raw files to their paths. ``recipe``
+    is the levelling recipe in canonical form. ``assumptions`` lists the assumptions that were made because
+    the card does not state a value. ``unpaired`` maps every id that lacks a scan or a layout to the reason,
+    and ``refused`` maps every id with an unusable file to the reason.
     """
 
     card: Card
@@ -63,9 +65,10 @@ def assemble(
         root: root group of the store.
         records: records of the finished scans, sorted by id, including reference scans (those whose ``use``
             is not "dataset").
-        load: function that takes the id of a scan and returns its arrays on the layout's grid, by name.
+        load: function that takes the id of a scan and returns a mapping from names to the scan's arrays on
+            the layout's grid.
         source: everything from which the records were made.
-        skipped: reasons why scans are not in the store, by id.
+        skipped: reasons why scans are not in the store, keyed by the id of the scan.
         build: facts that are not part of any hash, such as time, folder and software.
     """
     scans = [_row(record) for record in records_of_use(records)]
@@ -88,18 +91,21 @@ def assemble(
 
 
 def records_of_use(records: Sequence[Facts]) -> list[Facts]:
-    """Return the records of the dataset's scans without those of reference scans, in the given order."""
+    """Return the records of the scans that belong to the dataset, in the given order. Records of reference
+    scans are left out.
+    """
     return [record for record in records if record["use"] == "dataset"]
 
 
 def facts_of_card(card: Card) -> dict[str, Any]:
-    """Return what a card states about all scans together. These facts are part of the dataset's hash."""
+    """Return the facts that a card states about all its scans. They are part of the dataset's hash."""
     write = card.write.model_dump(exclude_none=True) if card.write else None
     return dataset_facts(card.layout, card.scan.instrument, write)
 
 
 def root_attributes(manifest: Facts, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """Return the attributes of the root group: those that follow from the manifest, and the two hashes.
+    """Return the attributes of the store's root group. They are the attributes that follow from the manifest,
+    and the hashes of the dataset and of the manifest.
 
     All attributes are numbers or texts, which any format can store.
     """
@@ -142,8 +148,8 @@ def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.Da
 
 
 def quality_table(records: Sequence[Facts]) -> pd.DataFrame:
-    """Return the table of quality, with one row per scan of the dataset. A value that could not be computed
-    is NaN.
+    """Return the table of the registrations' quality values, with one row per scan of the dataset. A value
+    that could not be computed is NaN.
     """
     import pandas as pd
 
@@ -214,15 +220,15 @@ def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[s
     """Return the table of files, with one row per raw file, sorted by id.
 
     Args:
-        source: everything from which the records were made, including the raw files and the ids that lack a
-            scan or a layout.
-        records: records of the finished scans, by id.
+        source: everything from which the records were made. The raw files and the ids that lack a scan or a
+            layout are taken from it.
+        records: records of the finished scans, keyed by the id of the scan.
         skipped: reasons why scans are not in the store, by id.
 
     Returns:
         A table with the columns ``path``, ``scan``, ``status`` (ok, skipped or unpaired), ``reason``,
         ``use``, ``sha256``, ``size_bytes`` and ``read``. ``sha256`` is the hash of the bytes that were used,
-        or empty if the file cannot be read. ``read`` is JSON with the reader, the unit, the channel, the
+        and is empty if the file cannot be read. ``read`` is JSON with the reader, the unit, the channel, the
         pitch and the complete header of the instrument's file.
     """
     import pandas as pd
@@ -260,7 +266,7 @@ def _used_sha256(record: Facts, name: str) -> str:
 
 
 def _facts(record: Facts | None, name: str) -> dict[str, Any]:
-    """Return what the reader states about a scan's file, or an empty dictionary for a layout's file."""
+    """Return the facts that the reader found in a scan's file. For a layout's file, the dictionary is empty."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

@@ -29,10 +29,10 @@ from litho_data.sharing.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
-# If the aspect ratio of a scan's pixels differs by more than this share from that of most scans, the scan's
-# file lacks rows or columns.
+# If the aspect ratio of a scan's pixels differs by more than this share from the aspect ratio in most scans,
+# the scan's file is assumed to lack rows or columns.
 _ASPECT_TOLERANCE = 1e-3
-# Largest number of pairs of an unregistered scan and a layout that are compared.
+# Largest number of comparisons of an unregistered scan with a layout.
 _MOST_SEARCHES = 2000
 
 
@@ -50,9 +50,9 @@ def build_dataset(
     """Build a dataset store from a dataset card (the TOML file that describes the raw files).
 
     Each scan is read, levelled by the card's recipe, registered, and resampled once onto the grid of its
-    layout. A scan that cannot be used is skipped. A line on stderr and an entry in the manifest give the
-    reason. The store is put in place only when it is complete, and an interrupted build continues when it is
-    run again. The report is written to ``<name>-report`` beside the store.
+    layout. A scan that cannot be used is skipped. The reason is printed on stderr and recorded in the
+    manifest. The store is put in place only when it is complete, and an interrupted build continues when it
+    is run again. The report is written to ``<name>-report`` beside the store.
 
     Args:
         card_path: path of the dataset card.
@@ -60,7 +60,8 @@ def build_dataset(
         data_dir: folder of the raw files. By default, it is the card's folder, ``$LITHO_DATA_DIR/<name>`` or
             the user cache, whichever contains the files.
         workers: number of local processes.
-        dask: address of a Dask scheduler, which is used in place of local processes. The result is the same.
+        dask: address of a Dask scheduler, which is used in place of local processes. The store is the same
+            either way.
         strict: if true, nothing is built if any scan has to be skipped, or if a scan has no layout or a
             layout has no scan.
         seed: seed of the robust estimator in the registration.
@@ -110,7 +111,9 @@ def _source(listing: Listing, recipe: Facts, seed: int, jobs: Sequence[Job]) -> 
 
 
 def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
-    """Run the jobs of a source, and write the store and its report, as ``build_dataset`` describes."""
+    """Run the jobs of a source, and write the store and its report. The docstring of ``build_dataset``
+    describes how.
+    """
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
         root = partial.open()
@@ -134,8 +137,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
                 else:
                     records[job.id] = dict(outcome)
         except InputError:
-            # A scan with bad input raises no error here, so this error comes from the cluster. Scans that are
-            # finished are kept for the next run.
+            # A scan with bad input raises no error here, so this error comes from the workers, for example
+            # from a Dask cluster. Scans that are finished are kept for the next run.
             if not records:
                 partial.discard()
             raise
@@ -189,8 +192,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
 
 
 def _relative(folder: Path, start: Path) -> str:
-    """Return the path of a folder relative to another one. With such a path, raw files and store can be moved
-    together.
+    """Return the path of a folder relative to the folder ``start``. A relative path stays valid if raw files
+    and store are moved together.
     """
     try:
         return Path(os.path.relpath(folder, start)).as_posix()
@@ -199,9 +202,10 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
-    """For every scan that could not be registered, find out whether it shows another layout of the set.
+    """For every scan that could not be registered, find out whether it shows a layout of another id.
 
-    If it does, this is added to the scan's reason in ``skipped``, and also returned, by the id of the scan.
+    If it does, the id of that layout is added to the scan's reason in ``skipped``. The result maps the id of
+    each such scan to a text that names the layout.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
@@ -226,11 +230,12 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 
 def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
-    """Find the scans whose pixels have another aspect ratio than those of most scans, and return the reasons
-    for leaving them out, by id. The result is empty if the card does not state the size of the scans.
+    """Find the scans whose pixels have another aspect ratio than the pixels of most scans. The result maps
+    the ids of these scans to the reason for leaving them out. It is empty if the card does not state the size
+    of the scans.
 
-    A text file that lacks its last rows can still be read as a matrix. However, its pixels then seem too long
-    along y, because the stated size is divided by too few rows.
+    A text file that lacks its last rows can still be read as a matrix. However, the pixels then seem too long
+    along y, because the side length that the card states is divided by too few rows.
     """
     if card.scan.size_um is None:
         return {}

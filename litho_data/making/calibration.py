@@ -1,5 +1,5 @@
-"""Determine the scale factors of a microscope from the scans of gratings and of a step that a dataset card
-names.
+"""Determine the scale factors of a microscope from scans of calibration standards. The standards are gratings
+and a step, and the dataset card names their scans.
 """
 
 import json
@@ -18,13 +18,14 @@ from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
 SCALES = ("y", "x", "z")
-# If the measured and the known height of the step differ by more than this factor, a unit or a file is wrong.
+# If the measured and the known height of the step differ by more than this factor, a unit or a file is
+# assumed to be wrong.
 _MOST_Z = 1.5
 
 
 def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
-    """Return the scales with which a build of the card would correct lengths and heights, by axis (``y``,
-    ``x`` or ``z``). Axes for which the card names no calibration standard are left out.
+    """Return the scales with which a build of the card would correct lengths and heights. The keys are the
+    axes ``y``, ``x`` and ``z``. Axes for which the card names no calibration standard are left out.
 
     Raises:
         InputError: the card has no table ``[calibration]``, a file is missing, or a scan does not show its
@@ -50,7 +51,7 @@ class Standards:
             calibrates), ``file`` (the position of its scan in ``files``), ``known_um`` (the known period or
             height), ``uncertainty_um`` (the uncertainty of this value), ``across`` (the axis along which
             profiles are taken) and ``read`` (the arguments of ``read_scan``).
-        files: paths of the scans, by their recorded names.
+        files: paths of the scans, keyed by their recorded names.
     """
 
     described: tuple[Facts, ...] = ()
@@ -108,7 +109,8 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:
-    """Return the scale factor of every axis and its standard uncertainty, in an array of shape (3, 2).
+    """Return the scale factor of every axis and the standard uncertainty of this factor. The result has shape
+    (3, 2).
 
     The rows are in the order of ``SCALES``. An axis without a standard has the factor 1 and the uncertainty
     0.

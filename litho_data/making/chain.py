@@ -1,4 +1,6 @@
-"""Run operations on one scan, one after another, and collect the part of the store that they make."""
+"""Run operations on one scan, one after another, and collect the arrays and records that they add to the
+store.
+"""
 
 import json
 from collections.abc import Mapping
@@ -17,8 +19,9 @@ from litho_data.store.partial import Piece
 class Chain:
     """The results of the operations that have run on a scan so far.
 
-    ``steps`` contains the records of the operations in order. ``arrays`` contains the arrays that they made,
-    by name. ``facts`` contains the facts that each operation found, by the name of the operation.
+    ``steps`` contains the records of the operations, in the order in which they ran. ``arrays`` contains the
+    arrays that the operations made, keyed by array name. ``facts`` contains the facts that each operation
+    found, keyed by the name of the operation.
     """
 
     steps: list[Step] = field(default_factory=list)
@@ -51,15 +54,15 @@ class Chain:
 
     @property
     def pitch_um(self) -> list[float]:
-        """Return the pitch (y, x) of the scan in µm. It is the pitch that the file or the card states,
-        multiplied by the calibrated scale of the axis if there is one.
+        """Return the pitch (y, x) of the scan in µm. It is the pitch that the file or the card states. If an
+        axis was calibrated, its pitch is multiplied by the calibrated scale.
         """
         axes = zip("yx", self.read["pitch_um"], strict=True)
         return [one * self.scales.get(f"scale_{axis}", 1.0) for axis, one in axes]
 
     def piece(self, **said: Any) -> Piece:
-        """Return the part of the store that the operations made. ``said`` contains further entries for its
-        record.
+        """Return the part of the store that the operations made. ``said`` contains the entries of its record
+        other than ``steps`` and ``software``.
         """
         steps = [step.to_record() for step in self.steps]
         record = {**said, "steps": steps, "software": software_record()}

@@ -1,9 +1,10 @@
-"""Find the edges of a film in an electron micrograph, and convert the signed distances from them to heights.
+"""Find the edges of a film in an electron micrograph, and convert signed distances from these edges to
+heights.
 
 In a micrograph, the film is brighter than the ground, and its rim is brightest. Charging changes the
 brightness from place to place. The edge is therefore placed where the brightness is half way between those of
-the ground and the rim nearby. This position is a convention: the wall of the film may lie at another point on
-the flank of the rim, and a micrograph cannot show where.
+the ground and the rim nearby. This position is a convention. The wall of the film may lie at another point on
+the flank of the bright rim, and a micrograph cannot show at which point.
 """
 
 from typing import NamedTuple
@@ -15,8 +16,9 @@ from litho_data.foundation import Array, InputError
 REACH_PX = 8.0
 """Distances from an edge that are larger than this many pixels of the micrograph are set to this value."""
 _NOISE_PX = 1.0
-# Pixels at these distances from the first edge, in px, count as rim on the film side and as ground on the
-# other. The last value is the sigma over which their brightness is averaged.
+# Pixels on the film whose distance from the first edge lies in the first range, in px, count as rim. Pixels
+# off the film whose distance lies in the second range count as ground. The last value is the sigma, in px, of
+# the Gaussian with which the brightness of rim and ground is averaged.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
 # Largest distance, in px, of the final edge from the first edge, which is found with a single threshold for
 # the whole picture.
@@ -24,17 +26,18 @@ _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0
 _STEP_PX = 0.2
-# An island or gap of the layout counts as lost if at most this share of it was printed as wanted.
+# An island or a gap of the layout counts as lost in printing if at most this share of its area was printed as
+# the layout states.
 _LOST = 0.1
 
 
 class Edges(NamedTuple):
     """The edges of a film in a micrograph.
 
-    ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the distance of each pixel from the
-    nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots and
-    pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation of the position
-    of an edge, as measured at a single pixel.
+    ``distance_px`` has the shape (ny, nx) of the micrograph. It contains the signed distance of each pixel
+    from the nearest edge, positive on the film. ``specks`` is a bool mask of the same shape. It marks dots
+    and pinholes of at most 40 pixels, which are ignored. ``sigma_px`` is the standard deviation with which a
+    single pixel determines the position of an edge.
     """
 
     distance_px: Array
@@ -89,8 +92,8 @@ def find_edges(grey: Array) -> Edges:
 
 
 def _dense(line: Array) -> Array:
-    """Return evenly spaced points along a contour. Contour and result have shape (n, 2) with columns y and
-    x.
+    """Return evenly spaced points along a contour. The contour and the result are arrays with the columns y
+    and x and one row per point.
     """
     along = np.r_[0.0, np.hypot(*np.diff(line, axis=0).T).cumsum()]
     places = np.arange(0.0, along[-1], _STEP_PX)
@@ -98,19 +101,20 @@ def _dense(line: Array) -> Array:
 
 
 def coverage(distance_um: Array, pitch_um: float) -> Array:
-    """Return the share of each pixel, from 0 to 1, that film covers. ``distance_um`` is the signed distance
-    from the nearest edge to the centre of the pixel.
+    """Return the share of each pixel's area, from 0 to 1, that film covers. ``distance_um`` is the signed
+    distance from the nearest edge to the centre of the pixel.
     """
     return np.clip(0.5 + distance_um / pitch_um, 0.0, 1.0)
 
 
 def edge_shift_px(level: Array, distance_px: Array) -> float:
-    """Return by how many pixels the edges of a film lie outside those of its layout, as the median over the
-    edges of the film.
+    """Return the median distance, in pixels, by which the edges of a film lie outside the edges of its
+    layout. The result is negative if they lie inside.
 
-    In a layout of small islands and gaps, a registration would take part of such a shift for a change of
-    scale. It must therefore be given a layout whose edges are shifted in the same way. A shift of less than
-    one pixel is negligible, and the result is then 0. It is also 0 if the film or the layout has no edges.
+    In a layout of small islands and gaps, a registration would mistake part of such a shift for a change of
+    scale. The registration must therefore use a layout whose edges are shifted in the same way. A shift of
+    less than one pixel is negligible, and the result is then 0. It is also 0 if the film or the layout has no
+    edges.
 
     Args:
         level: levels of the layout, shape (ny, nx).
@@ -126,14 +130,14 @@ def edge_shift_px(level: Array, distance_px: Array) -> float:
 
 def with_moved_edges(level: Array, outwards_px: float) -> Array:
     """Return the levels of the layout, as float of shape (ny, nx), with all edges moved outwards by
-    ``outwards_px``. Pixels that an edge crosses have levels in between.
+    ``outwards_px``. Pixels that an edge crosses have levels between 0 and the highest level.
     """
     return level.max() * coverage(_distance_px(level) + outwards_px, 1.0)
 
 
 def _distance_px(level: Array) -> Array:
-    """Return the distance of each pixel from the nearest edge of a layout, positive on the film. It is
-    infinite if the layout has no edge.
+    """Return the signed distance of each pixel from the nearest edge of a layout, positive where the layout
+    has film. It is infinite if the layout has no edge.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -153,8 +157,8 @@ def foreign(covered: Array, layout_share: Array, depth_px: int) -> Array:
     Args:
         covered: measured share of each pixel that film covers, shape (ny, nx), NaN where not measured.
         layout_share: the share that film should cover according to the layout, shape (ny, nx).
-        depth_px: deviations closer than this to an edge of the layout may belong to the print and are not
-            marked. The marked defects are widened by the same distance.
+        depth_px: distance in pixels. Deviations closer than this to an edge of the layout may belong to the
+            print and are not marked. The marked defects are widened by the same distance.
     """
     from scipy.ndimage import binary_dilation, distance_transform_edt, label, mean
 

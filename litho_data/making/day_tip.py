@@ -13,10 +13,12 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs with an estimated radius of the tip, if their card asks for one by ``tip = "blind"``.
+    """Return the jobs, with the estimated radius of the tip in their card if the card asks for an estimate by
+    ``tip = "blind"``.
 
     If the scans set no limit on the radius, the jobs are returned without a tip. The estimate is also printed
-    on stderr. Scans that cannot be read are not used here; the build reports later why.
+    on stderr. Scans that cannot be read are not used for the estimate. The build reports later why they
+    cannot be read.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)
@@ -30,8 +32,8 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
         print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
     else:
         print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
-    # The radius is rounded, by far less than its uncertainty, so that it does not depend on the order in
-    # which the scans finish.
+    # The radius is rounded, so that it does not depend on the order in which the scans finish. The rounding
+    # is far smaller than the radius's uncertainty.
     rounded = None if radius_um is None else float(f"{radius_um:.9g}")
     card = jobs[0].card
     process = card.process.model_copy(update={"tip": rounded})

@@ -13,8 +13,8 @@ _BOUND_SIGMA = 2.0
 
 
 class GratingScan(Record):
-    """What was measured in one scan of a grating. Values that could not be measured are None, and ``problem``
-    says why.
+    """The values that were measured in one scan of a grating. A value that could not be measured is None.
+    ``problem`` gives the reason, if there is one.
 
     Args:
         period_um: known period of the grating.
@@ -23,8 +23,8 @@ class GratingScan(Record):
             lengths. ``scale_x_sd`` and ``scale_y_sd`` are their standard uncertainties.
         bow_um: displacement along x of the middle of a scan line relative to its ends. ``bow_sd_um`` is its
             standard uncertainty.
-        tip_at_most_um: upper bound on the radius of the tip. It fails for a tip that is too blunt to enter
-            the gaps between bars, because such a tip seems sharper than it is.
+        tip_at_most_um: upper bound on the radius of the tip. The bound does not hold for a tip that is too
+            blunt to enter the gaps between bars, because such a tip seems sharper than it is.
     """
 
     id: str

@@ -1,4 +1,4 @@
-"""Compute the standard uncertainty of every registered height, and the parts of which it consists."""
+"""Compute the standard uncertainty of every registered height, and the contributions to it."""
 
 from collections.abc import Mapping
 
@@ -34,7 +34,8 @@ def height_sigma(
       resampling;
     - ``resampling``: the fine structure of the print that interpolation loses;
     - ``registration``: the uncertainty of the warp, multiplied by the slope of the heights;
-    - ``levelling``: the tilt and bow that levelling failed to remove or wrongly removed;
+    - ``levelling``: the tilt and bow that levelling failed to remove, or removed although they belong to the
+      print;
     - ``calibration``: the uncertainty of the z scale, multiplied by the height above the scan's mean.
 
     Args:
@@ -43,16 +44,19 @@ def height_sigma(
         layout_level: levels of the layout on the same grid.
         scan_pitch_um: pitch (y, x) of the scan in µm.
         layout_pitch_um: pitch of the layout in µm.
-        blur_px, model: blur and kind of warp that the registration found, as in ``warp_error``.
+        blur_px, model: sigma of the blur, in layout pixels, and kind of warp that the registration found, as
+            in ``warp_error``.
         levelled: whether a levelling recipe was applied. If so, the part ``levelling`` includes an estimate
-            of the surface that the recipe removed from the print. If not, it is the surface that does not
-            belong to the print, provided that this surface is significant.
+            of the surface that the recipe removed from the print. If no recipe was applied, the part
+            ``levelling`` is the quadratic surface that does not belong to the print, provided that this
+            surface is significant.
         fast_axis: the axis along which the tip moved fast.
         z_uncertainty: relative uncertainty of the z scale; 0 if the z scale was not calibrated.
 
     Returns:
-        The uncertainty in µm as float32 on the layout's grid, NaN where not valid, and a mapping with its
-        root mean square over the scan: ``sigma_<part>_nm`` for each part, and ``sigma_nm`` for the total.
+        The uncertainty in µm as float32 on the layout's grid, NaN where not valid; and a mapping with root
+        mean squares over the scan, in nm. Its key is ``sigma_<part>_nm`` for each part, and ``sigma_nm`` for
+        the total uncertainty.
     """
     own, height = levelled_um.astype(float), height_um.astype(float)
     valid, shape = np.isfinite(height), height.shape
@@ -88,7 +92,7 @@ def _resampling_nm2(
     """Return the variance, in nm², of the fine structure that interpolation loses.
 
     It is the integral, over all spatial frequencies, of the power spectrum of the print without noise,
-    multiplied by the share that interpolation loses at this frequency.
+    multiplied by the share of power that interpolation loses at each frequency.
     """
     filled = fill_gaps(levelled_um)
     lost = 0.0

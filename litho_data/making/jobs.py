@@ -20,7 +20,7 @@ from litho_data.store.partial import PartialStore, Piece
 
 _LAYOUT_AWARE = "layout-aware"
 # Width, in pixels, of the rim of level 0 that is added around the layout of a field that stands alone on the
-# substrate. Models continue a layout with its outermost levels, and with the rim they continue it with level
+# substrate. Models extend a layout by repeating its outermost levels. With the rim, they extend it with level
 # 0.
 _BARE_PX = 2
 # Film in a gap of the layout counts as dirt if it lies farther than this, in px, from the edges of the
@@ -50,8 +50,8 @@ def finish(job: Job, unfinished: PartialStore) -> Facts | str:
     """Run a job, add its arrays to the unfinished store, and return the record of the scan.
 
     The process that makes the arrays also stores them, so that only the record is sent to the main process.
-    If the input is bad, the result is the reason why the scan is skipped, so that a bad file never stops a
-    build.
+    If the input is bad, the result is a text with the reason why the scan is skipped. A bad file therefore
+    never stops a build.
     """
     try:
         piece = job.run()
@@ -83,7 +83,7 @@ class FieldJob:
         return self.field.id
 
     def key(self) -> str:
-        """Return the hash of everything that determines the result."""
+        """Return the hash of everything that determines the result: files, parameters and code."""
         described = {**asdict(self.field), "scan": self.scan_name, "layout": self.layout_name}
         plan = [described, self.recipe, self.seed, self.card.model_dump(mode="json")]
         own = (self.field.scan, self.field.layout, *self.standards.files.values())
@@ -101,7 +101,8 @@ class FieldJob:
         return chain.arrays.get("mask_level")
 
     def begin(self) -> Chain:
-        """Read the layout and the scan, and measure the scales of the microscope if there are standards.
+        """Read the layout and the scan, and measure the scales of the microscope if the card names
+        calibration standards.
 
         Raises:
             InputError: a file is unusable.
@@ -159,8 +160,8 @@ class FieldJob:
         )
 
     def _cover(self, chain: Chain) -> None:
-        """Run the operations on a micrograph after reading: find the edges of the film, register them, and
-        compute the heights and their uncertainty on the layout's grid.
+        """Run the operations that follow the reading of a micrograph. They find the edges of the film,
+        register the film onto the layout, and compute the heights and their uncertainty on the layout's grid.
         """
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
@@ -170,8 +171,8 @@ class FieldJob:
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})
 
     def _level(self, chain: Chain) -> None:
-        """Run the operations on heights after reading: level the scan and, unless it is a reference, register
-        and resample it and compute its uncertainty.
+        """Run the operations that follow the reading of heights. They level the scan. Unless it is a
+        reference scan, they also register and resample it, and compute the uncertainty of its heights.
         """
         of_dataset = self.field.use == "dataset"
         pitch = {"scan_pitch_um": chain.pitch_um}
@@ -193,8 +194,9 @@ class FieldJob:
         chain.run("uncertainty", {**pitch, "layout_pitch_um": self.card.layout.pitch_um, **fit, **lines})
 
     def _place(self, chain: Chain) -> dict[str, Any]:
-        """Return the parameters that describe the grid of the layout, and how many of its outermost pixels
-        become invalid. The heights of these pixels depend on the unknown surroundings of the field.
+        """Return the parameters that describe the grid of the layout. If the surroundings of the field are
+        unknown or continue the print, ``edge_px`` states how many of the outermost pixels become invalid,
+        because their heights depend on these surroundings.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
@@ -227,8 +229,8 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        # If the card's table states unit or size, the file must agree with it. If only the card itself states
-        # them, they are used for files that do not state their own.
+        # If the card's table states unit or size for a scan, the scan's file must agree with it. If only the
+        # card itself states them, they are used only for files that do not state their own unit or size.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 

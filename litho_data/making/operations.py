@@ -1,8 +1,8 @@
-"""Define the operations that make a dataset from raw files. They are pure functions of recorded parameters
-and inputs.
+"""Define the operations that make a dataset from raw files. An operation is a pure function of its recorded
+parameters and inputs.
 
-A build runs these operations, and ``replay`` repeats them from the record. No other code makes arrays of a
-store.
+A build runs these operations, and ``replay`` repeats them from the records in the store. No other code makes
+arrays of a store.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# If the aspect ratio of the pixels differs from 1 by more than this and the registration fails, the message
-# asks whether rows are missing.
+# If the registration fails and the aspect ratio of the scan's pixels differs from 1 by more than this, the
+# message asks whether rows are missing.
 _OBLONG = 0.01
 
 
@@ -115,7 +115,7 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the edges of the film, and convert them to a height map, which is then registered."""
+    """Find the edges of the film, and convert them to a height map. Another operation registers this map."""
     from litho_data.making.contour import coverage, find_edges
 
     edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
@@ -145,8 +145,8 @@ def _cover(params: Params, _: Files, arrays: Inputs) -> Made:
     covered = coverage(np.where(valid, distance, np.nan), pitch_um)
     dirt = foreign(covered, level / params["full_level"], params["dirt_px"])
     if shift_px := edge_shift_px(level, np.where(valid, distance / pitch_um, np.nan)):
-        # The edges may have moved farther than `dirt_px`, so that whole edges are marked as dirt. Only what
-        # is also marked relative to the moved edges is dirt.
+        # The edges may have moved farther than `dirt_px`, so that whole edges are marked as dirt. Only pixels
+        # that are also marked relative to the moved edges count as dirt.
         moved = with_moved_edges(level, shift_px) / params["full_level"]
         dirt &= foreign(covered, moved, params["dirt_px"])
     valid &= ~dirt
@@ -172,7 +172,7 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
 
 def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
     """Return the calibrated scale factor of the heights and its relative uncertainty. Without a calibration,
-    they are 1 and 0.
+    the factor is 1 and the uncertainty is 0.
     """
     if "calibration" not in arrays:
         return 1.0, 0.0
@@ -182,7 +182,7 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 
 @_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs them."""
+    """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs these levels."""
     from litho_data.level import layout_in_scan_frame
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from litho_data.making.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
-# Sigma of the blur of the layout in pictures of the residual, about the width of the printer's line. It is
-# used only for these pictures.
+# Sigma, in px, with which the layout is blurred for pictures of the residual. It is about the width of a
+# printed line, and is used only for these pictures.
 _BLUR_PX = 3.0
 _STAGES = {
     "layout (level)": "viridis",

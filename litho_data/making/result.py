@@ -9,11 +9,13 @@ from litho_data.store.schema import DatasetId
 
 
 class BuildResult(Result):
-    """The record of a build: which scans are in the store, which are not, and what should be fixed.
+    """The record of a build. It says which scans are in the store, which are not, and what should be fixed in
+    the dataset.
 
     ``n_scans`` and ``n_references`` are the numbers of scans and of reference scans in the store. ``reused``
-    is the number of those that an earlier, interrupted build had finished. ``skipped`` and ``unpaired`` map
-    the ids that are not in the store to the reasons. ``findings`` lists what to fix, worst first.
+    is the number of scans and reference scans that an earlier, interrupted build had finished. ``skipped``
+    and ``unpaired`` map each id that is not in the store to the reason. ``findings`` lists what to fix, worst
+    first.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"

@@ -1,7 +1,7 @@
 """Find scans that do not show the layout with the same id, because ids, files or doses were mixed up.
 
 A scan that could be registered may still show a similar layout, a mirror image of its layout, or its layout
-printed at another dose. A scan that could not be registered may show another layout of the set.
+printed at another dose. A scan that could not be registered may show another layout of the dataset.
 """
 
 from collections import Counter
@@ -23,26 +23,26 @@ _SIDE_PX = 128
 _EDGE_PX = 2
 # The correlation of a scan with another layout must exceed that with its own layout by this much.
 _BETTER = 0.02
-# A scan shows another layout if it correlates with it by at least the first value, and with every further
-# layout by less, by at least the second value. At the best shift, the correlation of a print with its own
-# layout is about 0.9, and with another layout 0.3 to 0.5.
+# An unregistered scan is said to show a layout if its correlation with this layout is at least the first
+# value, and exceeds the correlation with every other layout by more than the second value. At the best shift,
+# the correlation of a print with its own layout is about 0.9, and with another layout 0.3 to 0.5.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
-# Standard deviation of the logarithm of the height per level at one dose, first among prints of the same
-# layout, then among prints of different layouts.
+# Standard deviation of the logarithm of the height per level at one dose. The first value holds among prints
+# of the same layout, the second among prints of different layouts.
 _SCATTER_SAME, _SCATTER_OTHER = 0.01, 0.03
 _CLEAR_SIGMA = 4.0
 
 
 @dataclass(frozen=True)
 class Print:
-    """One registered scan, with its heights and its blurred layout sampled at a few points.
+    """One registered scan. Its heights and its blurred layout are sampled at a few points.
 
-    ``response`` contains the height per level in µm and its relative growth with the dose. ``edge_times``
-    says how many times more the outermost pixels deviate from the layout than the inner ones. ``dihedral`` is
-    the orientation that the registration found, and ``turned`` is true if the card states that the print was
-    rotated under the microscope. Scans in the same ``group`` should have the same height per level. The group
-    is the dose if the card states it, and the print otherwise.
+    ``response`` contains the height per level in µm, and the relative growth of this height with the dose.
+    ``edge_times`` is the rms deviation of the outermost pixels from the layout, divided by that of the inner
+    pixels. ``dihedral`` is the orientation that the registration found, and ``turned`` is true if the card
+    states that the print was rotated under the microscope. Scans in the same ``group`` should have the same
+    height per level. The group is the dose if the card states it, and the print otherwise.
     """
 
     id: str
@@ -58,18 +58,18 @@ class Print:
 
 
 def prints_of(records: Sequence[Facts], load: Callable[[str], Mapping[str, Array]]) -> list[Print]:
-    """Return the registered scans among the records, sampled at a few points.
+    """Return a ``Print`` for every record of a registered scan.
 
     Args:
         records: the records of the scans of a dataset.
-        load: function that takes the id of a scan and returns its arrays ``mask_level`` and ``height_um`` by
-            name.
+        load: function that takes the id of a scan and returns a mapping with its arrays ``mask_level`` and
+            ``height_um``.
     """
     return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
 
 
 def doubts(prints: Sequence[Print]) -> dict[str, str]:
-    """Return the reasons to suspect that a scan does not show its own layout, by the id of the scan.
+    """Return reasons to suspect that scans do not show their own layout, keyed by the id of the scan.
 
     Scans that are not suspected are left out.
     """
@@ -85,12 +85,13 @@ def fitting_layout(
     layouts: Mapping[str, Array],
     pitch_um: float,
 ) -> str:
-    """Return the id of the layout that a scan shows in any orientation, or "" if no layout clearly fits best.
+    """Return the id of the layout that a scan shows, whatever the scan's orientation. If no layout clearly
+    fits best, return "".
 
     Args:
         height_um: heights of the scan in µm, shape (ny, nx), NaN where not measured.
         scan_pitch_um: pitch (y, x) of the scan in µm.
-        layouts: levels of every layout, by id, each of shape (ny, nx).
+        layouts: levels of every layout, keyed by id. Each array has shape (ny, nx).
         pitch_um: pitch of the layouts in µm.
     """
     flat = remove_bow(at_layout_pitch(height_um, scan_pitch_um, pitch_um))
@@ -126,8 +127,8 @@ def _print(record: Facts, arrays: Mapping[str, Array]) -> Print:
 
 
 def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose heights fit another layout of the set better than the layout onto which they were
-    registered. Each is yielded as its id and the reason.
+    """Yield the scans whose heights fit another layout of the dataset better than the layout onto which they
+    were registered. Each is yielded as its id and the reason.
     """
     for shape in {one.topography.shape for one in prints}:
         alike = [one for one in prints if one.topography.shape == shape]
@@ -146,8 +147,8 @@ def _other_layouts(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 def _correlations(height: Array, layouts: Array) -> Array:
     """Return the correlation of the heights with each of n layouts. The result has shape (n,).
 
-    ``height`` has shape (pixels,), and ``layouts`` has shape (n, pixels). Heights that are NaN are ignored.
-    The correlation is 0 for a flat layout and for flat heights.
+    ``height`` has shape (pixels,), and ``layouts`` has shape (n, pixels). Pixels whose height is NaN are
+    ignored. The correlation is 0 for a flat layout and for flat heights.
     """
     seen = np.isfinite(height)
     own, others = (one - one.mean(axis=-1, keepdims=True) for one in (height[seen], layouts[:, seen]))
@@ -157,9 +158,9 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans that are mirrored relative to their layout, and those that are rotated in another way
-    than most scans. Each is yielded as its id and the reason. Scans of prints that the card states to be
-    rotated are left out.
+    """Yield the scans that are mirrored relative to their layout, and the scans that are rotated in another
+    way than most scans. Each is yielded as its id and the reason. If the card states that a print was
+    rotated, scans of this print are left out.
     """
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
     for one in (one for one in prints if not one.turned):
@@ -172,8 +173,8 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose height per level is that of another group, and the scans whose doses seem to be
-    swapped. Each is yielded as its id and the reason.
+    """Yield the scans whose height per level agrees with another group (dose or print) than their own, and
+    the scans whose doses seem to be swapped. Each is yielded as its id and the reason.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
@@ -211,9 +212,9 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
     relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    The exposure is the level times the dose. Therefore, the curve g of heights against blurred levels T also
-    shows how a larger dose would change the slope, and the growth is cov(T, T g') / cov(T, g). Here, g is a
-    parabola, and the growth is one plus the share of the slope that comes from its quadratic term. In a
+    The exposure is the level times the dose. Let g be the curve of heights against blurred levels T. It also
+    shows how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). A parabola is
+    fitted for g, so the growth is one plus the share of the slope that comes from the quadratic term. In a
     saturated print, the growth is negative.
     """
     seen = np.isfinite(height)
@@ -226,7 +227,8 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
 
 
 def _edge_times(topography: Array, height: Array, slope: float) -> float:
-    """Return the rms deviation of the outermost pixels from the layout, divided by that of the inner pixels.
+    """Return the rms deviation of the outermost pixels from the layout, divided by the rms deviation of the
+    inner pixels.
 
     The deviation is the height minus ``slope`` (in µm per level) times the blurred level. The result is 0 if
     no outermost or no inner pixel was measured.
@@ -242,12 +244,12 @@ def _edge_times(topography: Array, height: Array, slope: float) -> float:
 
 
 def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
-    """Return messages for the doses that seem to be swapped, by dose. The result is empty unless the height
-    per level clearly falls from one dose to a larger one.
+    """Return messages for the doses that seem to be swapped, keyed by dose. If the height per level nowhere
+    falls clearly from one dose to a larger one, the result is empty.
 
     Args:
-        rising: for each dose, the logarithm of the height per level and the number of scans. It contains only
-            doses at which a larger dose should raise the height.
+        rising: for each dose, the logarithm of the height per level and the number of scans. Only doses are
+            included at which a larger dose should raise the height.
         scatter: standard deviation of this logarithm for one scan.
     """
     doses = sorted(rising)

@@ -1,5 +1,5 @@
-"""Run and record a single step of a build, so that the origin of its arrays is known and they can be
-reproduced.
+"""Run and record a single step of a build. From the record, the origin of the step's arrays is known, and the
+arrays can be reproduced.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Step:
 
     @classmethod
     def from_record(cls, record: Facts) -> Step:
-        """Make the step from its stored record. The id in the record is ignored, so that it can be compared
-        with the id that is computed from the step.
+        """Make the step from its stored record. The id in the record is ignored. A caller can therefore
+        compare the stored id with the id that is computed from the step.
         """
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
@@ -70,7 +70,8 @@ class Operation:
     Args:
         name: name of the operation in the records.
         version: version of the operation. It is changed whenever the function may give different results.
-        function: function ``function(params, files, arrays)`` that returns arrays by name, and facts.
+        function: function ``function(params, files, arrays)`` that returns a mapping from names to arrays,
+            and a mapping of facts.
         takes: names of the input arrays, in the order in which they are recorded. Arrays that a scan does not
             have are left out.
         code: files and folders of this package on which the result depends.
@@ -94,8 +95,8 @@ class Operation:
 
         Args:
             params: all parameters of the operation, as plain data.
-            files: paths of raw files by their recorded name, in the order that the operation expects.
-            arrays: arrays by their name in the store. Only those named in ``takes`` are used.
+            files: paths of raw files, keyed by their recorded names, in the order that the operation expects.
+            arrays: arrays, keyed by their names in the store. Only the arrays named in ``takes`` are used.
 
         Raises:
             InputError: something is wrong with the input, for example a file is missing or unreadable.
@@ -123,8 +124,8 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit the numerical libraries to one thread in a block. The results then do not depend on the number of
-    cores, and parallel workers do not compete for cores.
+    """Limit the numerical libraries to one thread inside a ``with`` block. The results then do not depend on
+    the number of cores, and parallel workers do not compete for cores.
     """
     import cv2
     import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded

@@ -1,5 +1,5 @@
-"""Compare levelling recipes on three scans of a dataset card. The recipe is suggested after which the layout
-explains the heights best.
+"""Compare levelling recipes on three scans of a dataset card. The suggested recipe is the one after which the
+layout explains the heights best.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ method = "median-of-differences"
 }
 """The recipes that are compared, from the simplest to the most complex."""
 _SCANS = 3
-# A recipe is preferred to a simpler one only if its residual is less than this share of that of the simpler
-# one.
+# A recipe is preferred to a simpler recipe only if its residual is less than this share of the simpler
+# recipe's residual.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
 _LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
@@ -66,9 +66,9 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 class Suggestion:
     """The suggested recipe, and the residuals of all recipes in nm.
 
-    ``left_nm[recipe][scan]`` is the root mean square part of the levelled heights that the layout does not
-    explain, in blocks that were held out of the fit. ``warned`` maps recipes to the warnings about them.
-    ``card`` is the path of the card that was written.
+    ``left_nm[recipe][scan]`` is the residual: the root mean square of the part of the levelled heights that
+    the layout does not explain, in blocks that were held out of the fit. ``warned`` maps recipes to the
+    warnings about them. ``card`` is the path of the card that was written.
     """
 
     recipe: str
@@ -84,10 +84,10 @@ def suggest_recipe(
     pictures.
 
     The field is divided into blocks of 16 px. In half of the blocks, a free function of the blurred layout is
-    fitted to the levelled heights. The recipes are compared by the residual in the other half. It contains
-    both the tilt that a recipe fails to remove and the part of the print that it wrongly removes. A recipe is
-    not suggested if a step of it gives a warning, for example because it shifts lines that already agree with
-    adjacent lines in many pixels.
+    fitted to the levelled heights. The recipes are compared by the residual in the other half. This residual
+    contains both the tilt that a recipe fails to remove and the part of the print that the recipe wrongly
+    removes. If a step of a recipe gives a warning, the recipe is not suggested. For example, a step gives a
+    warning if it shifts lines that already agree with adjacent lines in many pixels.
 
     Args:
         card_path: path of the card. ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside
@@ -139,8 +139,8 @@ def suggest_recipe(
 
 
 def _best(left_nm: Mapping[str, float]) -> str:
-    """Return the recipe with the smallest residual. If simpler recipes have nearly the same residual, return
-    the simplest of them, which is listed first.
+    """Return the name of the recipe with the smallest residual. If simpler recipes have nearly the same
+    residual, return the simplest of them. Recipes are listed from the simplest to the most complex.
     """
     least = min(left_nm.values())
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
@@ -156,8 +156,8 @@ def _located(job: FieldJob) -> tuple[Array, Array]:
 
 
 def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
-    """Return the levelled heights, and a text with any warnings about the recipe. If the recipe cannot be
-    applied, return the raw heights and the reason.
+    """Return the levelled heights, and a text with the warnings of the recipe's steps. If the recipe cannot
+    be applied, return the raw heights and the reason.
     """
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
@@ -168,7 +168,7 @@ def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
 
 
 def left_by_layout(height_um: Array, layout: Array) -> float:
-    """Return the root mean square part, in µm, of the heights that the layout does not explain.
+    """Return the root mean square, in µm, of the part of the heights that the layout does not explain.
 
     A free function of the layout is fitted to the heights in half of the blocks of the field. The result is
     computed from the residuals in the other half.
@@ -190,8 +190,8 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
 
 
 def _write_card(card: Path, best: str) -> Path:
-    """Write the recipe, and a copy of the card whose ``process.level`` names it. The other text of the card
-    stays unchanged. Return the path of the copy.
+    """Write the recipe, and a copy of the card in which ``process.level`` names this recipe. The other text
+    of the card stays unchanged. Return the path of the copy.
     """
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))

@@ -11,17 +11,18 @@ from litho_data.foundation.results import Record
 from litho_data.making.right_layout import Print
 
 ALL = "all scans"
-# Limits of the height per level. If that of the prints differs from that of the card by more than the first
-# factor, this is reported; by more than the second factor, nothing is built. A scan is left out if its height
-# per level differs from that of the other scans by more than the third factor.
+# Limits of the height per level. If the height per level of the prints differs from that in the card by more
+# than the first factor, this is reported. If it differs by more than the second factor, nothing is built. A
+# scan is left out if its height per level differs from that of the other scans by more than the third factor.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
-# Limits of the scale of a scan on its layout. If the scales differ from 1 by more than the first value but
-# from each other by less than the second, the pitch in the card is wrong. If the scale of a single scan
-# differs from that of the others by more than the third value, the size of this scan is wrong.
+# Limits of the scale of a scan on its layout. If the scales differ from 1 by more than the first value, but
+# from each other by less than the second value, the pitch in the card is probably wrong. If the scale of a
+# single scan differs from that of the other scans by more than the third value, the size of this scan is
+# probably wrong.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 # Largest accepted value of ``Print.edge_times``. Measured prints have values of 1.1 to 1.5. Simulated prints
-# have 2 with a rim of substrate around the field, and 6 to 8 without a rim.
+# have the value 2 if the layout has a rim of substrate around the field, and 6 to 8 if it has no rim.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
 # Largest residual of levelling, as a share of the print's own standard deviation.
@@ -53,8 +54,8 @@ class Finding(Record):
 
 
 def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
-    """Find scans whose height per level differs greatly from that of the others, and return the reasons for
-    leaving them out, by id.
+    """Find scans whose height per level differs greatly from that of the other scans. The result maps the ids
+    of these scans to the reason for leaving them out.
     """
     gains = {one.id: abs(one.response[0]) for one in prints}
     if len(gains) < 3:
@@ -69,7 +70,8 @@ def odd_heights(prints: Sequence[Print]) -> dict[str, str]:
 
 
 def require_heights(prints: Sequence[Print], card: Card) -> None:
-    """Reject a card whose level height has nothing to do with the prints, such as a wavelength in nm.
+    """Reject a card whose level height cannot belong to the prints, for example because it is a wavelength in
+    nm.
 
     Raises:
         InputError: the height per level of the prints is more than 100 times that of the card, or less than a
@@ -98,8 +100,8 @@ def findings(
     Args:
         records: the records of the dataset's scans.
         prints: the registered scans, sampled at a few points (see ``prints_of``).
-        doubts: reasons to suspect that a scan does not show its own layout, by the id of the scan.
-        skipped: reasons why scans are not in the store, by the id of the scan.
+        doubts: reasons to suspect that a scan does not show its own layout, keyed by the id of the scan.
+        skipped: reasons why scans are not in the store, keyed by the id of the scan.
         card: the dataset card whose numbers are compared with the heights.
     """
     named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
@@ -115,7 +117,7 @@ def findings(
 
 
 def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[str, Weight]]:
-    """Yield what is wrong with one scan, each as a text and a weight.
+    """Yield the problems of one scan, each as a text and a weight.
 
     ``spread_nm`` maps the ids of the scans to the standard deviations of their heights, in nm.
     """
@@ -187,8 +189,8 @@ def _scale(record: Facts) -> float:
 
 
 def _height_times(prints: Sequence[Print], card: Card) -> float:
-    """Return the height per level of the prints (their median) divided by the level height in the card. The
-    result is 0 if there are no prints.
+    """Return the median height per level of the prints, divided by the level height in the card. The result
+    is 0 if there are no prints.
     """
     gains = [abs(one.response[0]) for one in prints]
     return float(np.median(gains)) / card.layout.level_height_um if gains else 0.0

@@ -58,7 +58,7 @@ class Canvas:
 
 
 def frame_layout(level: Array) -> Array:
-    """Return the layout with a guard frame around it. The frame repeats the outermost levels of the layout."""
+    """Return the layout with a guard frame around it. The frame repeats the layout's outermost levels."""
     return np.pad(level, GUARD_PX, mode="edge")
 
 
