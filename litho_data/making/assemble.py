@@ -266,7 +266,7 @@ def _used_sha256(record: Facts, name: str) -> str:
 
 
 def _facts(record: Facts | None, name: str) -> dict[str, Any]:
-    """Return the facts that the reader found in a scan's file. For a layout's file, the dictionary is empty."""
+    """Return the facts that the reader found in a scan's file. For a layout's file, the result is empty."""
     for step in record["steps"] if record else ():
         if step["op"] in READERS and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

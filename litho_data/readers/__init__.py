@@ -1,4 +1,4 @@
-"""Read instrument files as ``Scan`` objects, with one module per format."""
+"""Read files of instruments as ``Scan`` objects. Each module reads one format or several related formats."""
 
 from litho_data.readers.layout import read_layout
 from litho_data.readers.read import list_channels, read_scan

@@ -1,5 +1,5 @@
-"""Read files of self-describing arrays (HDF5 of any program, NetCDF 3 and 4, MATLAB). Scale, unit and axes
-are taken from the file.
+"""Read files of self-describing arrays (HDF5 files of any program, NetCDF 3 and 4, MATLAB). The scale, the
+unit and the axes of an array are taken from the file.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _UNKNOWN = re.compile(
 )
 # Names of numbers that convert counts into heights, such as m and b in "m · counts + b".
 _OF_COUNTS = re.compile(r"resolution|[mb]|c[01]", re.I)
-# Names of scales and offsets outside an array's own attributes: in single values beside the array and in
-# attributes of its groups. There, many attributes have nothing to do with the array, so only unambiguous
-# names are listed.
+# Names of scales and offsets that stand outside an array's own attributes, i.e. in single values beside the
+# array or in attributes of its groups. Many attributes there have nothing to do with the array, so only
+# unambiguous names are listed.
 _SCALE = re.compile(
     r"((z|heights?|data|values?|topography)[ _-]?)?(scale|scaling|factor|scale_factor|multiplier|gain)|"
     r"(z|heights?|data|values?|topography|add)[ _-]?offset",
@@ -53,8 +53,9 @@ Read = Callable[[], Array]
 class Coordinate:
     """The positions of the pixels along one dimension of an array.
 
-    ``values`` contains the positions, in ``unit``. It is None if the file states only a ``length``. ``axis``
-    is "x" or "y" if the file names the axis in addition to the dimension.
+    ``values`` contains the positions, in ``unit``. If the file states only a length, ``values`` is None and
+    ``length`` contains this length. ``axis`` is "x" or "y" if the file names an axis in addition to the
+    dimension.
     """
 
     values: Array | None
@@ -80,8 +81,8 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Held:
-    """An array in a file, which is read only when needed: its type and shape, a function that reads it, and
-    what the file says about it.
+    """An array in a file. Its values are read only when needed. The object contains the array's type and
+    shape, a function that reads its values, and what the file says about the array.
 
     ``dims`` contains the names of the array's two dimensions. ``coordinates`` maps names of dimensions to
     their coordinates, and may include dimensions of other arrays in the file. ``around`` contains the single
@@ -98,13 +99,15 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """Wrap an array that has already been read; ``described`` is passed on as the further fields."""
+        """Wrap an array that has already been read. ``described`` contains the values of the fields after
+        ``read``, in order.
+        """
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
 
     @property
     def is_map(self) -> bool:
-        """Return whether the array contains numbers along two dimensions."""
+        """Return whether the array has at least two rows and two columns of numbers."""
         return self.dtype.kind in f"{_NUMBERS}c" and len(self.shape) == 2 and min(self.shape) > 1
 
 
@@ -162,10 +165,10 @@ def array_channel(name: str, held: Held) -> Channel:
 
 
 def _axes(held: Held) -> tuple[tuple[str, ...], bool]:
-    """Return the names of the dimensions along y and x, and whether the array's first index runs along x.
+    """Return the names of the dimensions along y and x, and True if the array's first index runs along x.
 
-    If neither dimension of the array has coordinates, but the file contains coordinates named x and y whose
-    lengths match the array, these are used.
+    If neither dimension of the array has coordinates, coordinates named x and y in the file are used,
+    provided that their lengths match the array.
     """
     known = held.coordinates
     first, second = ((known[dim].axis if dim in known else "") or dim for dim in held.dims)
@@ -197,7 +200,7 @@ def _plain(value: Any) -> Any:
 def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
     """Read the values, set missing pixels to NaN, and apply scale and offset.
 
-    Marks of missing pixels are compared with the numbers as stored, that is before scaling.
+    Marks of missing pixels are compared with the stored numbers, before scale and offset are applied.
     """
     low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
     missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
@@ -212,8 +215,8 @@ def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
 def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
     """Make one channel per two-dimensional array in a file without groups.
 
-    One-dimensional arrays are taken as coordinates, and single values as descriptions of all maps. ``around``
-    contains the attributes of the whole file.
+    One-dimensional arrays are taken as coordinates, and single values as descriptions of all two-dimensional
+    arrays (maps). ``around`` contains the attributes of the whole file.
     """
     lines = {name: _coordinate(one.read(), one.attributes) for name, one in arrays.items() if _is_line(one)}
     single = {name: one.read().ravel()[0] for name, one in arrays.items() if _size(one) == 1}
@@ -230,7 +233,7 @@ def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
     """Read one channel per two-dimensional dataset of an open HDF5 file.
 
-    MATLAB stores arrays column by column, so in its files the first index runs along x.
+    MATLAB stores arrays column by column. In MATLAB's files, the first index therefore runs along x.
     """
     datasets: list[Any] = []
     file.visititems(
@@ -248,12 +251,14 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 
 
 def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
-    """Return the names of the arrays that are masks (of type bool), as a dictionary from their shapes."""
+    """Return the names of the arrays that are masks (of type bool), keyed by the shape of the array."""
     return {one.shape: name for name, one in arrays if one.dtype.kind == "b"}
 
 
 def _refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Reject a map if the file has a mask of the same shape, because it is unknown what the mask marks."""
+    """Reject a map if the file has a mask of the same shape, because the file does not say what the mask
+    marks.
+    """
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")
 
@@ -288,8 +293,8 @@ def _hdf5_array(path: Path, item: Any, matlab: bool) -> Held:
 
 
 def _is_line(array: Any) -> bool:
-    """Return whether an array contains numbers along a single dimension. Other dimensions of length 1 do not
-    count, because MATLAB stores a vector as a matrix with one row or column.
+    """Return whether an array contains numbers along a single dimension. Dimensions of length 1 do not count,
+    because MATLAB stores a vector as a matrix with one row or column.
     """
     return array.dtype.kind in _NUMBERS and _size(array) > 1 and max(array.shape) == _size(array)
 

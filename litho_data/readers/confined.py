@@ -1,4 +1,4 @@
-"""Run other projects' parsers in a child process, within limits of time and memory.
+"""Run parsers of other projects in a child process, within limits of computing time and memory.
 
 A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. Each process
 that reads files starts one child process at its first file and uses it for all files. A new child is started
@@ -25,24 +25,24 @@ from litho_data.readers.reader import DAMAGED, foreign_parser
 T = TypeVar("T")
 
 _MIB = 1 << 20
-# The limits of computing time and memory: a constant, plus a part that grows with the size of the file.
-# Undamaged files need about a hundredth of this time and a tenth of this memory.
+# The limits of computing time and memory. Each is the sum of a constant and a part that grows with the size
+# of the file. Undamaged files need about a hundredth of the allowed time and a tenth of the allowed memory.
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
-# The longest wait for a result, in multiples of the computing time allowed. A parser on a busy computer
-# answers within this time, but a parser that waits for something never does.
+# The longest wait for a result, in multiples of the allowed computing time. The wait is long enough for a
+# parser on a busy computer. It ends a parser that uses no computing time because it waits for something.
 _WAITING_PER_COMPUTING = 20
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 
 
 def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, ...]) -> T:
-    """Run a function that parses a file, and return its result. Any error becomes one InputError about the
-    file.
+    """Run a function that parses a file, and return its result. Any error is raised as an InputError about
+    the file.
 
     Args:
         function: the function, which takes no argument.
         path: the file that it parses. The limits depend on the size of the file.
-        kind: the format, in words for messages.
+        kind: name of the format that messages show.
         parsers: names of other projects' modules that the function needs. If any are named, the function runs
             in the child process and must be picklable. On systems other than POSIX, it always runs in this
             process.
@@ -57,7 +57,7 @@ def _guarded(function: Callable[[], T], kind: str) -> T:
 
 
 class _Child:
-    """One child process. It is started when it is first needed, and started again if it has ended."""
+    """The child process. It is started when it is first needed, and started again if it has ended."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -107,7 +107,7 @@ class _Child:
         self._owner = os.getpid()
 
     def _end(self, error: Exception, computing_s: float) -> str:
-        """End the child, and return the reason for the missing answer in words for a message."""
+        """End the child, and return the reason why it gave no answer, in words for a message."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
             self._process.kill()
@@ -126,8 +126,8 @@ class _Child:
 
 
 def serve(descriptor: int) -> None:
-    """Receive functions in the child process, run them and send back their results, until the parent process
-    has ended.
+    """Run in the child process: receive functions, run them, and send back their results until the parent
+    process has ended.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe = Connection(descriptor)
@@ -147,7 +147,7 @@ def serve(descriptor: int) -> None:
 
 @contextmanager
 def _limits(computing_s: float, memory: int) -> Iterator[None]:
-    """Limit the block's computing time in seconds and its additional memory in bytes.
+    """Limit the computing time, in seconds, and the additional memory, in bytes, of a ``with`` block.
 
     If the block computes for longer, a signal ends the process. If it needs more memory, Python raises
     MemoryError.

@@ -1,5 +1,5 @@
-"""Read the levels from files that the design package exported for a printer. The sidecar, a JSON file beside
-each exported file, says how to read it.
+"""Read the levels from files that the design package exported for a printer. Beside each exported file lies
+its sidecar, a JSON file that says how to read the exported file.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def export_of(file: Path) -> dict[str, Any]:
 
 
 def exported_levels(path: Path, says: Facts) -> Array:
-    """Return the levels of the designed element, without alignment marks. The array is uint8 of shape (ny,
-    nx) with row 0 at the top.
+    """Return the levels of the designed element, without alignment marks. The result is a uint8 array of
+    shape (ny, nx), with row 0 at the top.
 
     Args:
         path: the exported file.
@@ -63,8 +63,9 @@ def exported_levels(path: Path, says: Facts) -> Array:
 
 
 def exported_rows(path: Path, says: Facts) -> Any:
-    """Return the levels of a whole exported file, including its alignment marks, as an array or an object
-    that is sliced by rows. For TIFF and GDS, such an object reads only the rows that are requested.
+    """Return the levels of a whole exported file, including its alignment marks. The result is an array, or
+    an object that can be sliced by rows. For TIFF and GDS, it is such an object, and a slice reads only the
+    requested rows.
 
     Raises:
         InputError: the sidecar is incomplete, or the file does not match it.
@@ -91,7 +92,9 @@ def exported_rows(path: Path, says: Facts) -> Any:
 
 
 class TiffRows:
-    """The levels on the first page of a TIFF, as uint8. Only the strips with the requested rows are read."""
+    """The levels on the first page of a TIFF, as uint8. A slice reads only the strips of the TIFF that
+    contain the requested rows.
+    """
 
     def __init__(self, path: Path):
         import tifffile
@@ -107,7 +110,7 @@ class TiffRows:
 
 def _image_levels(path: Path, greys: Sequence[int]) -> Array:
     """Read the levels from an exported PNG or BMP. ``greys`` contains the grey value of each level. The
-    result is uint8 of shape (ny, nx).
+    result is a uint8 array of shape (ny, nx).
 
     Raises:
         InputError: the file is not an image, or it contains a grey value that is not in ``greys``.
@@ -124,10 +127,11 @@ def _image_levels(path: Path, greys: Sequence[int]) -> Array:
 
 
 def _dxf_levels(path: Path, shape: Shape, pitch_um: float, greys: Sequence[int]) -> Array:
-    """Read the levels from the closed polylines of an exported DXF. The result is uint8 of shape (ny, nx)
-    with row 0 at the top.
+    """Read the levels from the closed polylines of an exported DXF. The result is a uint8 array of shape (ny,
+    nx), with row 0 at the top.
 
-    Each polyline begins with its layer, which is the grey value of a level, and a number that is not used.
+    The name of a polyline's layer is the grey value of its level. The first point in the record of a
+    polyline is not a corner and is skipped.
     """
     level_of = {grey: level for level, grey in enumerate(greys)}
     found = np.full(shape, level_of.get(0, 0), np.uint8)
@@ -143,7 +147,7 @@ def _gwl_levels(
     path: Path, shape: Shape, pitch_um: float, level_height_um: float, pedestal_um: float, slicing_um: float
 ) -> Array:
     """Read the levels from an exported GWL file, by counting the slices that are written at each pixel. The
-    result is uint8 of shape (ny, nx) with row 0 at the top.
+    result is a uint8 array of shape (ny, nx), with row 0 at the top.
 
     Raises:
         InputError: the slices at a pixel do not add up to a whole number of levels.
@@ -175,8 +179,8 @@ def _gwl_levels(
 
 
 def read_stl_triangles(path: Path) -> Array:
-    """Return the corners of the n triangles in a binary STL, in µm. The array is float32 of shape (n, 3, 3),
-    indexed by triangle, corner and coordinate.
+    """Return the corners of the n triangles in a binary STL, in µm. The result is a float32 array of shape
+    (n, 3, 3), indexed by triangle, corner and coordinate.
 
     Raises:
         InputError: the length of the file does not match the number of triangles that it states.
@@ -193,8 +197,8 @@ def read_stl_triangles(path: Path) -> Array:
 def read_stl_levels(
     path: Path, shape: Shape, cell_um: float, level_height_um: float, pedestal_um: float
 ) -> Array:
-    """Read the levels of the cells in an exported STL from the heights of the solid's upper faces. The result
-    is uint8 of shape (ny, nx) with row 0 at the top.
+    """Read the levels of the cells in an exported STL, from the heights of the solid's upper faces. The
+    result is a uint8 array of shape (ny, nx), with row 0 at the top.
 
     Each face lies in a single cell of side ``cell_um``.
 

@@ -1,6 +1,7 @@
 """Read the levels from GDSII files that the design package wrote, one band of rows at a time.
 
-Such a file describes the layout by rectangles in cells, which are placed repeatedly.
+Such a file describes the layout by rectangles, which are grouped in cells. A cell may be placed at several
+positions.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ _START = 0x0004080000060D02
 
 
 class GdsRows:
-    """The levels of a GDS file, as uint8 with row 0 at the top. A slice of rows reads only these rows."""
+    """The levels of a GDS file, as uint8 with row 0 at the top. Slicing the object by rows reads only the
+    requested rows.
+    """
 
     def __init__(self, path: Path, shape: Shape, pitch_um: float, layers: str):
         self.shape = shape
@@ -44,7 +47,8 @@ class GdsRows:
         self._shapes: dict[str, tuple[int, int]] = {}
         self._references: dict[str, list[tuple[str, int, int]]] = {}
         self._index()
-        # The cell of every row of blocks, with the position of its lower left corner in pixels.
+        # For every row of blocks, the position (x, y) of its lower left corner in pixels, and the name of its
+        # cell.
         self._bands = [
             (round((x + dx) / self._step), round((y + dy) / self._step), cell)
             for name, x, y in self._references["LAYOUT"]
@@ -55,7 +59,8 @@ class GdsRows:
         top, bottom, _ = rows.indices(self.shape[0])
         low, high = self.shape[0] - bottom, self.shape[0] - top
         # A rectangle is added through its four corners: each adds or subtracts the level everywhere above and
-        # to the right of the corner. The sums over rows and columns do this for all corners at once.
+        # to the right of the corner. The cumulative sums over rows and columns do this for all corners at
+        # once.
         steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
@@ -72,9 +77,7 @@ class GdsRows:
         return summed[-2::-1, :-1].astype(np.uint8)
 
     def _index(self) -> None:
-        """Find, for every cell, the position of its rectangles in the file and the other cells that it
-        places.
-        """
+        """Find, for every cell, where its rectangles lie in the file, and which other cells it places."""
         at, cell, name = 0, "", ""
         while True:
             # 64 bytes hold any record that is used here. Only records of rectangles are longer.

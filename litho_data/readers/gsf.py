@@ -1,5 +1,5 @@
-"""Read and write the format Gwyddion Simple Field (GSF). A file consists of a text header, one to four NUL
-bytes, and the rows of the field as little-endian float32.
+"""Read and write files in the format Gwyddion Simple Field (GSF). A file consists of a text header, one to
+four NUL bytes, and the rows of the field as little-endian float32.
 """
 
 from pathlib import Path
@@ -16,7 +16,8 @@ _UM_PER_M = 1e6
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Return the only channel of a GSF file. It has a unit and a size only if the header states them.
+    """Return the only channel of a GSF file. The channel has a unit and a size only if the header states
+    them.
 
     Raises:
         InputError: the file is not a GSF file, its header lacks XRes or YRes or contains a scale, or the
@@ -83,7 +84,7 @@ def gsf_bytes(height_um: Array, pitch_um: YX | None, title: str = "") -> bytes:
 
     Args:
         height_um: heights in µm, shape (ny, nx), NaN where not measured.
-        pitch_um: pitch (y, x) in µm; without it, the file states no size.
+        pitch_um: pitch (y, x) in µm. With None, the file does not state the size of the field.
         title: name of the field.
     """
     ny, nx = height_um.shape

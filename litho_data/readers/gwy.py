@@ -12,14 +12,15 @@ from litho_data.foundation import Array, InputError, Shape
 from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, one_by_one
 
 _MAGIC = b"GWYP"
-# The types of single values, by their letter in the file. The capital letter stands for an array of the type.
+# The types of single values, keyed by the letter that stands for them in the file. A capital letter stands
+# for an array of this type.
 _NUMBERS = {"b": "?", "c": "u1", "i": "<i4", "q": "<i8", "d": "<f8"}
 _FIELD_KEY = re.compile(r"/(\d+)/data")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Return one channel per data field. Masked pixels keep their heights, and the mask is returned with
-    them.
+    """Return one channel per data field. Masked pixels keep their heights, and the channel's ``load`` returns
+    the mask in addition to the heights.
 
     A pixel is masked if Gwyddion's mask is above zero there. The metadata that Gwyddion stores for a channel
     become the channel's header.
@@ -69,12 +70,14 @@ def _pixels(what: str, field: dict[str, Any], shape: Shape) -> Array:
 
 
 def _unit(field: dict[str, Any], key: str) -> str | None:
-    """Return the unit, or None if Gwyddion states an empty one, as it does for pure numbers."""
+    """Return the unit that a data field states, or None if this unit is empty. Gwyddion writes an empty unit
+    for pure numbers.
+    """
     return str(field.get(key, {}).get("unitstr", "")) or None
 
 
 def _object(data: bytes, start: int, limit: int) -> tuple[dict[str, Any], int]:
-    """Return the components of an object by name, and the position where the object ends.
+    """Return the components of an object, keyed by name, and the position where the object ends.
 
     Args:
         data: the bytes of the file.

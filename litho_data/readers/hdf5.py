@@ -1,5 +1,5 @@
-"""Read HDF5 files: those of known programs (JPK's series, Nanosurf's NHF, TopoStats' results) by their own
-conventions, and those of all other programs as self-describing arrays.
+"""Read HDF5 files. Files of known programs (JPK's series, Nanosurf's NHF, TopoStats' results) are read by the
+conventions of these programs. Files of all other programs are read as self-describing arrays.
 """
 
 from functools import partial
@@ -88,8 +88,8 @@ def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:
 
 
 def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: float) -> Loaded:
-    """Read the values of one frame, converted with the file's default calibration. JPK counts rows from the
-    bottom, so the rows are returned in reverse order.
+    """Read the values of one frame, and convert them with the file's default calibration. JPK counts rows
+    from the bottom, so the order of the rows is reversed.
     """
     column, row = positions().astype(int).T
     values = np.full((row.max() + 1, column.max() + 1), np.nan)
@@ -98,7 +98,9 @@ def _load_jpk(counts: Read, positions: Read, frame: int, slope: float, offset: f
 
 
 def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
-    """Return one channel per signal, for every image and direction. Groups without images are skipped."""
+    """Return one channel for every signal of every image and scan direction. Groups without images are
+    skipped.
+    """
     import h5py
 
     channels = []
@@ -118,7 +120,7 @@ def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) ->
     """Make the channel of a signal that is stored as integer counts.
 
     The full range of the integer type corresponds to the calibrated range that the file states. Rows and
-    columns stay as stored.
+    columns keep the order in which they are stored.
     """
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])

@@ -1,5 +1,5 @@
-"""Read layouts (what was sent to the printer) as integer levels. The file contains the levels or grey values
-that stand for levels.
+"""Read layouts, i.e. the patterns that were sent to the printer, as integer levels. The file of a layout
+contains the levels themselves or grey values that stand for levels.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ def read_layout(
     levels: int | None = None,
     average_px: int | None = None,
 ) -> Array:
-    """Read the level numbers of a layout as an array of shape (ny, nx) with row 0 at the top.
+    """Read the level numbers of a layout. The result is an array of shape (ny, nx), with row 0 at the top.
 
     The array is uint8, or uint16 for more than 256 levels. The file may be TIFF (with any compression that
     tifffile and imagecodecs support), PNG, BMP or NPY. A colour image is treated as greyscale if its channels
@@ -36,8 +36,9 @@ def read_layout(
             contains values too large for level numbers, it is read as a greyscale image in which white is the
             highest level. All its values must then be multiples of the same grey step.
         average_px: side of a square in pixels, for an image with only two grey values. Each square of the
-            image becomes one pixel of the layout, whose level is the number of lighter pixels in the square.
-            Pixels at the right and at the bottom that do not fill a square are cropped.
+            image becomes one pixel of the layout. The level of this pixel is the number of pixels in the
+            square that have the lighter grey value. Pixels at the right and at the bottom that do not fill a
+            square are cropped.
 
     Raises:
         InputError: the file does not exist, is damaged, has a format that is not supported, or has pixels
@@ -75,8 +76,8 @@ def _averaged(file: Path, pixels: Array, side: int) -> Array:
 
 
 def _white_step(pixels: Array, levels: int | None) -> float:
-    """Return the difference between the grey values of successive levels, in an image in which white is the
-    highest level. Return 1 if the file contains the level numbers themselves.
+    """Return the difference between the grey values of successive levels. White is taken as the highest
+    level. Return 1 if the file contains the level numbers themselves.
     """
     if levels is None or pixels.max() < levels:
         return 1.0

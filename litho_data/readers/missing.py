@@ -13,14 +13,16 @@ from litho_data.readers.text_blocks import WORDS
 _USUAL = np.array(WORDS["missing"]["marks"], float)
 _USUAL_TOLERANCE = 1e-4
 # An extreme value that is not one of the usual marks looks like a mark if its distance from the other values
-# exceeds this multiple of their span. If only one pixel has the value, the second multiple applies.
+# exceeds a multiple of their span. The first multiple applies if several pixels have the value, the second if
+# only one pixel has it.
 _FAR, _FAR_ALONE = 10, 1000
 _FEWEST_VALUES = 8
 # Values count as equal within these relative tolerances, because they may be stored as float32. Values above
 # the limit _LARGE are written with few digits, so their tolerance is wider.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# The lowest or highest value is suspicious if it fills at least this share of the pixels, at least this
-# number of pixels, and at least this multiple of the number of pixels that a value fills on average.
+# The lowest or highest value is suspicious if the number of pixels with this value reaches all of three
+# limits. These are a share of all pixels, a number of pixels, and a multiple of the mean number of pixels per
+# value.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
 
@@ -30,8 +32,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
     Args:
         channel: the channel from which the values were read.
         values: array of shape (ny, nx) of the numbers in the file.
-        missing: the numbers and words that mark missing pixels. An empty list says that there are no marks.
-            None says that the caller does not know of any.
+        missing: the numbers and words that mark missing pixels. An empty list states that there are no marks.
+            None states that the caller does not know whether there are any.
 
     Raises:
         InputError: the file contains a word that is not in ``missing``, or ``missing`` is None and a number
@@ -56,8 +58,8 @@ def without_missing(channel: Channel, values: Array, missing: Sequence[float | s
 
 
 def _marks(values: Array) -> list[tuple[float, int]]:
-    """Return the extreme values that look like marks, each with its number of pixels. The most extreme value
-    comes first.
+    """Return the extreme values that look like marks, each with the number of pixels that have this value.
+    The most extreme value comes first.
     """
     numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     found: list[tuple[float, int]] = []

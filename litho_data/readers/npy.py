@@ -33,8 +33,8 @@ def read_channels(path: Path) -> list[Channel]:
 def read_archive(path: Path) -> list[Channel]:
     """Return one channel per two-dimensional array of numbers in an ``.npz`` file.
 
-    Single values and one-dimensional arrays in the same file give the unit and the axes, as in a MATLAB file.
-    Other arrays are skipped.
+    The unit and the axes are taken from single values and one-dimensional arrays in the same file, as for a
+    MATLAB file. Other arrays are skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -59,7 +59,7 @@ def _member(path: Path, name: str) -> Array:
 
 
 def load_array(path: Path) -> Array:
-    """Return the array of a ``.npy`` file as a memory map, so that its values are read only when used.
+    """Return the array of a ``.npy`` file as a memory map. The values are read only when they are used.
 
     Raises:
         InputError: the file is damaged or contains pickled objects, or its values are not real numbers.
@@ -76,7 +76,8 @@ def load_array(path: Path) -> Array:
 
 
 def _is_archive(head: bytes) -> bool:
-    """Return whether a file begins like a ZIP archive whose first member is a ``.npy`` file.
+    """Return whether a file that begins with these bytes is a ZIP archive whose first member is a ``.npy``
+    file.
 
     The name of the first member follows a header of 30 bytes.
     """

@@ -1,4 +1,4 @@
-"""Unpack files that contain another file: gzip, and Digital Surf's compressed surfaces."""
+"""Unpack files that contain another file, i.e. gzip files and Digital Surf's compressed surfaces."""
 
 import gzip
 import struct
@@ -15,15 +15,15 @@ _GZIP = b"\x1f\x8b"
 _SURF, _PACKED_SURF = b"DIGITAL SURF", b"DSCOMPRESSED"
 _MOST_BYTES = 1 << 30
 _PIECE = 1 << 20
-# Digital Surf's header has 512 bytes. A comment and a private zone follow it; their sizes stand in the header
-# at byte 334.
+# Digital Surf's header has 512 bytes. It is followed by a comment and a private zone, whose sizes are stored
+# in the header from byte 334 on.
 _SURF_HEADER, _SURF_ZONES, _MOST_STREAMS = 512, 334, 4096
 
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """Yield the path of the file itself, or, if the file is packed, that of a temporary file with the
-    unpacked content.
+    """Yield the path of an unpacked file. If the given file is packed, this is the path of a temporary file
+    with the unpacked content. Otherwise, it is the given path.
 
     Raises:
         InputError: the file is damaged, or its content is larger than 1 GiB.

@@ -1,8 +1,10 @@
-"""Read printed fields in the pair format of the paper's authors. Each field is stored as pairs of 8-bit
-images, one of the layout and one of the heights, and may be cut into four quadrants.
+"""Read printed fields in the pair format of the paper's authors. Each field is stored as a pair of 8-bit
+images, one of the layout and one of the heights. A field may also be cut into four quadrants, with one pair
+of images for each.
 
-In an image of heights, a grey value stands for the height grey value / 255 · full scale. The format has no
-mask of valid pixels, no negative heights and only 256 grey values, so it loses accuracy.
+In an image of heights, the height of a pixel is its grey value, divided by 255 and multiplied by the full
+scale. The format has no mask of valid pixels, no negative heights and only 256 grey values, so it loses
+accuracy.
 """
 
 from collections.abc import Sequence
@@ -22,8 +24,8 @@ def stitch_field(
     """Join the quadrants of one field, and return the arrays of the field by name.
 
     Args:
-        files: the images of the layout, followed by the images of the heights, both in the order of
-            ``quadrants``.
+        files: the images of the layout, followed by the images of the heights. Both groups are in the order
+            of ``quadrants``.
         quadrants: the numbers of the quadrants, 1 to 4, or only 0 for an undivided field.
         full_scale_um: for each image of heights, the height that grey value 255 stands for.
         levels: number of levels that the layout may have.

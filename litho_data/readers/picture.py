@@ -18,7 +18,7 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
 
     Args:
         path: the file.
-        what: what messages call the file, such as "layout".
+        what: the word that messages use for the file, such as "layout".
 
     Raises:
         InputError: the file does not exist, is damaged, has a format that is not supported, has pixels whose
@@ -39,7 +39,7 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
 
 
 def value_range(pixels: Array) -> str:
-    """Return the type and range of the numbers of a picture, in words for messages."""
+    """Return a text for messages that states the type and the range of a picture's numbers."""
     if pixels.dtype.kind not in "uif":
         return str(pixels.dtype)
     return f"{pixels.dtype} from {pixels.min():g} to {pixels.max():g}"

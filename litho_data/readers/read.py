@@ -1,4 +1,4 @@
-"""Read one scan. This module chooses the channel, unit and size in the same way for all formats."""
+"""Read one scan. The channel, the unit and the size are chosen in the same way for all formats."""
 
 import re
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ from litho_data.scan import Axis, Scan
 _NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
 # Relative tolerance when two stated sizes are compared, because files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
-# The side of a scan lies in this range. If a file states coordinates without a unit, the range decides which
-# unit is possible.
+# The sides of a scan are assumed to lie in this range. If a file states coordinates without a unit, the range
+# decides which units are possible.
 _SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
@@ -49,7 +49,7 @@ def read_scan(
     Args:
         path: the file that the instrument wrote.
         format: one of ``formats()``, or ``"auto"`` to detect it from the content.
-        unit: unit of the heights. It is needed if the file does not state the unit.
+        unit: unit of the heights in the file. It is needed if the file does not state the unit.
         size_um: side lengths (y, x) of the scan in µm, from edge to edge, for files that do not state them.
             If neither the file nor the caller states the size, the pitch stays unknown (None).
         channel: name of the channel to read. It is needed if the file has several height channels.
@@ -58,7 +58,8 @@ def read_scan(
         full_scale_um: for images of integers, the height in µm that the largest possible integer stands for:
             height = value / largest integer · full_scale_um. It is given in place of ``unit``.
         missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
-            to the marks that the file itself states. An empty list says that there are no further marks.
+            to the marks that the file itself states. An empty list states that there are no such additional
+            marks.
         defaults: if true, ``unit`` and ``size_um`` are only used if the file does not state the unit or the
             size. If false, they must agree with what the file states.
 
@@ -137,7 +138,9 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
 
 
 def _with_unit_of_name(channel: Channel) -> Channel:
-    """Take the unit from the name of a channel if the name states one, as in ``height_nm``."""
+    """Return the channel with the unit that its name states, as in ``height_nm``. The channel is unchanged if
+    the file states the unit, or if the name states none.
+    """
     ends = _NAMED_UNIT.search(channel.name)
     return replace(channel, unit=ends[1]) if ends and channel.unit is None else channel
 
@@ -194,8 +197,8 @@ def _settle_unit(
 
 
 def _to_um(values: Array, factor: float) -> Array:
-    """Multiply the values by the factor to µm. A factor below one is applied as a division, because only then
-    does 100 nm become exactly 0.1 µm.
+    """Convert the values to µm by multiplying them by the factor. A factor below one is applied as a
+    division, because only then 100 nm become exactly 0.1 µm.
     """
     inverse = round(1 / factor)
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
@@ -215,8 +218,8 @@ def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
 def _size_of_extent(channel: Channel, unit: str) -> YX | None:
     """Return the size (y, x) in µm from coordinates whose unit the file does not state.
 
-    Two units are tried: µm, and the unit of the heights. The result is None unless exactly one possible size
-    follows.
+    Two units are tried: µm, and the unit of the heights. If exactly one of them gives a plausible size,
+    return this size. Otherwise return None.
     """
     if channel.extent is None or channel.full_scale is not None:
         return None

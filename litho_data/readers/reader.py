@@ -1,5 +1,5 @@
-"""Define the interface of a reader. A reader recognises a file and describes its channels before they are
-loaded.
+"""Define the interface of a reader. A reader recognises files of one format, and describes the channels of a
+file before their values are loaded.
 """
 
 import logging
@@ -19,16 +19,17 @@ import numpy as np
 from litho_data.foundation import YX, Array, InputError, Shape, is_length, um_per
 from litho_data.scan import Axis
 
-# Largest number of pixels of a scan (2 GiB as float64). A larger number is far more likely to come from a
-# damaged header than from a real scan.
+# Largest number of pixels of a scan (2 GiB as float64). If a header states a larger number, it is assumed to
+# be damaged.
 _MAX_PIXELS = 2**28
-# Largest ratio of unpacked to packed size. This is the limit of Deflate, the strongest compression in use.
+# Largest accepted ratio of unpacked to packed size. It is the limit of Deflate, the strongest compression
+# that the supported formats use.
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
-# Words that occur in a parser's message if the file is truncated or changed. Any other message is taken to
-# mean that the file is of an unknown kind.
+# Words that occur in a parser's message if the file is truncated or changed. Any other message is taken as a
+# sign that the file is of an unknown kind.
 _CUT = re.compile(
     r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
     r"crc|incomplete|reach(es)? beyond",
@@ -50,16 +51,17 @@ class Channel:
         unit: unit of the values as the file states it; None if the file does not state it.
         size_um: side lengths (y, x) of the map in µm, from edge to edge; None if the file does not state
             them.
-        load: function that reads the map. It returns the values in ``unit``, an array of shape (ny, nx) with
-            row 0 at the top, and the file's mask of the same shape, or None if the file has no mask.
+        load: function that reads the map. It returns two items. The first is an array of the values in
+            ``unit``, of shape (ny, nx), with row 0 at the top. The second is the file's mask of the same
+            shape, or None if the file has no mask.
         full_scale: the largest value that the integer type of an image can hold; None for real numbers.
         fast_axis: axis along which the tip moved fast; None if the file does not state it.
         header: everything that the file states about the channel, as strings.
         problem: the reason why the channel cannot be read; empty if it can be read.
         x_is: which direction in the file runs along x, in words, such as "a row of the file".
         extent: side lengths (y, x) of the map from edge to edge, if the file states them without a unit.
-        words: words that stand in the file in place of numbers. Each is mapped to the line where it first
-            occurs. The pixels with these words are NaN.
+        words: words that stand in the file in place of numbers, each with the line where it first occurs.
+            Pixels with such a word are NaN.
         notes: warnings for the user of the map.
     """
 
@@ -88,8 +90,8 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """Return whether the channel may contain heights. It may if its unit is a length, or if the file does
-        not state its unit.
+        """Return whether the channel may contain heights. This is the case if its unit is a length, or if the
+        file does not state its unit.
         """
         return not self.problem and (self.unit is None or is_length(self.unit))
 
@@ -103,7 +105,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Reader:
-    """A file format: how to recognise and read it.
+    """A file format, with functions that recognise and read files of this format.
 
     Args:
         name: name of the format. It is written as ``format = "…"`` in a dataset card and after ``--format``
@@ -125,8 +127,8 @@ class Reader:
 
 
 def one_by_one(name: str, make: Callable[[], Channel]) -> Channel:
-    """Make a channel. If this fails, return a substitute channel whose ``problem`` says why it cannot be
-    read, so that the other channels of the file stay usable.
+    """Make a channel. If this fails, return a substitute channel whose ``problem`` gives the reason. The
+    other channels of the file then stay usable.
     """
     try:
         with foreign_parser("a map"):
@@ -149,8 +151,8 @@ def _copied(values: Array) -> Loaded:
 
 
 def extent_um(y: float, x: float, unit: str | None) -> YX | None:
-    """Convert stated side lengths to (y, x) in µm. Return None unless both are positive and finite and the
-    unit is a length.
+    """Convert stated side lengths to (y, x) in µm. Return None if a length is not positive and finite, or if
+    the unit is not a length.
     """
     if unit is None or not is_length(unit):
         return None
@@ -164,8 +166,8 @@ def unknown_content(head: bytes) -> InputError:
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
-    """Return the channels with unique names. A name that occurs again gets a number, so that each channel can
-    be chosen by its name.
+    """Return the channels with unique names. If a name occurs again, a number is added to it, so that each
+    channel can be chosen by its name.
     """
     seen: dict[str, int] = {}
     unique = []
@@ -193,10 +195,11 @@ def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
 
 @contextmanager
 def foreign_parser(kind: str) -> Iterator[None]:
-    """Guard a block that runs another project's parser: turn any exception into one InputError.
+    """Guard a ``with`` block that runs another project's parser. Any exception in the block is raised as an
+    InputError.
 
     Args:
-        kind: what the file should be, in words for the message, such as ``"TIFF"``.
+        kind: name of the format that the parser reads, for the message, such as ``"TIFF"``.
 
     On a damaged file, such parsers write to the log and raise errors of many types: struct, index, key,
     value, memory, decoding and assertion errors, and types of their own. A caller could not handle so many

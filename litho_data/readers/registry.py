@@ -6,8 +6,8 @@ from litho_data.foundation import InputError, unknown_name
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
-# Readers are listed in the order in which they are tried. Formats with a signature of their own come first.
-# Containers and text files, which many programs write, come after them.
+# Readers are listed in the order in which they are tried. Formats with their own signature come first. After
+# them come containers and text files, which many programs write.
 _READERS = [
     gsf.READER,
     gwy.READER,
@@ -33,7 +33,7 @@ def formats() -> tuple[str, ...]:
 
 
 def register_reader(reader: Reader) -> Reader:
-    """Register a reader for another format. It is tried before the existing readers.
+    """Register a reader for another format. The new reader is tried before the existing readers.
 
     A build may start several processes, and each of them must register the reader. Therefore, call this
     function in a plug-in, or at the top level of the script that starts the build.

@@ -1,5 +1,5 @@
-"""Read Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7). Their rows run from
-bottom to top.
+"""Read grids of Golden Software's Surfer, in the formats DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7).
+The rows in these files run from bottom to top.
 """
 
 import struct
@@ -11,14 +11,14 @@ from litho_data.foundation import Array, InputError
 from litho_data.readers.reader import Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
-# Pixels with at least this value are blank (not measured). It lies below the value in files with float32 and
-# in text files, which is 1.70141e38.
+# Pixels with at least this value are blank (not measured). The mark in text files and in files with float32
+# is 1.70141e38, which is slightly larger.
 _BLANK = 1.7014e38
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Return the only channel of the file, a grid. The coordinates in the file are those of pixel centres,
-    and their unit is not stated.
+    """Return the only channel of the file, which is a grid of heights. The file states the coordinates of
+    pixel centres, without a unit.
 
     Raises:
         InputError: the file is not a Surfer grid.
@@ -33,7 +33,8 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _older(raw: bytes) -> tuple[Array, float, float, float]:
-    """Return the heights, the steps along y and x, and the value of blank pixels, from a DSAA or DSBB file.
+    """Read a DSAA or DSBB file. Return the heights, the steps along y and x, and the value that marks blank
+    pixels.
 
     The file states the numbers of columns and rows, followed by the ranges of x, y and z and the heights.
     """
@@ -49,7 +50,7 @@ def _older(raw: bytes) -> tuple[Array, float, float, float]:
 
 
 def _sections(raw: bytes) -> tuple[Array, float, float, float]:
-    """Return the heights, the steps along y and x, and the value of blank pixels, from a DSRB file.
+    """Read a DSRB file. Return the heights, the steps along y and x, and the value that marks blank pixels.
 
     The file consists of sections, each with a tag, a size and a content. The section GRID contains the
     geometry, and the section DATA after it contains the heights.

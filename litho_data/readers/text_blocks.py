@@ -1,4 +1,4 @@
-"""Divide text files into blocks of numbers, and assign to each block the lines of words above it."""
+"""Divide text files into blocks of numbers. The lines of words above a block become its header."""
 
 import codecs
 import re
@@ -30,8 +30,8 @@ _QUOTED = re.compile(r'"([^",\n]*)"')
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = table_beside(__file__, "words.toml")
 _KEYS: dict[str, list[str]] = WORDS["keys"]
-# The unit in the title of a column or of the whole table, as in "Height [nm]". A title that is followed by a
-# number, as in "Height [nm]: 50", states a length and not the unit of the values.
+# Matches the unit in the title of a column or of the whole table, as in "Height [nm]". If a number follows,
+# as in "Height [nm]: 50", the line states a length and not the unit of the values.
 _TITLED = re.compile(
     r"\b(?:z|h\d*|heights?|topography|höhe|hauteur|altura|altezza)"
     r"(?>(?:\b(?: (?:image|map|data|values?))?\s*(?:in\s+|[\[(]\s*)|_)([^\])\s:=,;]{1,12})[\])]?)"
@@ -43,7 +43,7 @@ _SCALES = re.compile(
     r"bit2nm|(scale|conversion|calibration)[ _-]?factor|^(multiplier|scale|factor|lsb)\b|"
     r"(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
 )
-# A scale in prose: "multiply by 10", "heights in 0.1 nm".
+# Matches a scale in prose, such as "multiply by 10" or "heights in 0.1 nm".
 _SCALE_IN_WORDS = re.compile(
     r"\b(multipl(y|ied)|divided?) by\b|\b(counts?|digits?|bits?|lsb)\s*=\s*\d[\d.e-]* ?([nuµμ]?m|Å)\b|"
     r"\b(z|heights?|values?|data)\b.{0,8}(\bin|\bx|[×*]) ?(?!1 )\d[\d.e^-]* ?([nuµμ]?m|Å)\b",
@@ -55,9 +55,9 @@ _SCALE_IN_WORDS = re.compile(
 class Block:
     """A block of consecutive lines of numbers, with the header that stands above it.
 
-    ``header`` maps the keys of the header's lines to their values, and ``words`` contains these lines as they
-    stand. ``rows`` contains the lines of numbers as text, and ``first_line`` is the number of the first of
-    them in the file.
+    ``header`` maps the keys in the header's lines to their values, and ``words`` contains these lines
+    unchanged. ``rows`` contains the lines of numbers as text. ``first_line`` is the line number, in the file,
+    of the first of these rows.
     """
 
     header: dict[str, str]
@@ -88,7 +88,7 @@ class Block:
         return self.first("unit").strip("[]() ") or next(iter(lengths + others), None)
 
     def require_pixels(self, shape: Shape) -> None:
-        """Check that the numbers of rows and columns are those that the header states, if it states them.
+        """If the header states the numbers of rows and columns, check that ``shape`` agrees with them.
 
         Raises:
             InputError: the header states other numbers.
@@ -100,7 +100,7 @@ class Block:
 
     @property
     def factor(self) -> float | None:
-        """Return the factor that converts the values to metres, or None if the header gives none.
+        """Return the factor that converts the values to metres, or None if the header states no such factor.
 
         Raises:
             InputError: the header gives a scale of an unknown kind.
@@ -223,7 +223,7 @@ def is_row(line: str) -> bool:
     """Return whether a line is a row of numbers, which means that it is not a comment and that at least half
     of its cells are numbers.
 
-    A line that repeats a single word is also a row, of missing pixels only, unless the word is a unit.
+    A line that repeats a single word is a row of missing pixels, unless the word is a unit.
     """
     if _COMMENT.match(line) or not line.strip():
         return False
@@ -261,8 +261,8 @@ def _note(line: str, header: dict[str, str], number_of_line: int) -> None:
 
 
 def number(text: str) -> float:
-    """Return the number at the start of a text, or NaN if there is none. It may have a decimal comma and an
-    exponent as in Fortran.
+    """Return the number at the start of a text, or NaN if there is none. The number may be written with a
+    decimal comma, and with an exponent as in Fortran.
     """
     found = NUMBER.match(text.strip())
     return float(re.sub("[dD]", "e", found[0]).replace(",", ".")) if found else float("nan")

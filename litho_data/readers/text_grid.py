@@ -1,5 +1,5 @@
-"""Find the coordinates in a table of numbers. They are axes in the first row and column, or the x and y of
-points that fill a grid.
+"""Find the coordinates in a table of numbers. Coordinates are axes in the first row and column, or columns
+with the x and y of points that fill a grid.
 """
 
 import re
@@ -10,10 +10,12 @@ import numpy as np
 
 from litho_data.foundation import YX, Array, InputError, is_length, um_per
 
-# Coordinates are written with few digits, so a step may differ from the mean step by this share of it.
+# Coordinates are written with few digits, so a step may differ from the mean step by this share of the mean
+# step.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# A single axis, or a pair of axes with uneven steps, counts as an axis only from this many numbers on.
+# A first row or column alone, or a pair of both with uneven steps, is recognised as an axis only if it has at
+# least this many numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -30,9 +32,9 @@ class Map:
     """A map of heights without its axes, with row 0 at the top and x to the right.
 
     ``size_um`` contains the side lengths (y, x) in µm, if the table states them with a unit. ``extent``
-    contains them if the table states them without a unit. ``x_is`` says in words which direction in the file
-    runs along x. ``corner`` is true if the first cell of the table does not belong to the map, so that it may
-    contain a word.
+    contains the side lengths (y, x) in the unit of the coordinates, which the table may not state. ``x_is``
+    says in words which direction in the file runs along x. ``corner`` is true if the first cell of the table
+    does not belong to the map. This cell may then contain a word.
     """
 
     values: Array
@@ -47,8 +49,8 @@ def without_axes(values: Array, words: Sequence[str]) -> Map:
     """Remove from a matrix the first row and column if they contain coordinates or pixel numbers.
 
     Evenly spaced numbers are taken as coordinates, unless the next row or column has the same spacing. In
-    that case both belong to the map, because neighbouring lines of a map are alike. The numbers 0, 1, 2, …
-    (or 1, 2, 3, …) count pixels and say nothing about lengths.
+    that case, both lines belong to the map, because neighbouring lines of a map are alike. The numbers 0, 1,
+    2, … (or 1, 2, 3, …) count pixels and say nothing about lengths.
 
     Raises:
         InputError: the first row and column look like coordinates that are not evenly spaced, or the
@@ -110,7 +112,7 @@ def _counts(line: Array) -> bool:
 
 def _size_um(words: Sequence[str], extent: YX) -> YX | None:
     """Return the size (y, x) in µm if the words above the numbers give a unit for x, otherwise None. If they
-    give no unit for y, it has the unit of x.
+    give no unit for y, the unit of x is used for y.
     """
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
@@ -122,8 +124,8 @@ def _size_um(words: Sequence[str], extent: YX) -> YX | None:
 def _columns(words: Sequence[str], count: int) -> list[int]:
     """Return the numbers of the columns that contain x, y and z.
 
-    The columns are found by the words above them. Without such words, a table of three columns is taken as x,
-    y, z. In all other cases the list is empty.
+    The columns are identified by the words above them. Without such words, the columns of a table with three
+    columns are taken as x, y and z. In all other cases, the list is empty.
     """
     for text in words:
         names = _GAPS.split(_IN_UNIT.sub("", text[:200].lower()).strip("#% "))

@@ -13,15 +13,15 @@ from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# A table with few columns and many rows contains points, not the lines of a map. A table is long enough to
-# count as points if it has at most this many columns and at least this many rows per column.
+# A table with few columns and many rows may contain points instead of the lines of a map. It may if it has at
+# most this many columns and at least this many rows per column. The two pairs of limits are alternatives.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
 _IGOR = "IGOR\n"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """Read one channel per block of numbers. Its unit and size are known only if the lines above the numbers
-    state them.
+    """Read one channel per block of numbers. The unit and the size of a channel are known only if the lines
+    above its numbers state them.
 
     Lines of words, and lines that start with ``#`` or ``%``, are the header of the numbers below them. If the
     first row and column contain coordinates, they are taken as axes. A table of points that fill a regular
@@ -103,7 +103,7 @@ def write_text_matrix(path: str | Path, height_um: Array) -> None:
 
 
 def _recognises(path: Path, head: bytes) -> bool:
-    """Return whether the file begins like a text with rows of at least two numbers.
+    """Return whether the first bytes of the file are text that contains rows of at least two numbers.
 
     Raises:
         InputError: the rows are the points of a profile or of a point cloud, which is not a map.

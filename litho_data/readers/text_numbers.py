@@ -1,5 +1,5 @@
-"""Convert rows of text to numbers. Separators, decimal commas and words are handled, and damage is
-detected.
+"""Convert rows of text to numbers. The rows may have different kinds of separators, decimal commas, and words
+in place of numbers. Damaged rows are detected.
 """
 
 import io
@@ -26,8 +26,9 @@ _TRUNCATED = "the file may be truncated"
 class Table:
     """A table of numbers read from text.
 
-    ``values`` has shape (rows, columns), with NaN in place of words. ``words`` maps every word, except one in
-    the first cell, to the line where it first occurs. ``corner`` is the word in the first cell, or None.
+    ``values`` has shape (rows, columns), with NaN in place of words. ``words`` maps every word in the table
+    to the line where it first occurs. A word in the first cell is left out. ``corner`` is the word in the
+    first cell, or None.
     """
 
     values: Array
@@ -64,7 +65,8 @@ def _numbers(text: str, first_line: int) -> Table:
 
 
 def _plain(text: str, first_line: int) -> tuple[str, str | None]:
-    """Return the text with decimal points, and the separator between its cells. None stands for any blanks.
+    """Return the text with decimal points in place of decimal commas, and the separator between its cells. If
+    the separator is None, the cells are separated by any blanks.
 
     Commas are taken as separators only if nothing else separates the cells. Otherwise they are decimal
     commas, and the text must not contain decimal points.
@@ -118,8 +120,8 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
 def _refuse_decimal_commas(text: str, first_line: int) -> None:
     """Reject rows like ``0,9000,0,3100``, where commas seem to be both decimal commas and separators.
 
-    The sign of this is that all cells in even places have the same number of digits, and cells in odd places
-    have other numbers of digits.
+    Such rows are recognised by the numbers of characters. All cells in even places have the same number of
+    characters, and no cell in an odd place has this number.
     """
     if "." in text:
         return

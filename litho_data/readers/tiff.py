@@ -24,7 +24,7 @@ _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _ORIENTATION, _UPRIGHT = 274, 1
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
-# Some instrument makers store the heights in private tags, beside a picture of them.
+# Some instrument makers store the heights in private tags, in addition to a picture of the heights.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
 _LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
@@ -39,8 +39,9 @@ def read_channels(path: Path) -> list[Channel]:
 
     The pixel size is taken from OME metadata. Without them, it is taken from the resolution tags, but only if
     ImageJ names their unit. Otherwise, these tags usually describe a print on paper and not the sample. If
-    ImageJ or GDAL stored a calibration of the values, it is applied; other values stay as stored. GDAL's
-    no-data value marks missing pixels. Copies of a page at reduced resolution are skipped.
+    ImageJ or GDAL stored a calibration of the values, it is applied. Without a calibration, values are
+    returned as stored. GDAL's no-data value marks missing pixels. Copies of a page at reduced resolution are
+    skipped.
 
     Raises:
         InputError: the file is damaged.
@@ -59,7 +60,9 @@ def read_channels(path: Path) -> list[Channel]:
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[TiffFile]:
-    """Open a TIFF file. Any error that a damaged file causes in the block becomes an InputError."""
+    """Open a TIFF file for use in a ``with`` block. Any error that a damaged file causes in the block is
+    raised as an InputError.
+    """
     import tifffile
 
     with foreign_parser("TIFF"), tifffile.TiffFile(path) as file:
@@ -78,8 +81,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Return the instrument maker's format of this TIFF, which its tags reveal, by the name that
-    SurfaceTopography uses. Return an empty text if the tags belong to no such format.
+    """Return the name of the instrument maker's format to which the tags of this TIFF belong. It is the name
+    that SurfaceTopography uses. Return an empty text if the tags belong to no such format.
     """
     try:
         with open_tiff(path) as file:
@@ -127,7 +130,8 @@ def _may_hold_heights(tag: Any, shape: Shape) -> bool:
 
 
 def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str | None, float | None]:
-    """Return the scale, offset, unit and no-data value of a page; height = scale · value + offset.
+    """Return the scale, offset, unit and no-data value of a page. Heights are computed as scale · value +
+    offset.
 
     Raises:
         InputError: ImageJ's calibration is not a straight line, or the page's description contains a scale
@@ -155,7 +159,9 @@ def _calibration(page: Any, imagej: dict[str, Any]) -> tuple[float, float, str |
 
 
 def _plain_text(description: str) -> str:
-    """Return a page's description as lines of text. JSON is converted to lines ``key: value``."""
+    """Return a page's description as lines of text. A description in JSON is converted to lines of the form
+    ``key: value``.
+    """
     try:
         return "\n".join(f"{key}: {value}" for key, value in json.loads(description).items())
     except (ValueError, AttributeError):  # no JSON, or no object
@@ -171,7 +177,7 @@ def _ome_pitches_um(text: str, pages: int) -> list[YX | None]:
 
     The pages of the first image come first, then those of the second, and so on. The number of pages of an
     image is the product of its sizes in z, channel and time. If these numbers do not add up to the number of
-    pages, every entry is None.
+    pages in the file, every entry of the result is None.
     """
     pitches: list[YX | None] = []
     for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):

@@ -61,8 +61,8 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
-    """Return the formats whose signature the file has. They have the names that SurfaceTopography gives
-    them.
+    """Return the names of the formats whose signature the file has. They are the names that SurfaceTopography
+    uses.
     """
     signed = tuple(kind for kind, starts in _STARTS.items() if head.startswith(starts))
     if is_tiff(head):
@@ -79,8 +79,8 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Return whether a file begins with the header of an Igor wave: a known version number and a correct
-    checksum. For version 5, the usual one, the checksum is not tested.
+    """Return whether a file begins with the header of an Igor wave. Such a header has a known version number
+    and a correct checksum. For version 5, which is the usual version, the checksum is not tested.
     """
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
@@ -90,7 +90,7 @@ def _is_igor(head: bytes) -> bool:
 
 
 def _recognise(path: Path) -> str:
-    """Return the file's format, by the name that SurfaceTopography gives it.
+    """Return the name that SurfaceTopography uses for the file's format.
 
     Several formats may share a signature. The result is the first format with the file's signature whose
     reader can open the file.
@@ -118,8 +118,8 @@ def _recognise(path: Path) -> str:
 
 
 def _require_whole_igor_file(path: Path, head: bytes) -> None:
-    """Reject an Igor wave of version 5 that is shorter than its header states. The library igor2 does not
-    check such headers, so it could try to read gigabytes.
+    """Reject an Igor wave of version 5 whose file is shorter than its header states. The library igor2 does
+    not check the sizes in such headers, so it could try to read gigabytes.
     """
     order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
     if order is None:
@@ -167,7 +167,7 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
 
     SurfaceTopography indexes heights [x, y], with y downwards, so they are transposed here.
     """
-    # SurfaceTopography requires a size even if the file has none; the heights do not depend on it.
+    # SurfaceTopography requires a size even if the file states none. The heights do not depend on this size.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
@@ -185,8 +185,8 @@ def _flatten(content: Facts, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _vendor_header(path: Path, kind: str) -> dict[str, str]:
-    """Return the complete header of an Igor wave or a Nanoscope file, because SurfaceTopography passes on
-    only parts of it. Return an empty dictionary for other formats.
+    """Return the complete header of an Igor wave or a Nanoscope file. SurfaceTopography returns only parts of
+    these headers. For other formats, return an empty dictionary.
     """
     if kind == "ibw":
         return _igor_note(path)
@@ -207,9 +207,9 @@ def _fast_axis(header: dict[str, str]) -> Axis | None:
 
 
 def _layer_names(path: Path, kind: str) -> list[str]:
-    """Return the labels of the layers of an Igor wave; the list is empty for other formats.
+    """Return the labels of the layers of an Igor wave. For other formats, the list is empty.
 
-    They are read here because SurfaceTopography drops the label if there is only one layer.
+    The labels are read here because SurfaceTopography drops the label if there is only one layer.
     """
     if kind != "ibw":
         return []
@@ -232,8 +232,8 @@ def _igor_note(path: Path) -> dict[str, str]:
 
 
 def _nanoscope_header(path: Path) -> dict[str, str]:
-    """Return the entries of a Nanoscope header by ``section/key``. Sections with the same name are
-    numbered.
+    """Return the entries of a Nanoscope header, keyed by ``section/key``. If sections have the same name, a
+    number is added to the name.
     """
     with path.open("rb") as stream:
         raw = stream.read(_LONGEST_HEADER)

@@ -1,7 +1,7 @@
 """Read Wyko ASCII files.
 
-A header of tab-separated cells is followed by blocks of numbers, in wavelengths or nm. The word ``Bad`` marks
-missing pixels.
+Such a file consists of a header of tab-separated cells, followed by blocks of numbers. Heights are in
+wavelengths or in nm. The word ``Bad`` marks missing pixels.
 """
 
 from pathlib import Path
@@ -23,8 +23,8 @@ def read_channels(path: Path) -> list[Channel]:
     """Return one channel per block of numbers. A flag in the first line says whether heights are in nm or in
     wavelengths.
 
-    In this format, a line of the file contains a column of the map, from bottom to top. If the numbers of
-    lines and cells show that each line contains a row instead, the file is read row by row.
+    In this format, a line of the file contains a column of the map, from bottom to top. However, if the
+    numbers of lines and cells show that each line contains a row of the map, the file is read row by row.
 
     Raises:
         InputError: the header does not state the wavelength although heights are in wavelengths, or a block
