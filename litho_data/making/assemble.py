@@ -223,7 +223,7 @@ def files_table(source: Source, records: Mapping[str, Facts], skipped: Mapping[s
         source: everything from which the records were made. The raw files and the ids that lack a scan or a
             layout are taken from it.
         records: records of the finished scans, keyed by the id of the scan.
-        skipped: reasons why scans are not in the store, by id.
+        skipped: reasons why scans are not in the store, keyed by the id of the scan.
 
     Returns:
         A table with the columns ``path``, ``scan``, ``status`` (ok, skipped or unpaired), ``reason``,

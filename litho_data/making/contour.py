@@ -2,9 +2,9 @@
 heights.
 
 In a micrograph, the film is brighter than the ground, and its rim is brightest. Charging changes the
-brightness from place to place. The edge is therefore placed where the brightness is half way between those of
-the ground and the rim nearby. This position is a convention. The wall of the film may lie at another point on
-the flank of the bright rim, and a micrograph cannot show at which point.
+brightness from place to place. The edge is therefore placed where the brightness is half way between the
+brightness of the ground nearby and that of the rim nearby. This position is a convention. The wall of the
+film may lie at another point on the flank of the bright rim, and a micrograph cannot show at which point.
 """
 
 from typing import NamedTuple

@@ -13,8 +13,8 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs, with the estimated radius of the tip in their card if the card asks for an estimate by
-    ``tip = "blind"``.
+    """Return the jobs. If their card asks for an estimate of the tip's radius by ``tip = "blind"``, the
+    estimated radius replaces "blind" in the card.
 
     If the scans set no limit on the radius, the jobs are returned without a tip. The estimate is also printed
     on stderr. Scans that cannot be read are not used for the estimate. The build reports later why they

@@ -238,7 +238,9 @@ def _register(params: Params, _: Files, arrays: Inputs) -> Made:
 
 
 def _as_arrays(found: Registration) -> dict[str, Array]:
-    """Return the arrays of a registration by their names in the store: matrix, bend and mask of defects."""
+    """Return the arrays of a registration, keyed by their names in the store. They are the matrix, and if
+    present the bend and the mask of defects.
+    """
     made = {"scan_to_layout": found.scan_to_layout}
     if found.bend_um is not None:
         made["bend_um"] = found.bend_um.amount

@@ -142,7 +142,7 @@ def _of_a_scan(record: Facts, spread_nm: Mapping[str, float]) -> Iterator[tuple[
 def _of_the_card(
     records: Sequence[Facts], prints: Sequence[Print], card: Card
 ) -> Iterator[tuple[str, str, Weight]]:
-    """Yield contradictions between the scans and the numbers in the card.
+    """Yield contradictions between the measured scans and the numbers in the card.
 
     Each contradiction consists of the id of the scan that it concerns (or "all scans"), a text and a weight.
     """

@@ -22,8 +22,8 @@ _STL_HEADER_BYTES = 80
 
 
 def export_of(file: Path) -> dict[str, Any]:
-    """Return the content of the sidecar that the design package wrote beside an exported file. It is empty if
-    the file has no such sidecar.
+    """Return the content of the sidecar that the design package wrote beside an exported file. The result is
+    empty if the file has no such sidecar.
 
     Raises:
         InputError: the file is not the one that the sidecar describes, because its SHA-256 differs.

@@ -1,4 +1,4 @@
-"""Read Gwyddion's own files. Every data field becomes a channel, and its mask is kept."""
+"""Read files in Gwyddion's own format, GWY. Every data field becomes a channel, and its mask is kept."""
 
 import re
 import struct

@@ -1,5 +1,5 @@
-"""Handle missing pixels. A file may mark them with a number or a word, and the caller must state these
-marks.
+"""Handle missing pixels. A file may mark missing pixels with a number or a word, and the caller must state
+these marks.
 """
 
 from collections.abc import Sequence

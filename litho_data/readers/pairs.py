@@ -21,7 +21,7 @@ GREY_MAX = 255
 def stitch_field(
     files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
 ) -> dict[str, Array]:
-    """Join the quadrants of one field, and return the arrays of the field by name.
+    """Join the quadrants of one field, and return the arrays of the field, keyed by name.
 
     Args:
         files: the images of the layout, followed by the images of the heights. Both groups are in the order

@@ -122,8 +122,8 @@ class Block:
         return [number(stated)] if NUMBER.match(stated) else []
 
     def size_um(self, shape: Shape) -> YX | None:
-        """Return the size (y, x) in µm if the header states the pixel size or both side lengths, otherwise
-        None.
+        """Return the size (y, x) in µm if the header states the pixel size or the lengths of both sides.
+        Otherwise return None.
         """
         if pitch := _length_um(self.first("pixelsize", "xycalibration")):
             return shape[0] * pitch, shape[1] * pitch
@@ -135,7 +135,7 @@ def refuse_scales(header: Mapping[str, str]) -> None:
     """Reject a header that contains a scale of a kind that no known format uses.
 
     Raises:
-        InputError: the header has such a scale.
+        InputError: the header contains a scale of an unknown kind.
     """
     for key, value in header.items():
         if _SCALES.search(key.lower()) and NUMBER.match(value) and number(value) not in (0.0, 1.0):

@@ -111,8 +111,8 @@ def _counts(line: Array) -> bool:
 
 
 def _size_um(words: Sequence[str], extent: YX) -> YX | None:
-    """Return the size (y, x) in µm if the words above the numbers give a unit for x, otherwise None. If they
-    give no unit for y, the unit of x is used for y.
+    """Return the size (y, x) in µm if the words above the numbers give a unit for x. Otherwise return None.
+    If the words give no unit for y, the unit of x is used for y.
     """
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}

@@ -37,11 +37,11 @@ _WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "
 def read_channels(path: Path) -> list[Channel]:
     """Read one channel per page. In an RGB page, the three samples of each pixel must be identical.
 
-    The pixel size is taken from OME metadata. Without them, it is taken from the resolution tags, but only if
-    ImageJ names their unit. Otherwise, these tags usually describe a print on paper and not the sample. If
-    ImageJ or GDAL stored a calibration of the values, it is applied. Without a calibration, values are
-    returned as stored. GDAL's no-data value marks missing pixels. Copies of a page at reduced resolution are
-    skipped.
+    The pixel size is taken from OME metadata. Without OME metadata, it is taken from the resolution tags, but
+    only if ImageJ's metadata name the unit of these tags. Otherwise, these tags usually describe a print on
+    paper and not the sample. If ImageJ or GDAL stored a calibration of the values, it is applied. Without a
+    calibration, values are returned as stored. GDAL's no-data value marks missing pixels. Copies of a page at
+    reduced resolution are skipped.
 
     Raises:
         InputError: the file is damaged.

@@ -194,7 +194,7 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 
 
 def _fast_axis(header: dict[str, str]) -> Axis | None:
-    """Return ``"x"`` if the header of an Asylum file gives a scan angle of 0° or 180°, otherwise None.
+    """Return ``"x"`` if the header of an Asylum file gives a scan angle of 0° or 180°. Otherwise return None.
 
     At other angles, the file does not say whether the lines follow the axes of the scanner or those of the
     scan, so the caller must state the fast axis.

@@ -24,7 +24,8 @@ _GRID = 65
 
 @dataclass(frozen=True)
 class Bend:
-    """The displacement of the points of a scan from their nominal to their true positions.
+    """The bend of a scan, i.e. the displacement of the scan's points from their nominal to their true
+    positions.
 
     The displacement is a polynomial of u and v. These are the coordinates along x and y, scaled so that they
     run from -1 to 1 over the frame of the scan.
@@ -156,7 +157,7 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def fit_bent_affine(
     points: Array, images: Array, middle: Array, half: Array, degree: int = 2
 ) -> tuple[Array, Bend]:
-    """Fit, by least squares, an affine map and a bend that together map points to their images.
+    """Fit an affine map and a bend that together map points to given images, by least squares.
 
     The model is ``images`` ≈ affine(``points`` + bend(``points``)).
 

@@ -1,4 +1,5 @@
-"""Register scans whose scanner bends the image or creeps. No straight warp fits such scans.
+"""Register scans whose scanner bends the image or creeps. No straight warp (a warp without bend or creep)
+fits such scans.
 
 A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling.
 Creep displaces the scan lines along both axes, by a smooth function of the position along the slow axis
@@ -138,7 +139,7 @@ class _Images:
     """
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """Prepare the images. Of the topography, only one row and one column in ``every`` is used. Pixel
+        """Prepare the images. Of the topography, only every ``every``-th row and column is used. Pixel
         indices of the layout refer to this coarser grid.
         """
         from scipy.ndimage import spline_filter

@@ -1,5 +1,5 @@
-"""Find areas where a scan does not show the print, because of dust, collapsed or missing parts, or lifted
-film.
+"""Find defects, i.e. areas where a scan does not show the print because of dust, collapsed or missing parts,
+or lifted film.
 
 If a warp is fitted by least squares, such an area can shift the warp by whole pixels. A defect is a connected
 area where the heights differ from what the layout predicts by many times the usual difference.

@@ -23,8 +23,8 @@ SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """The shifts of the blocks of the field relative to the warp. All arrays have shape (n, 2), with columns
-    x and y, in layout pixels.
+    """The shifts of the field's blocks relative to the positions that the warp predicts. All arrays have
+    shape (n, 2), with columns x and y, in layout pixels.
 
     ``middle_px`` contains the centres of the blocks. ``shift_px`` contains, for every block, the displacement
     of its content from the position that the warp predicts. ``held_out_px`` contains the displacement from
@@ -79,7 +79,8 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: Array, measured: Array, topography: Array
 ) -> BlockShifts:
-    """Measure the shift of every block relative to the warp, and relative to a warp fitted without the block.
+    """Measure the shift of every block of the field relative to the position that the warp predicts, and
+    relative to the position that a warp fitted without the block predicts.
 
     Args:
         refinement: the fit of the warp.

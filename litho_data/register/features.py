@@ -57,7 +57,8 @@ class Correspondence:
 
 
 def match_features(scan: Array, layout_level: Array, seed: int) -> Correspondence | None:
-    """Find ORB keypoints in both images, match them with a cross-check, and fit an affine map by MAGSAC++.
+    """Find ORB keypoints in scan and layout, match them with a cross-check, and fit an affine map to the
+    matches by MAGSAC++.
 
     Args:
         scan: heights at the layout's pitch, shape (ny, nx), NaN where not measured.

@@ -29,7 +29,8 @@ class Hypothesis:
 
 
 def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
-    """Correlate a low-resolution copy of the scan, in every orientation and polarity, with one of the layout.
+    """Correlate a low-resolution copy of the scan, in every orientation and polarity, with a low-resolution
+    copy of the layout.
 
     Args:
         scan: heights at the layout's pitch, shape (ny, nx), NaN where not measured.
@@ -154,8 +155,8 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
 
 
 def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Return the spectra of three images: the mask of measured pixels, the heights, and their squares. The
-    heights are centred and scaled to a mean square of one.
+    """Return the spectra of three images: the mask of measured pixels, the heights, and the squared heights.
+    The heights are centred and scaled to a mean square of one.
     """
     from scipy.fft import rfft2
 

@@ -38,8 +38,8 @@ class Refinement:
 
     The field is divided into cells with sides of about ``CELL_PX`` pixels. For every cell, ``gram`` contains
     the matrix of inner products of the regressors with each other and with the scan. Its shape is (cells_y,
-    cells_x, k, k). The first regressor is that of the gain, then come those of the background and of the
-    warp, and the scan comes last. These sums suffice to fit the warp again to any part of the field.
+    cells_x, k, k). The order is: the regressor of the gain, the regressors of the background, the regressors
+    of the warp, and last the scan. These sums suffice to fit the warp again to any part of the field.
     """
 
     model: Model

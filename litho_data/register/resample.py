@@ -1,4 +1,6 @@
-"""Resample a scan onto the layout's pixels in a single step. Missing pixels of the scan remain missing."""
+"""Resample a scan onto the layout's pixels by a single interpolation. Missing pixels of the scan remain
+missing.
+"""
 
 from functools import lru_cache
 

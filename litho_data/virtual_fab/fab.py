@@ -20,7 +20,7 @@ class Fab:
     """A virtual fab: a printer, a microscope, their knobs (effects that can be added) and noise, and the seed
     of all random draws.
 
-    ``cause`` is an optional effect of your own that is not a knob.
+    ``cause`` is an optional effect that you define yourself and that is not a knob.
     """
 
     printer: Printer

@@ -74,7 +74,8 @@ class Job:
 
 
 class Cause:
-    """Base class for effects of your own that are not knobs. The base class itself changes nothing.
+    """Base class for effects that you define yourself and that are not knobs. The base class itself changes
+    nothing.
 
     A subclass overrides one or more of the methods. The result of a method may depend only on its arguments,
     because a field may be printed and scanned more than once.

@@ -52,7 +52,7 @@ def simulate(
     The folder ``out/raw`` contains what a laboratory would deliver: the card, its table, the layouts and the
     scans. The folder ``out/truth`` contains what only a simulation knows: the record ``truth.json``, and the
     heights of every print, once without and once with roughness. Scans are made one at a time, so the memory
-    used does not grow with their number.
+    that is used does not grow with the number of scans.
 
     Args:
         out: folder of the run.
@@ -61,7 +61,7 @@ def simulate(
         seed: seed of all random draws of the run.
         knobs: effects that are added to plain printing and scanning, given as settings or as texts
             ``name=strength[@seed]``.
-        cause: an effect of your own that is not a knob. The truth does not record it.
+        cause: an effect that you define yourself and that is not a knob. The truth does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
         microscope: ``default`` (scans with a margin and small affine errors), ``aligned`` (scans with a
             margin only), or your own microscope.
