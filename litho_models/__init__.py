@@ -1,5 +1,5 @@
-"""Models of the printer. A model is trained on a dataset, corrected with the residuals of that dataset, and
-frozen.
+"""Models of the printer. A model is trained on a dataset, corrected with terms that explain its residuals on
+this dataset, and frozen (saved with fixed weights).
 """
 
 from typing import TYPE_CHECKING

@@ -35,9 +35,9 @@ def spot_um(pitch_um: float) -> float:
 
 
 def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: float) -> dict[str, Any]:
-    """Return the lengths of a model's configuration, scaled to the spot size for the given pitch. A length
-    that is missing in ``set_`` is scaled from its default value. If the scale is 1, the returned dict is
-    empty.
+    """Return the values of a model's length settings (such as blur widths), scaled to the spot size for the
+    given pitch. If ``set_`` contains a length, this value is scaled; otherwise the default value is scaled.
+    If the scale is 1, the returned dict is empty.
     """
     scale = spot_um(pitch_um) / FIRST_SPOT_UM
     if scale == 1:
@@ -53,8 +53,9 @@ def scaled_lengths(config: type[BaseModel], set_: dict[str, Any], pitch_um: floa
 class SimulatorConfig(BaseModel):
     """Configuration of a model: its geometry and its variant. Subclasses add their hyper-parameters.
 
-    ``VARIANT_FIELDS`` lists the fields that a variant sets. The configuration stores the values of these
-    fields. A saved model therefore stays the same if the definition of a variant changes later.
+    ``VARIANT_FIELDS`` lists the fields whose values depend on the variant. The configuration stores these
+    values, not only the name of the variant. A saved model therefore stays the same if the definition of a
+    variant changes later.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -71,7 +72,7 @@ class SimulatorConfig(BaseModel):
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
         """Make the configuration of a named variant. Values in ``fields`` (geometry or hyper-parameters)
-        replace those that the variant sets.
+        replace the values that the variant sets.
 
         Raises:
             InputError: the variant is unknown.
@@ -101,13 +102,14 @@ class Simulator(nn.Module, ABC):
     of shape (batch, 1, ny, nx), in µm.
 
     A subclass implements ``interior``. The height of a pixel may depend only on the layout within
-    ``reach_px`` pixels of it. A crop of the layout with this margin then gives the same heights as the whole
-    field.
+    ``reach_px`` pixels of it. If a part of the layout is cropped together with a margin of this width, the
+    heights of that part are the same as in the whole layout.
     """
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # True if the height is linear in the parameters. One Jacobian then serves the whole fit.
+    # True if the height is linear in the parameters. The Jacobian is then constant and is computed only once
+    # per fit.
     is_linear: ClassVar[bool] = False
 
     def __init__(self, config: SimulatorConfig):
@@ -124,12 +126,14 @@ class Simulator(nn.Module, ABC):
     @property
     @abstractmethod
     def reach_px(self) -> int | None:
-        """Return the receptive radius in pixels, or None if each pixel depends on the whole layout."""
+        """Return the receptive radius in pixels, or None if the height of each pixel depends on the whole
+        layout.
+        """
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile size of a model whose result depends on the size of its input, or None for other
-        models.
+        """Return the tile size if the result of the model depends on the size of its input. Otherwise return
+        None.
         """
         return None
 
@@ -144,14 +148,14 @@ class Simulator(nn.Module, ABC):
         """
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        """Return the height of the whole layout, µm. For this, the layout is continued beyond its edge by
+        """Return the height of the whole layout, µm. Before the computation, the layout is padded by
         repeating its outermost pixels.
         """
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Return the height, µm, that ``forward`` gives, with ``border_px`` pixels cropped on each side.
+        """Return the same height as ``forward``, µm, but with ``border_px`` pixels cropped on each side.
 
         A model without a receptive radius overrides this method if it can leave out the computation of the
         border. For models with a receptive radius, ``predict_inside`` computes only the pixels that are
@@ -167,15 +171,16 @@ class Simulator(nn.Module, ABC):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Return the allowed ranges of the model's physical values. Each key is the name of the parameter
-        that stores the value as one unlimited (raw) number. Parameters without a key have no range.
+        """Return the allowed ranges of the model's physical values. Each key is the name of a parameter,
+        which stores the physical value as one raw number without limits. Parameters that are not among the
+        keys have no range.
         """
         return {}
 
     @property
     def at_bounds(self) -> dict[str, float]:
-        """Return the physical values that lie on a bound of their range. The dict maps the name of the value
-        to this bound.
+        """Return the physical values that lie on a bound of their range, as a dict from the name of the value
+        to the bound.
         """
         parameters = dict(self.named_parameters())
         bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
@@ -188,21 +193,21 @@ class Simulator(nn.Module, ABC):
 
     @property
     def reach_um(self) -> float | None:
-        """Return the receptive radius in µm, or None if each pixel depends on the whole layout."""
+        """Return the receptive radius in µm, or None if the height of each pixel depends on the whole layout."""
         return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
 
     @property
     def parameter_count(self) -> int:
-        """Return the number of values in all parameters, fixed ones included."""
+        """Return the total number of scalar values in all parameters, including fixed parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
 
 
 def is_small(model: nn.Module) -> bool:
     """Return True if the model has at most ``SMALL_PARAMETERS`` trainable values.
 
-    Small models are fitted by least squares, unless the paper's recipe is used. The closed loop fits a small
-    base model together with the effects that it adds. Larger models are trained by stochastic gradient
-    descent, and the closed loop leaves them unchanged.
+    Small models are fitted by least squares, unless the training recipe ``paper`` is used. The closed loop
+    fits a small base model together with the effects that it adds. Larger models are trained by stochastic
+    gradient descent, and the closed loop leaves them unchanged.
     """
     return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 

@@ -1,3 +1,4 @@
-"""Blind boards. A board is a set of dataset stores simulated by the virtual fab with hidden causes. A judge
-compares the answers of a loop with these causes.
+"""Blind boards. A board is a set of dataset stores that the virtual fab (the simulated printer and
+microscope) made with hidden causes of error. A closed loop searches each store for causes, and a judge
+compares its answers with the hidden causes.
 """

@@ -1,5 +1,6 @@
 """Make a blind board and judge a loop on it. A board consists of simulated dataset stores and a record of
-their hidden causes; a loop is any program that names causes.
+their hidden causes of error. A loop is any program that reads such a store and names the causes that it
+finds.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from litho_models.boards.planting import plant, trial_jobs, write_raw
 from litho_models.boards.records import Answer, Board, Draw, Draws, Hidden, Scoreboard, Trial
 
 # Base model that the loop corrects. On the board ``singles``, the Physics model can represent every printer.
-# The board ``mixtures`` also has printers that it cannot represent, so there the loop chooses the best base
-# model.
+# The board ``mixtures`` also has printers that the Physics model cannot represent. On this board, the loop
+# therefore chooses the best base model itself.
 BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 STORES, HIDDEN, TRIALS = "stores", "hidden", "trials"
 # A function that maps a dataset store and an empty working folder to the loop's answer.
@@ -40,7 +41,8 @@ def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str
     """Draw the trials of a board.
 
     Raises:
-        InputError: no trials can be drawn with these settings, or the fields cannot be printed.
+        InputError: no trials can be drawn with these settings, or the fields have a size that cannot be
+            simulated.
     """
     # This call raises an error for impossible field sizes now, before a trial fails on them.
     Plan(n_scans, (size_px, size_px))
@@ -57,22 +59,21 @@ def new_board(
     n_scans: int = 12,
     size_px: int = 256,
 ) -> Draws:
-    """Make the dataset stores of a board in ``out/stores`` and write their causes to ``out/hidden``. An
-    interrupted call resumes.
+    """Make the dataset stores of a board in ``out/stores`` and write their causes to ``out/hidden``. If the
+    call is interrupted, repeating it resumes the work.
 
     Args:
         out: folder of the board.
-        board: ``singles`` (one cause per trial) or ``mixtures`` (two to four causes per trial); some trials
-            of either board have none. ``seed``: determines all random draws.
-        trials: number of trials to make, starting with the first drawn; None makes all.
+        board: ``singles`` (one cause per trial) or ``mixtures`` (two to four causes per trial). On each
+            board, some trials have no cause. ``seed``: determines all random draws.
+        trials: number of trials to make, starting with the first drawn trial; None makes all trials.
         n_scans: number of scans in each store; ``size_px``: side of a layout, in pixels.
 
     Raises:
         InputError: no trials can be drawn with these settings, or ``out`` holds another board.
     """
     drawn = make_draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=BASE[board])
-    # Trials that plant causes into measured prints are left out, because they need a store of measured
-    # prints.
+    # Trials that add causes to measured prints are left out, because they need a store of measured prints.
     kept = [draw for draw in drawn.trials if draw.kind != "measured"][:trials]
     draws = drawn.model_copy(update={"trials": kept})
     facts = draws.model_dump(mode="json", exclude={"schema_"})
@@ -104,15 +105,16 @@ def judge_board(
     """Give every store of a board to a loop, judge the answers of the loop, and write ``scoreboard.json`` and
     ``scoreboard.csv``.
 
-    If the loop raises an error, only the current trial fails. An interrupted call resumes.
+    If the loop raises an error, only the current trial counts as failed, and the next trial is run. If the
+    call is interrupted, repeating it resumes the work.
 
     Args:
         board: folder written by ``new_board``.
         out: folder for the results; the files that the loop writes are kept in one folder per trial.
         loop: function that receives the path of a store and of an empty folder and returns an answer; by
             default the closed loop of this package.
-        name: name of the loop, written to the scoreboard. If ``out`` holds the trials of a loop with another
-            name, an error is raised.
+        name: name of the loop, which is written to the scoreboard. If ``out`` holds results of a loop with
+            another name, an error is raised.
         report: function that receives the progress messages of the default loop.
 
     Raises:
@@ -190,8 +192,9 @@ def cpu_s() -> float:
 
 
 def trial_line(trial: Trial) -> str:
-    """Describe a judged trial in one line: the outcome of each planted cause, the causes named wrongly, the
-    error of the corrected model, and the reason if the trial failed.
+    """Describe a judged trial in one line. The line states the outcome of each planted cause, the causes that
+    the loop named wrongly and the error of the corrected model. For a failed trial, it also states the reason
+    for the failure.
     """
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false name: {name}" for name in trial.false_names]

@@ -20,23 +20,25 @@ from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest and largest drawn size of a cause. The strength that gives this size is found on four scans.
-# Measured on all scans, the size may turn out 13 % smaller, and the cause must still be large enough to
-# count.
+# Smallest and largest drawn size of a cause. The strength that gives the drawn size is found on four scans.
+# Measured on all scans, the size may be 13 % smaller. The smallest size is chosen so that the cause even then
+# exceeds the size from which causes count.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
-# Number of mixtures of each kind: LINEAR have a linear slope loss whose strength differs by batch; S_SHAPED
-# have an S-shaped scanner axis in half of the scans; GROUPED have another cause whose strength differs by
-# batch or field; BEYOND_PHYSICS have a printer that the Physics model cannot imitate.
+# Number of trials of each kind on the board ``mixtures``: LINEAR have a linear slope loss whose strength
+# differs by batch; S_SHAPED have an S-shaped scanner axis in half of the scans; GROUPED have another cause
+# whose strength differs by batch or field; BEYOND_PHYSICS have a printer that the Physics model cannot
+# imitate.
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
-# These knobs are not drawn. Line roughness is part of the default noise. Of long-range proximity, less than
-# 10 nm remains after the base model is refitted.
+# These knobs (settings of the virtual fab that plant a cause) are not drawn. Line roughness is already part
+# of the default noise. Long-range proximity leaves a residual of less than 10 nm after the base model is
+# refitted.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# Some of these causes differ randomly between scans, and the others do not change the height map. One model
-# of all scans therefore cannot contain them.
+# Some of these causes differ randomly from scan to scan, and the others do not change the height map. A
+# single model of all scans therefore cannot represent them.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -47,8 +49,8 @@ _OF_SINGLE_SCANS = {
 }
 # The measured prints may already have these causes, so finding them would prove nothing.
 _MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
-# These knobs were added after the first boards were published. They are not drawn, so that a seed still gives
-# the same board.
+# These knobs were added after the first boards were published. They are not drawn, so that each seed still
+# gives the same board as before.
 _LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
 # Ranges from which the parameters of the printers are drawn. They lie around the defaults of the virtual fab
 # and within the bounds of the Physics model.
@@ -64,8 +66,9 @@ _PRINTER_RANGES = {
 def draw_board(board: Board, seed: int) -> list[Draw]:
     """Draw the trials of a board. They are in random order, and each has its own printer parameters.
 
-    Each knob and each form is used once before any is used again. A trial is an ``alias`` if its cause is a
-    knob that the base model can imitate or that the per-scan terms absorb. A trial with any other knob is
+    Each knob (setting of the virtual fab) and each form (law that the loop's catalogue does not contain) is
+    used once before any of them is used again. The kind of a trial is ``alias`` if its cause is a knob whose
+    effect the base model can imitate or the per-scan terms can absorb. With any other knob, the kind is
     ``in-form``. The sizes of the causes are drawn log-uniformly.
 
     Raises:
@@ -124,8 +127,8 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 def _draw_mixtures(rng: Rng) -> list[Draw]:
     """Draw the trials of the board ``mixtures``.
 
-    The loop's catalogue contains the form of about half of the causes. No two causes of a trial have a right
-    name in common.
+    About half of the causes have a form that is in the loop's catalogue. No name counts as the right answer
+    for two causes of the same trial.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -161,8 +164,8 @@ def _draw_mixtures(rng: Rng) -> list[Draw]:
 
 
 def _in_groups(cause: CauseDraw, at: int, rng: Rng) -> CauseDraw:
-    """Make the strength of a cause differ by batch or by field if trial number ``at`` is among the first of
-    the board ``mixtures``.
+    """For the first trials of the board ``mixtures``, make the strength of a cause differ by batch or by
+    field. ``at`` is the number of the trial. In later trials, the cause stays unchanged.
     """
     if at < LINEAR:
         return _by_batch(cause, rng)
@@ -201,8 +204,8 @@ def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
 
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
-    """Draw causes from ``deck`` until there are ``size``, starting from those in ``started``. Skip a cause if
-    one of its right names is in ``refused`` or belongs to an earlier cause.
+    """Draw causes from ``deck`` and add them to those in ``started`` until there are ``size`` causes. Skip a
+    cause if one of its right names is in ``refused`` or belongs to an earlier cause.
     """
     names = list(started)
     while len(names) < size:

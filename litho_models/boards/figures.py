@@ -15,8 +15,8 @@ from litho_data.foundation.run_facts import run_info
 from litho_models.boards.other_forms import FORMS
 from litho_models.boards.records import COUNTS_FROM_RMS_NM, Draws, Kind, Outcome, Scoreboard, Trial, Verdict
 
-# Largest accepted error of the model corrected with the findings, as a multiple of the error of the true
-# models.
+# Largest accepted error of the model that was corrected with the loop's findings, as a multiple of the error
+# of the true models.
 TOLERANCE: dict[Kind, float] = {"other-form": 1.3, "mixture": 1.15}
 TOLERANCE_OF_THE_REST = 1.05
 _NAMED: tuple[Verdict, ...] = ("right", "set-contains-it")
@@ -52,8 +52,8 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
 
 
 def share(hits: Iterable[bool]) -> str:
-    """Format how many values are True and how many there are, with the exact (Clopper-Pearson) 95 %
-    confidence interval of this share.
+    """Return a text with the number of True values, the number of all values, and the exact (Clopper-Pearson)
+    95 % confidence interval of the share of True values.
     """
     known = [*hits]
     if not known:
@@ -76,8 +76,8 @@ def counted(trials: Iterable[Trial]) -> list[Outcome]:
 
 
 def figures_of(scoreboard: Scoreboard) -> list[Figure]:
-    """Compute the headline results. In a failed trial, no cause counts as found, and the error counts as
-    above its tolerance.
+    """Compute the headline results. In a failed trial, no cause counts as found, and the error of the
+    corrected model counts as above its tolerance.
     """
     trials = scoreboard.trials
     figures = (_of_singles if scoreboard.board == "singles" else _of_mixtures)(trials)
@@ -115,8 +115,8 @@ def figure_lines(scoreboard: Scoreboard) -> list[str]:
 
 
 def reaches_floor(trial: Trial) -> bool:
-    """Return True if the error of the model corrected with the findings is within the tolerance of this kind
-    of trial. Return False if the error is unknown.
+    """Return True if the error of the model that was corrected with the loop's findings is within the
+    tolerance for this kind of trial. Return False if the error is unknown.
     """
     ratio = trial.errors.ratio if trial.errors else None
     return ratio is not None and ratio <= TOLERANCE.get(trial.draw.kind, TOLERANCE_OF_THE_REST)

@@ -22,8 +22,8 @@ from litho_models.loop.errors import error_rows
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.grouped import label_of
 
-# For these forms, a right name counts only if the confidence interval of the exponent found contains this
-# value.
+# For these forms, a right name counts only if the loop also states an exponent whose confidence interval
+# contains this value.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
 # This form consists of line offsets, so a loop that reports line offsets has noticed it.
@@ -31,7 +31,7 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Return the findings without those that the default noise of the fab causes in every scan, such as
+    """Return the findings without the effects that are part of the fab's default noise in every scan, such as
     datum, bow or line offsets.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
@@ -74,9 +74,10 @@ def judge(
 ) -> list[Outcome]:
     """Return one outcome per planted cause, in the order of the causes.
 
-    If nothing was planted, the list has one outcome, which holds for the whole trial.
+    If nothing was planted, the list contains a single outcome for the whole trial.
 
-    Each finding counts for at most one cause. Larger causes are matched with the findings first.
+    Each finding is matched with at most one cause. The causes are matched in order of size, the largest
+    first.
     """
     found = answer.found
     left = answer.left or bool(_beyond_noise(found))
@@ -107,8 +108,8 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the names that the loop gave wrongly: each is a finding whose set of names contains no planted
-    cause. The form that changes the printer (the draw's ``base``) also counts as planted.
+    """Return the findings that are wrong, which are those whose set of names contains no planted cause. The
+    form that changes the printer (``base`` of the draw) also counts as a planted cause.
     """
     return [
         " | ".join(named.names)
@@ -132,8 +133,8 @@ def _is_right(one: Planted, named: Found) -> bool:
 def _displacement_is_shared(
     one: Planted, answer: Answer, jobs: Sequence[Job], scans: Sequence[PrintedScan]
 ) -> bool:
-    """Return True if the loop found a displacement along x that is shared by groups of scans, and none of
-    these groups mixes strongly and weakly displaced scans.
+    """Return True if the loop found that groups of scans share a displacement along x, and if none of these
+    groups contains both strongly and weakly displaced scans.
     """
     strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
     for grouping in answer.displaced_by:
@@ -145,8 +146,9 @@ def _displacement_is_shared(
     return False
 
 
-# One model of all scans cannot predict rounding, scars at random positions, or values that are drawn anew for
-# every scan or line. Bends of the scans are not listed, because the transforms in the store contain them.
+# A single model of all scans cannot predict rounding, scars at random positions, or values that are drawn
+# anew for every scan or line. Bends of the scans are not listed here, because the registration transforms in
+# the store already contain them.
 _UNFORESEEABLE = {
     "datum-offset",
     "min-to-zero-datum",
@@ -163,11 +165,12 @@ _UNFORESEEABLE = {
 def true_floor(
     draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int = 0
 ) -> float:
-    """Return the mean absolute error, nm, of the true models, with one term (the datum) fitted to each scan.
+    """Return the mean absolute error, nm, that remains if the true causes are known exactly. One term (the
+    datum) is fitted to each scan.
 
-    The predictions of the true models are noise-free scans that contain all planted causes. Each is mapped
-    onto the layout with the transform and the bend that the store contains for this scan. The error is
-    computed over the same scans and pixels as the scores of the loop, with the same per-scan terms.
+    The predictions are noise-free scans that contain all planted causes. Each predicted scan is mapped onto
+    the layout with the transform and the bend that the store contains for this scan. The error is computed
+    over the same scans and pixels as the scores of the loop, with the same per-scan terms.
     """
     by_id = {job.id: job for job in jobs}
     predictions = []
@@ -191,8 +194,8 @@ def true_floor(
 
 
 def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
-    """Return the median relative error of the physical values fitted in the base model: first without, then
-    with the findings of the loop.
+    """Return two numbers: the median relative error of the base model's physical values when they are fitted
+    without the loop's findings, and the same when they are fitted with the findings.
 
     Return None if the printer or the base model is not a Physics model.
     """
@@ -202,7 +205,8 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # If the base model fits the spot, this is the standard deviation of the squared spot.
+    # If the width of the spot is fitted in the base model, this value is the standard deviation of the
+    # squared spot.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
     def error(values: dict[str, float]) -> float:
@@ -214,7 +218,8 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
     """Make the record of a trial that ended with an exception, and print the exception.
 
-    The paths in ``places`` are replaced by the given names in the reason, because results are published.
+    The reason is published. Local paths in it are therefore replaced by the names that ``places`` gives for
+    them.
     """
     traceback.print_exception(error)
     reason = f"{type(error).__name__}: {error}"

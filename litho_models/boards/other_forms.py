@@ -1,9 +1,9 @@
 """Causes whose functional form is not in the loop's catalogue of effects, and printers that the Physics model
 cannot represent.
 
-The forms differ from the catalogue in their law, axis, range or scale. Neither this module nor ``draws``
-reads the catalogue. The seed of a trial determines the random values of its forms, such as a direction, a
-distance or a position.
+The forms differ from the effects in the catalogue in their law, axis, range or scale. Neither this module nor
+``draws`` reads the catalogue. The seed of a trial determines the random values of its forms, such as a
+direction, a distance or a position.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from litho_data.virtual_fab.geometry import ScanFrame
 Rng = np.random.Generator
 Stage = Literal["dose", "surface", "scan"]
 Deck = Literal["both", "mixtures", "base"]
-# A function with the arguments (field, strength, canvas or frame of the scan, job). It returns the changed
-# field.
+# A function with the arguments (field, strength, canvas or frame of the scan, job). It returns the field with
+# the effect added.
 Law = Callable[..., Array]
 Draw = Callable[[Rng], Law]
 
@@ -42,11 +42,12 @@ class Form:
     its law.
 
     Attributes:
-        limit: largest strength, in ``unit``. At strength 0 the law changes nothing.
+        limit: largest allowed strength, in ``unit``. At strength 0 the form has no effect.
         meaning: text that says what the strength is and which values are drawn.
-        deck: boards that draw this form. A ``base`` form is never drawn as a cause; it changes the printer of
-            a mixture.
-        names: names in the loop's catalogue that count as a right answer. Most forms have none.
+        deck: which boards draw this form as a cause. A form with the value ``base`` is never drawn as a
+            cause; it changes the printer itself in some trials of the board ``mixtures``.
+        names: names in the loop's catalogue that count as a right answer. For most forms there is no such
+            name.
     """
 
     name: str
@@ -237,8 +238,8 @@ def _diagonal_slope_loss(rng: Rng) -> Law:
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall along one direction."""
-    # This equals a loss of half the amount on all flanks plus a displacement. Registration removes the
-    # displacement.
+    # This loss is equivalent to half of it on all flanks plus a displacement of the print. Registration
+    # removes the displacement.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
@@ -411,8 +412,8 @@ def _hill_response(rng: Rng) -> Law:
         threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
         low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
         hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
-        # For a sum of doses, the Hill curve may exceed full conversion. The logistic curve never reaches full
-        # conversion.
+        # The Hill curve may exceed full conversion when several doses are added. The logistic curve never
+        # reaches full conversion, so its inverse needs a limit.
         response = np.minimum(low + (high - low) * hill, 0.99)
         return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
 

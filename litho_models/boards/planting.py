@@ -2,8 +2,8 @@
 
 The size of a cause is the rms of the residual that remains after the base model is refitted to prints with
 this cause. To find it, the Physics model is fitted to noise-free scans that contain the cause. (Without
-causes, this model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine registration
-error are fitted to each scan at the same time.
+causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine
+registration error are fitted to each scan at the same time.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
 
 
 def share_of(cause: CauseDraw, job: Job) -> float:
-    """Return the strength that a cause has in one scan, as a share of its full strength."""
+    """Return the fraction of its full strength that a cause has in one scan."""
     if cause.by == "all":
         return 1.0
     strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
@@ -72,7 +72,8 @@ def fab_of(
     Args:
         draw: the trial as drawn.
         planted: causes at their strengths, as returned by `plant`.
-        noise, microscope: if given, they replace the defaults of the virtual fab.
+        noise, microscope: if given, they replace the default noise and the default microscope of the virtual
+            fab.
         without: names of causes to leave out.
     """
     strength = {one.draw.name: one.strength * share_of(one.draw, job) for one in planted}
@@ -90,14 +91,15 @@ def fab_of(
 
 
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """For each drawn cause, find the strength at which the cause, planted alone in these fields, has its
-    drawn size.
+    """For each drawn cause, find the strength at which it has its drawn size. The size is measured with only
+    this cause planted in the given fields.
 
     If the draw has a form that changes the printer (``base``), this form comes first in the result.
 
-    A cause that cannot reach its drawn size gets its largest strength, and the size that it reaches is
-    recorded. No other cause is drawn in its place. For a trial of kind ``alias``, the strength is chosen by
-    the change of the scans before the refit, because the refit absorbs most of this change.
+    If a cause cannot reach its drawn size, it is planted at its largest allowed strength, and the size at
+    this strength is recorded. It is not replaced by another cause. For a trial of kind ``alias``, the
+    strength is chosen by the change of the scans before the refit, because the refit absorbs most of this
+    change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]
     return [_sized(one, jobs, draw) for one in drawn]
@@ -146,7 +148,7 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
     Args:
         heights_um: one array of shape (ny, nx) per job: heights on the grid of the layout, µm.
-        printer: printer whose parameters are the starting values of the fit.
+        printer: printer whose parameters are used as starting values of the fit.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
     model = plain_model(printer)
@@ -159,7 +161,9 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
 
 
 class _Refit(ModelProblem):
-    """The least-squares problem of a model and the terms of each scan, which are made orthonormal."""
+    """The least-squares problem of fitting a model together with per-scan terms. The per-scan terms are made
+    orthonormal.
+    """
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]

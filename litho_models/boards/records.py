@@ -10,7 +10,7 @@ from litho_data.foundation.results import Record, Result
 
 Board = Literal["singles", "mixtures"]
 Kind = Literal["in-form", "alias", "other-form", "empty", "mixture", "measured"]
-# Causes whose size (rms) is not above this value are listed, but do not count in the headline results.
+# Causes whose size (rms) is at most this value are listed, but they do not count in the headline results.
 COUNTS_FROM_RMS_NM = 8.0
 Verdict = Literal[
     "right",
@@ -26,14 +26,15 @@ Verdict = Literal[
 
 
 class CauseDraw(Record):
-    """A cause as drawn: the name of a knob of the virtual fab or of another form, and the size that the cause
-    should have.
+    """A drawn cause. It contains the name of a knob (setting of the virtual fab) or of a form from
+    ``other_forms``, and the size that the cause should have.
 
     The size is defined as in `Planted.rms_nm`.
 
     Attributes:
-        by: the scans that have only ``weak`` times the strength: none (``all``), those after ``place`` in the
-            printing order (``batch``), or those whose id does not end in a digit of ``place`` (``field``).
+        by: how the strength varies. ``all``: all scans have the full strength. ``batch``: the scans after
+            ``place`` in the printing order have only ``weak`` times the strength. ``field``: the scans whose
+            id does not end in a digit of ``place`` have only ``weak`` times the strength.
     """
 
     name: str
@@ -83,8 +84,8 @@ class Planted(Record):
         names: names in the loop's catalogue of effects that count as a right answer.
         strength: strength, in ``unit``; ``at_limit``: True if the drawn size could not be reached, so that
             the strength is the largest allowed.
-        rms_nm: rms of the residual that this cause alone leaves in noise-free scans after the base model, the
-            per-scan terms and the registration are refitted.
+        rms_nm: size of the cause, nm. It is the rms of the residual in noise-free scans that contain only
+            this cause, after the base model, the per-scan terms and the registration are refitted.
     """
 
     draw: CauseDraw
@@ -116,8 +117,8 @@ class Outcome(Record):
 
 
 class TrialErrors(Record):
-    """Mean absolute errors, nm, on held-out scans, with one term (the datum) fitted to each scan: of the base
-    model, of the corrected model, and of the true models.
+    """Mean absolute errors, nm, of the base model, of the corrected model and of the true models. All are
+    computed on held-out scans, with one term (the datum) fitted to each scan.
 
     ``floor_nm``, the error of the true models, is None for measured prints, whose true models are unknown.
     """
@@ -136,8 +137,8 @@ class Found(Record):
     """One finding of a loop.
 
     Attributes:
-        names: name of the effect in the loop's catalogue, then the names of effects that cannot be told from
-            it.
+        names: name of the effect in the loop's catalogue, followed by the names of effects that cannot be
+            distinguished from it.
         by: how the strength varies. ``all``: one strength for all scans; ``scan``: one strength per scan;
             otherwise the name of the grouping of scans that has one strength per group.
         exponents: confidence intervals of the exponent, if the finding is a power law.
@@ -155,12 +156,13 @@ class Answer(Result):
     Attributes:
         found: causes, laws and descriptions.
         left: whether the residual has structure that the loop cannot explain.
-        absorbed: names of effects that the loop's base model absorbs.
+        absorbed: names of effects whose influence the loop's base model can absorb, so that the loop cannot
+            detect them.
         displaced_by: names of the groupings, as in `Found.by`, whose groups of scans share a displacement
             along x.
         before_nm, after_nm: mean absolute error without and with the findings, over the scans that are not
-            locked. Each scan is predicted by a fit that did not use this scan, and one offset is fitted to
-            the scan. None if the loop does not state the error.
+            locked. Each scan is predicted by a model that was fitted to other scans, and one offset is fitted
+            to the scan before the error is computed. None if the loop does not state the error.
         base_values, corrected_values: fitted values of the Physics model, without and with the findings.
     """
 
@@ -183,7 +185,7 @@ class Trial(Result, extra="ignore"):
     failed.
 
     Attributes:
-        false_names: findings named wrongly: each is a set of names without any planted cause.
+        false_names: wrong findings. Each is a set of names that contains no planted cause.
         bias: median relative error of the base model's values, without and with the findings; None if the
             printer or the base model is not a Physics model.
         dataset_cpu_s: CPU time that the loop used, s. In the published boards, it includes the time to build
