@@ -193,7 +193,9 @@ class Simulator(nn.Module, ABC):
 
     @property
     def reach_um(self) -> float | None:
-        """Return the receptive radius in µm, or None if the height of each pixel depends on the whole layout."""
+        """Return the receptive radius in µm. Return None if the height of each pixel depends on the whole
+        layout.
+        """
         return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
 
     @property

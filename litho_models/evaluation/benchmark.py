@@ -1,6 +1,6 @@
 """Train and score several models on one dataset, by cross-validation under one protocol.
 
-Every finished fit is cached. An interrupted or extended benchmark therefore fits only what is missing.
+Every finished fit is cached. If a benchmark is interrupted or extended, only the missing fits are computed.
 """
 
 import time
@@ -62,22 +62,22 @@ def benchmark(
         store: dataset store.
         out: result folder; ``out/cache`` keeps every fit.
         split: ``grouped`` (whole scans are held out), ``leave-one-print-out``, or ``paper`` (one random 75/25
-            split of the quadrants of all scans). With ``paper``, training and test set share scans, so errors
-            are too small; use it only for comparison with the paper.
+            split of the quadrants of all scans). With ``paper``, the training set and the test set contain
+            parts of the same scans, so errors are underestimated. Use it only for comparison with the paper.
         models: names of the models to compare.
         settings: values for fields of ``TrainingConfig``, which replace those of the recipe.
         folds: number of folds of the split ``grouped``, at most the number of development scans.
-        first_folds: number of folds to fit and score, for a quick comparison of seeds or settings; None for
-            all.
-        policy: nuisance terms fitted to each scan before its ``mae_datum_free_nm`` is computed; by default
-            ``offset``, or ``none`` for films.
+        first_folds: number of folds to fit and score, for a quick comparison of seeds or settings; None fits
+            and scores all folds.
+        policy: policy, i.e. set of nuisance terms that are fitted to each scan before its
+            ``mae_datum_free_nm`` is computed; by default ``offset``, or ``none`` for films.
         background: ``training``, ``shared`` or ``none``; by default ``training``, or ``none`` for films. With
             ``training``, the smooth background that each fit learns from its training scans is added to its
             predictions. With ``shared``, each fit also learns a measurement model, which is applied to its
             predictions.
-        noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor in this file is
-            shown beside the errors. By default, the noise floor is estimated from the held-out residuals of
-            the best model.
+        noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
+            states is shown beside the errors. By default, the noise floor is estimated from the held-out
+            residuals of the best model.
         open_lock_box: also train each model on all scans that are not locked, and score it on the locked
             scans.
         seed: seed of the split, of the pixel blocks on which nuisance terms are fitted, and of the training.
@@ -88,7 +88,7 @@ def benchmark(
         InputError: no model is given, or a model is unknown or repeated; the store cannot be read, or is too
             small for the split or the lock box; ``first_folds`` exceeds the number of folds; the noise
             analysis belongs to other data; the cache is damaged; or ``out`` holds a benchmark with models or
-            scans that this one lacks.
+            scans that the new benchmark does not contain.
     """
     require_models(models)
     dataset = open_store(store)
@@ -177,10 +177,12 @@ def _fit(job: _Job) -> tuple[FitRecord, list[Array]]:
 
 
 def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
-    """Return the fits by model and fold number, each with the predicted heights of its held-out scans."""
+    """Return all fits, keyed by model name and fold number. Each fit comes with the predicted heights of its
+    held-out scans.
+    """
     fits: _Fits = {}
     done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
-    # The training times of the models differ too much for one common estimate. The remaining time is
+    # The models take too different times to train for one common estimate of the remaining time. It is
     # therefore estimated for each model separately, unless the fits run in other processes.
     of = len(jobs) if places.elsewhere else 0
     first, rest = jobs[0][1], len({job[1].number for job in jobs}) - 1
@@ -196,8 +198,8 @@ def _fit_all(jobs: Sequence[_Job], places: Workers, dataset: str) -> _Fits:
 
 
 def _require_no_less(folder: Path, models: Sequence[str], scored_ids: Sequence[str]) -> None:
-    """Raise an InputError if the folder holds a benchmark with models or scans that the new one lacks.
-    Repeating or extending a benchmark is allowed.
+    """Raise an InputError if the folder holds a benchmark with models or scans that the new benchmark does
+    not contain. Repeating or extending a benchmark is allowed.
     """
     if not (folder / Benchmark.FILE_NAME).exists():
         return

@@ -1,8 +1,8 @@
 """Cache the fits of a benchmark. The cache stores the record of each fit and the heights that it predicts for
 its held-out scans.
 
-Each fit (one model on one fold) has its own folder. The name of the folder contains a hash of everything that
-determines the fit.
+Each fit (one model on one fold) has its own folder. The name of the folder contains a hash of everything on
+which the result of the fit depends.
 """
 
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 
 
-# Older results have two more fields, which are ignored: the cost of a prediction, and the change of a
-# prediction in another crop.
+# Older result files have two more fields, which are ignored: the cost of a prediction, and how much a
+# prediction changes if the layout is cropped differently.
 class FitDiagnostics(Record, extra="ignore"):
     """Errors of one fitted model on its training, validation and held-out scans.
 
     Each error is the datum-free error with the policy ``offset``, averaged over scans and computed without a
-    background. All three are computed in the same way, so their differences show over-fitting.
-    ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the measurement model
-    that was learned together with the fit, if there is one.
+    background. The three errors are computed in the same way, so differences between them show over-fitting.
+    ``inner_validation_nm`` is None if there are no validation scans. ``measurement`` is the model of the
+    microscope that was learned together with the fit, if there is one.
     """
 
     background: Background
@@ -73,8 +73,9 @@ def fit_or_load(
     fit and the heights, µm, that it predicts for the held-out scans, as one array of shape (ny, nx) per scan.
 
     Args:
-        measured: also learn a measurement model. It is learned from a first fit and removed from the training
-            scans; then the fit is repeated and the measurement model is learned again.
+        measured: also learn a measurement model, i.e. a model of what the microscope adds to the height. It
+            is learned from the residuals of a first fit, and what it predicts is removed from the training
+            scans. Then the fit is repeated, and the measurement model is learned again.
 
     Raises:
         InputError: the cached fit cannot be read.
@@ -93,8 +94,8 @@ def fit_or_load(
 
 
 def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
-    """Learn a measurement model from the scans and the predictions of ``model``. Return the scans with this
-    measurement model removed.
+    """Learn a measurement model from the scans and the predictions of ``model``. Return the scans without the
+    contribution that the measurement model predicts.
     """
     heights = [predict_scan(model, scan) for scan in scans]
     learned = learn_measurement(scans, heights)
@@ -104,8 +105,8 @@ def _freed(model: Simulator, scans: Sequence[PrintedScan]) -> list[PrintedScan]:
 def expected(
     record: FitRecord, background: BackgroundUse, scan: PrintedScan, height_um: np.ndarray
 ) -> Prediction:
-    """Combine a predicted print with the background or the measurement model that the fit learned from its
-    training scans. Return the result, which predicts the scan.
+    """Return the predicted scan. It is the predicted print combined with the background or with the
+    measurement model, which the fit learned from its training scans.
     """
     found = record.diagnostics
     if background == "none":

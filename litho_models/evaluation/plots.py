@@ -23,8 +23,9 @@ Lines = Callable[[Any], Sequence[Sequence[float | None]]]
 
 
 def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
-    """Draw both headline errors of each model (with nothing fitted, and with terms fitted to each scan) with
-    their confidence intervals. Lines mark the noise floor and the error reported in the paper.
+    """Draw two errors of each model with their confidence intervals: the error with nothing fitted to the
+    scans, and the error after terms are fitted to each scan. Lines mark the noise floor and the error
+    reported in the paper.
     """
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
@@ -94,8 +95,8 @@ def residual_maps(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> 
 
 
 def line_profiles(scan: PrintedScan, residuals_um: Mapping[str, np.ndarray]) -> Figure:
-    """Draw the middle row of one scan: the layout, the measured height, and the prediction of each model with
-    the terms fitted to the scan added.
+    """Draw profiles along the middle row of one scan: the layout, the measured height, and the prediction of
+    each model. The terms that were fitted to the scan are added to each prediction.
     """
     figure = new_figure(10, 3.4)
     axes = figure.subplots()
@@ -121,8 +122,8 @@ def level_bias(scores: Sequence[ModelScores]) -> Figure:
 
 
 def transfer(scores: Sequence[ModelScores]) -> Figure:
-    """Draw the transfer function, the coherence and the power spectral density of the error against spatial
-    frequency, along x (solid lines) and y (dashed lines).
+    """Draw the transfer function of each model, its coherence with the measured height, and the power
+    spectral density of its error, all against spatial frequency, along x (solid lines) and y (dashed lines).
     """
 
     def of(name: str) -> Lines:

@@ -71,12 +71,13 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     ``benchmark.json`` or an ``evaluation.json``.
 
     Models that both results contain are compared with each other. If each result contains only one model,
-    these two are compared, whatever their names. A negative difference means that the model of the first
-    result is better.
+    these two models are compared, even if their names differ. A negative difference means that the model of
+    the first result is better.
 
     Raises:
         InputError: a file cannot be read; the results differ in data, folds, scored scans or nuisance terms;
-            in only one of them was the model trained on scored scans; or no model is in both results.
+            the model of one result was trained on the scored scans, but that of the other was not; or no
+            model is in both results.
     """
     import pandas as pd
 
@@ -101,8 +102,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
 
 
 def _scored(path: str | Path) -> tuple[dict[str, object], dict[str, ModelScores]]:
-    """Read a result. Return the facts that must be the same in two results that are compared, and the scores
-    of this result by model name.
+    """Read a result. Return the facts that must agree before two results can be compared, and the scores of
+    this result, keyed by model name.
     """
     file = Path(path)
     if file.is_dir():
@@ -147,6 +148,8 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
 
 
 def _short(value: object) -> str:
-    """Return a value as text. A hash is shortened to its first digits, which suffice to tell two apart."""
+    """Return a value as text. A hash is shortened to its first digits, which suffice to tell two hashes
+    apart.
+    """
     text = str(value)
     return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

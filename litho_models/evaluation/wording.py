@@ -12,10 +12,11 @@ _CHANCE = 0.05
 
 
 def benchmark_verdict(result: Benchmark) -> str:
-    """Return sentences that state which model predicts best, by how much, whether the difference is more than
-    chance, and the noise floor.
+    """Return sentences that state which model predicts best, by how much, whether the difference to the other
+    models is more than chance, and how large the noise floor is.
 
-    If the scans come from several prints, the difference is tested over prints instead of over scans.
+    If the scans come from several prints, the test of the difference counts prints instead of scans as
+    independent units.
     """
     best, second = [*sorted(result.scores, key=lambda one: one.leading_nm), None][:2]
     assert best is not None
@@ -25,8 +26,8 @@ def benchmark_verdict(result: Benchmark) -> str:
 
 
 def evaluation_verdict(result: Evaluation) -> str:
-    """Return sentences that state the error of the model, with and without terms fitted to each scan, and the
-    noise floor.
+    """Return sentences that state the noise floor and two errors of the model: with and without terms fitted
+    to each scan.
     """
     return _verdict(result, result.scores)
 

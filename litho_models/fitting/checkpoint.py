@@ -1,5 +1,5 @@
 """Write and read the checkpoints of a training run. A checkpoint contains the present weights, the best
-weights so far, the state of the optimiser, and the history.
+weights so far, the state of the optimiser, and the records of the rounds so far.
 """
 
 import json
@@ -57,8 +57,9 @@ class TrainingState:
 
 @contextmanager
 def reading_kept(folder: Path) -> Iterator[None]:
-    """Convert any error of the block, which reads files that an earlier run stored in ``folder``, to an
-    InputError. Such files are always written as a whole, so unreadable files are damaged.
+    """Context manager for a block that reads files which an earlier run stored in ``folder``. Any error in
+    the block is converted to an InputError. Such files are always written completely, so a file that cannot
+    be read is damaged.
 
     Raises:
         InputError: a file is missing or damaged.
@@ -78,7 +79,7 @@ def reading_kept(folder: Path) -> Iterator[None]:
 
 
 class CheckpointFolder:
-    """A folder that always contains the last complete checkpoint of one run. ``key`` is a hash that
+    """A folder that contains at any time the last complete checkpoint of one run. ``key`` is a hash that
     identifies the run.
 
     Raises:
@@ -96,7 +97,8 @@ class CheckpointFolder:
         buffer = BytesIO()
         torch.save((state.model.state_dict(), state.best, state.optimiser.state_dict()), buffer)
         with atomic_folder(self.path) as folder:
-            # Python writes the file, because torch does not raise an OSError on a full disk.
+            # The file is written by Python instead of torch, because torch does not raise an OSError if the
+            # disk is full.
             (folder / "state.pt").write_bytes(buffer.getvalue())
             record = {"key": self._key, "history": [entry.model_dump() for entry in state.history]}
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
@@ -109,7 +111,7 @@ class CheckpointFolder:
         """
         if self._kept:
             with reading_kept(self.path):
-                # Only tensors and numbers are loaded. No code in the file is run.
+                # Only tensors and numbers are loaded, so no code in the file is run.
                 kept = torch.load(self.path / "state.pt", map_location="cpu", weights_only=True)
                 weights, state.best, moments = kept
                 state.model.load_state_dict(weights)

@@ -1,4 +1,6 @@
-"""Define the settings of a training run. They are an immutable record, which every run saves."""
+"""Define the settings of a training run. The settings are an immutable record, which every run saves together
+with its results.
+"""
 
 from typing import Any, Literal, Self, get_args
 
@@ -14,13 +16,13 @@ RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # In the default PBL, the optimiser steps train only the chain of blurs and small networks. Feature networks,
-# fitted afterwards, correct what the chain misses. A short training is therefore enough, and no validation
-# scans are needed to choose the best round.
+# which are fitted afterwards, correct the errors that remain after the chain. A short training is therefore
+# enough, and no validation scans are needed to choose the best round.
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # Names of the settings on which a fit by least squares depends.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "model", "seed", "nuisance"}
-# Upper limit of all settings that are counts. No real case needs more, and sums over larger counts lose
-# digits or overflow.
+# Upper limit of all settings that are counts. No real case needs larger counts, and sums over larger counts
+# would lose digits or overflow.
 _MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
@@ -29,9 +31,10 @@ class TrainingConfig(Record):
     """Settings of one fit. A fit by least squares uses only those in ``LEAST_SQUARES_FIELDS``; the other
     settings apply to stochastic gradient descent.
 
-    ``nuisance`` is the policy that names the per-scan terms fitted together with the model. These terms never
-    become part of the model. The gain of a scan is not fitted in training, because part of it depends on the
-    layout. The offsets of the training scans are constrained to a mean of zero.
+    ``nuisance`` is the policy, i.e. the name of the set of terms that are fitted to each scan together with
+    the model. These terms never become part of the model. The gain of a scan is not fitted in training,
+    because it would absorb part of the influence of the layout. The offsets of the training scans are
+    constrained to a mean of zero.
     """
 
     FORMER = frozenset({"free_gain"})
@@ -69,13 +72,13 @@ class TrainingConfig(Record):
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
         """Return the settings that a named recipe has for a model. Values in ``settings`` replace individual
-        fields.
+        values of the recipe.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
         of 72 quadrants. It uses the learning rates of the paper and fits no per-scan terms. The recipe
         ``fast`` uses AdamW with a one-cycle schedule and random crops, and fits per-scan terms together with
-        the model. Its numbers of steps are in ``FAST_STEPS``, and its settings for the default PBL are in
-        ``FAST_CHAIN``.
+        the model. Its numbers of steps for each model are in ``FAST_STEPS``, and its settings for the default
+        PBL model are in ``FAST_CHAIN``.
 
         Raises:
             InputError: the recipe is unknown.
@@ -106,8 +109,8 @@ class TrainingConfig(Record):
         least squares.
 
         A large model is trained by gradient descent unless it is linear in its parameters. A small or linear
-        model is trained by gradient descent only in the recipe ``paper``, and only if the paper states its
-        learning rate.
+        model is trained by gradient descent only with the recipe ``paper``, and only if the paper states a
+        learning rate for this model.
         """
         closed_form = is_small(model) or model.is_linear
         return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)

@@ -1,5 +1,5 @@
-"""Choose the crops on which a model is trained, and cut them out of layouts and scans, with a margin if
-needed.
+"""Choose the crops on which a model is trained, and cut them out of layouts and scans. A crop may include a
+margin around it.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from torch import Tensor
 from litho_data.store import PrintedScan
 from litho_models.fitting.config import TrainingConfig
 
-# Largest number of pixels that go through the network at once. To compute its gradient, a network stores
+# Largest number of pixels that the network processes at once. To compute its gradient, a network stores
 # hundreds of bytes per pixel.
 _PASS_PX = 256**2
 
@@ -45,15 +45,16 @@ def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
 
 def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
     """Cut each window out of the field of its scan, and stack the crops. The result is float32 of shape
-    (windows, 1, size, size), where size is that of a window with its margin.
+    (windows, 1, size, size), where size is the side of a window including its margin.
     """
     crops = [cut(fields[window.scan], window, margin_px) for window in windows]
     return torch.from_numpy(np.stack(crops)[:, None].astype(np.float32))
 
 
 def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
-    """Choose the windows of one optimiser step. For given scan shapes and settings, they depend only on the
-    seed and the number of the step, so a resumed run gives the same result.
+    """Choose the windows of one optimiser step. For given scan shapes and settings, the windows depend only
+    on the seed and the number of the step. A run that was interrupted and resumed therefore gives the same
+    result.
     """
     if config.crops == "quadrants":
         return _from_permuted_quadrants(shapes, config, step)
@@ -68,10 +69,10 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 
 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
-    """Divide the windows of a step into groups, which go through the network one after the other.
+    """Divide the windows of a step into groups, which the network processes one after the other.
 
     On a CPU, a group has at most ``_PASS_PX`` pixels, unless a single window is larger. This limits the
-    memory and takes no extra time. On other devices, all windows form one group.
+    memory without taking more time. On other devices, all windows form one group.
     """
     per_pass = len(windows)
     if device.type == "cpu":
@@ -80,8 +81,8 @@ def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Wind
 
 
 def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:
-    """Divide each scan into squares of side ``size_px``, and return those that lie completely inside. A scan
-    of 512 px, for example, has four quadrants of 256 px.
+    """Divide each scan into squares of side ``size_px``, and return the squares that lie completely inside
+    the scan. A scan of 512 px, for example, has four quadrants of 256 px.
     """
     return [
         Window(scan, y, x, size_px)
@@ -105,8 +106,8 @@ def _from_permuted_quadrants(
 
 
 def grid_pixels(scan: PrintedScan, count: int) -> np.ndarray:
-    """Choose about ``count`` pixels on a square grid over the scan. Return the flat indices of those that
-    were measured.
+    """Choose about ``count`` pixels on a square grid over the scan. Return the flat indices of those chosen
+    pixels that were measured.
     """
     step = max(1, round((scan.usable.size / count) ** 0.5))
     grid = np.zeros_like(scan.usable)

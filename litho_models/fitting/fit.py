@@ -1,4 +1,6 @@
-"""Fit any model to measured scans. The commands, the benchmark and the closed loop all use this module."""
+"""Fit any model to measured scans. All fits of the commands, of the benchmark and of the closed loop are made
+by this module.
+"""
 
 import time
 from collections.abc import Sequence
@@ -36,8 +38,7 @@ class FitFacts(Record):
     """Facts about a fit: the number of parameters of the model, the ids of its training and validation scans,
     and the duration of the fit.
 
-    ``at_bounds`` contains the fitted values that lie on a bound of their range: it maps the name of each to
-    this bound.
+    ``at_bounds`` maps the name of each fitted value that lies on a bound of its range to this bound.
     """
 
     parameters: int
@@ -48,8 +49,8 @@ class FitFacts(Record):
 
 
 class Fitted(NamedTuple):
-    """A fitted model, the facts of its fit, and the records of its training rounds. A fit by least squares
-    has no rounds.
+    """A fitted model, the facts of its fit, and the records of its training rounds. For a fit by least
+    squares, there are no rounds, and the list is empty.
     """
 
     model: Simulator
@@ -107,7 +108,7 @@ def fit(
         parameters=model.parameter_count,
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
-        # The sum over the history includes the rounds before an interruption.
+        # The durations are summed over all recorded rounds, including those before an interruption.
         seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
         at_bounds=model.at_bounds,
     )
@@ -120,7 +121,8 @@ def fit_in_cache(
     """Fit a model as ``fit`` does. Checkpoints are kept in a folder inside ``cache``, whose name contains the
     key of the fit (see ``run_key``).
 
-    A benchmark and a closed loop that train the same model on the same scans thus share one training.
+    If a benchmark and a closed loop train the same model on the same scans, the training is therefore done
+    only once.
     """
     untrained = build_model(model_name, config.variant, **common_geometry(scans))
     name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
@@ -128,8 +130,8 @@ def fit_in_cache(
 
 
 def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Fit ``FIRST_MODEL`` to the scans, and return the heights, µm, that it predicts for them. The first
-    per-scan terms in the training of a network are estimated from these heights.
+    """Fit ``FIRST_MODEL`` to the scans, and return the heights, µm, that it predicts for them. The training
+    of a network uses these heights for its first estimate of the per-scan terms.
     """
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":

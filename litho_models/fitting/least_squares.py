@@ -3,8 +3,8 @@ parameters of the model.
 
 The loss is a sum of squared or of absolute residuals r. Absolute residuals are minimised as squares that have
 the weights 1/sqrt(r² + δ²). A ``Problem`` provides the residuals of a model and their derivatives. It also
-provides the ``room``, which is the smallest and largest step allowed for each parameter. The model is a
-process model, or the base model of the closed loop with its effects.
+provides the ``room``, i.e. the smallest and the largest allowed step of each parameter. The fitted model is a
+process model, or the base model of the closed loop together with its effects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ Room = tuple[Array, Array]
 # measured print (16 nm).
 ABSOLUTE_WIDTH_UM = 0.002
 _DAMPING_START = 1e-3
-# A combination of normalised columns whose squared norm is below this value is taken for rounding error.
+# If a combination of normalised columns has a squared norm below this value, it is regarded as rounding
+# error.
 _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
@@ -38,7 +39,7 @@ class Linearised:
     Attributes:
         residual: measured minus predicted height; shape (n,).
         jacobian: derivatives of the predicted height with respect to p parameters; shape (p, n).
-        basis: the k terms that are fitted to this scan; shape (k, n).
+        basis: values of the k per-scan terms that are fitted to this scan; shape (k, n).
     """
 
     residual: Array
@@ -68,8 +69,9 @@ class Rules:
     Attributes:
         loss: whether the sum of absolute residuals or of squared residuals is minimised.
         term_weight: weight, with the loss ``squares``, of the part of a residual that the terms of the scan
-            can explain. The weight is large enough to determine what these terms have in common in all scans,
-            which is the common datum. It is small enough that no single scan biases the parameters.
+            can explain. The weight is large enough to determine the part of these terms that is common to all
+            scans (the common datum). It is small enough that the terms of a single scan do not bias the
+            parameters.
         pinned: number of scan terms, with the loss ``absolute``, whose mean over the scans is held at zero.
             They are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
@@ -77,8 +79,8 @@ class Rules:
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
             one.
         lowest_damping: lower limit of the damping.
-        kept_above: the derivatives are reused for the next step as long as a step reduces the loss by at
-            least this fraction of the predicted reduction. With None, they are computed anew after every
+        kept_above: the derivatives are reused for the next step if the last step reduced the loss by at least
+            this fraction of the predicted reduction. With None, the derivatives are computed anew after every
             step.
     """
 
@@ -154,11 +156,11 @@ def fit_least_squares(
 @dataclass(frozen=True)
 class NormalEquations:
     """The normal equations of one step. The first ``count`` rows belong to the parameters, and the next rows
-    to the terms of the scans. The last rows are the conditions that hold the mean of each pinned term at
-    zero.
+    to the terms of the scans. The last rows are the conditions that hold the mean of each pinned term (see
+    ``Rules``) over the scans at zero.
 
-    With the loss ``squares``, the terms of the scans are eliminated beforehand, so only the rows of the
-    parameters are there.
+    With the loss ``squares``, the terms of the scans are eliminated beforehand, so the equations contain only
+    the rows of the parameters.
     """
 
     matrix: Array
@@ -206,8 +208,8 @@ class NormalEquations:
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
             step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
-        # The terms are solved for again with the limited step, because the terms found with the unlimited
-        # step do not match it.
+        # The terms are computed again for the limited step, because the terms found together with the
+        # unlimited step do not match it.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape
         if not scans * each:
@@ -244,7 +246,8 @@ def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
     """Return the normal matrix, the right side and the weighted sum of squares of one scan, after its terms
-    are eliminated. The part of each column that the terms can explain has the weight ``term_weight``.
+    are eliminated. The part of each column that the terms of the scan can explain is multiplied by the weight
+    ``term_weight``.
     """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
@@ -268,12 +271,12 @@ def weighted_squares(residuals: Sequence[Array], linear: Sequence[Linearised], t
 
 
 def solve_damped(normal: Array, right: Array, damping: float, room: Room | None = None) -> Array:
-    """Find the damped step x within its limits: minimise x·A·x / 2 - b·x + damping · x·diag(A)·x / 2. A may
-    be singular, because some parameters may have no effect.
+    """Find the damped step x within its limits by minimising x·A·x / 2 - b·x + damping · x·diag(A)·x / 2. The
+    matrix A may be singular, because some parameters may have no effect.
 
-    The limits are part of the minimisation. If the unlimited step were cut to the limits afterwards, the
-    other parameters would still be those of the uncut step. Fits whose optimum is on a bound would then
-    converge slowly.
+    The limits are part of the minimisation. If the unlimited step were clipped to the limits afterwards, the
+    steps of the other parameters would not take the clipping into account. Fits whose optimum is on a bound
+    would then converge slowly.
 
     Args:
         normal, right: the positive semi-definite matrix A, of shape (p, p), and the vector b, of shape (p,).
@@ -289,7 +292,8 @@ def solve_damped(normal: Array, right: Array, damping: float, room: Room | None 
         return step
     factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
     target = np.linalg.solve(factor, right / scale)
-    # lsq_linear needs distinct bounds. A parameter whose bounds coincide hardly moves.
+    # ``lsq_linear`` requires that the two bounds of a parameter differ. If they coincide, they are moved
+    # apart by so little that the parameter hardly moves.
     width = np.maximum(room[1] - room[0], 1e-12)
     box = (room[0] * scale, (room[0] + width) * scale)
     return lsq_linear(factor.T, target, box, method="bvls").x / scale

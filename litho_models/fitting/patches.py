@@ -1,5 +1,5 @@
-"""A PyTorch ``Dataset`` of patches for your own training loop, drawn from the scans of a store that are not
-locked.
+"""A PyTorch ``Dataset`` of patches for your own training loop. The patches are drawn from those scans of a
+store that are not locked.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from litho_models.fitting.crops import Window, cut
 
 class Patch(TypedDict):
     """One patch: the layout with its margin, the measured height, the mask of valid pixels, the id of the
-    scan, and the indices of the patch's first pixel in the scan.
+    scan, and the row and column of the patch's first pixel in the scan.
     """
 
     layout_um: Tensor
@@ -33,11 +33,11 @@ class PatchDataset(Dataset[Patch]):
     """Square patches at random positions in the scans of a store. The position of a patch depends only on the
     seed and on the index of the patch.
 
-    For a patch of side s and a margin of width m, ``layout_um`` is float32 of shape (1, s + 2m, s + 2m). The
-    margin shows a model the layout around the patch. ``height_um`` is float32 of shape (1, s, s), with 0
-    where nothing was measured. ``valid`` is a boolean mask of shape (1, s, s) that marks the measured pixels.
-    Patches are neither rotated nor flipped: the two axes of a print differ, and a lag of the beam or the
-    microscope acts in one direction only.
+    For a patch of side s and a margin of width m, ``layout_um`` is float32 of shape (1, s + 2m, s + 2m). With
+    the margin, a model also receives the layout around the patch. ``height_um`` is float32 of shape (1, s,
+    s), with 0 where nothing was measured. ``valid`` is a boolean mask of shape (1, s, s) that marks the
+    measured pixels. Patches are neither rotated nor flipped, because the two axes of a print differ, and a
+    lag of the beam or of the microscope acts in one direction only.
 
     Args:
         store: dataset store or its path. Locked scans are left out.

@@ -31,9 +31,9 @@ EPOCHS_PER_ROUND = 2
 
 
 class _Pixels(NamedTuple):
-    """The n fitted pixels of one scan. ``features`` are the k features of all networks together, of shape (n,
-    k). ``rest_um`` is the measured height minus the height that the chain predicts, µm, of shape (n,).
-    ``terms`` are the maps of the m per-scan terms, of shape (m, n).
+    """The n fitted pixels of one scan. ``features`` contains the k features of all networks together, with
+    shape (n, k). ``rest_um`` is the measured height minus the height that the chain predicts, µm, with shape
+    (n,). ``terms`` contains the values of the m per-scan terms at these pixels, with shape (m, n).
     """
 
     features: Tensor
@@ -45,13 +45,13 @@ def fit_feature_networks(
     model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
 ) -> RoundRecord:
     """Fit the feature networks of ``model`` in place. They learn the residual of its chain (blurs and small
-    networks); the mean absolute error is minimised.
+    networks) by minimising the mean absolute error.
 
-    Line offsets are not among the per-scan terms of this fit, because they average out.
+    Line offsets are not fitted as per-scan terms here, because they average out over a scan.
 
     Returns:
-        The record of this fit as one round, with errors computed after the per-scan terms are removed. The
-            ``validation`` scans do not influence the fit.
+        The record of this fit, which counts as one round. Its errors are computed after the per-scan terms
+            are removed. The ``validation`` scans do not influence the fit.
     """
     started = time.monotonic()
     terms = smooth_training_terms(config.nuisance)
@@ -99,7 +99,7 @@ def fit_feature_networks(
 
 def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
     """Return the heights, µm, that the networks should learn at the fitted pixels, with the per-scan terms
-    removed. The result is one vector for the pixels of all scans.
+    removed. The result is a single vector with the fitted pixels of all scans.
     """
     with torch.no_grad():
         rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]

@@ -11,8 +11,8 @@ from torch import distributed as dist
 
 
 def joined() -> tuple[int, int]:
-    """Connect this process with the others that torchrun started, if there are any. They communicate through
-    gloo on CPUs and NCCL on GPUs. With GPUs, each process uses its own GPU.
+    """Connect this process with the others that torchrun started, if there are any. The processes communicate
+    through gloo on CPUs and through NCCL on GPUs. With GPUs, each process uses its own GPU.
 
     Returns:
         The rank of this process, counted from 0, and the number of processes.

@@ -17,31 +17,31 @@ from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_s
 from litho_models.scan_terms.policies import smooth_training_terms
 
 # Strength of the ridge penalty, relative to the mean square of each feature after the per-scan terms are
-# removed. The penalty affects only combinations of weights that the scans do not determine. On the measured
-# prints, all values from 1e-6 to 1e-4 give the same result.
+# removed. The penalty is so small that it affects only combinations of weights that the scans do not
+# determine. On the measured prints, all strengths from 1e-6 to 1e-4 give the same result.
 RIDGE = 1e-5
 # Number of fitted pixels of each scan, which lie on a square grid. Twice as many pixels do not improve the
 # predictions of the measured prints. The features of one scan take 94 MB (16,384 pixels × 716 features × 8
-# bytes). They are kept in memory if those of all scans take at most KEPT_BYTES; otherwise each pass computes
-# them again. The feature maps of one tile need another 0.3 GB.
+# bytes). If the features of all scans together take at most KEPT_BYTES, they are kept in memory; otherwise
+# each pass computes them again. The feature maps of one tile need another 0.3 GB.
 FITTED_PX = 16_384
 TILE_PX = 512
 KEPT_BYTES = 2**31
-# The first pass minimises squared residuals. The second pass reweights them so that absolute residuals are
-# minimised, and dirt on a print has little influence.
+# The first pass minimises squared residuals. The second pass reweights the pixels so that absolute residuals
+# are minimised. Dirt on a print then has little influence.
 PASSES = 2
-# Weight of the part of a residual that the per-scan terms can explain. This part determines the datum that
-# all scans have in common.
+# Weight of the part of a residual that the per-scan terms can explain. With this small weight, this part
+# still determines the datum that all scans have in common.
 _TERM_WEIGHT = 1e-3
 
 
 def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
-    """Fit the weights of ``model`` in place. The mean absolute error is minimised.
+    """Fit the weights of ``model`` in place by minimising the mean absolute error.
 
     Args:
         model: the model to fit; ``scans``: training scans.
-        policy: names the terms that are fitted to each scan. Line offsets are left out, because they average
-            out.
+        policy: names the terms that are fitted to each scan. Line offsets are left out of the fit, because
+            they average out over a scan.
     """
     terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):

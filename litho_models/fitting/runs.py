@@ -1,4 +1,4 @@
-"""Train a model on the scans of a store and write a run folder. Interrupted runs resume."""
+"""Train a model on the scans of a store and write a run folder. An interrupted run can be continued."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -66,8 +66,8 @@ def train(
     Args:
         store: dataset store; ``model``: name of a model; ``out``: folder for the run.
         recipe, variant: recipe of ``TrainingConfig``, and variant of the model.
-        settings: values for fields of ``TrainingConfig`` or of the model, which replace those of the recipe
-            and the variant.
+        settings: values for fields of ``TrainingConfig`` or of the model's configuration. They replace the
+            values of the recipe and the variant.
 
     Raises:
         InputError: the recipe, variant, model or a setting is unknown, the store cannot be read, or ``out``
@@ -131,8 +131,8 @@ def train(
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
-    """Return the settings of a training, after checking them. Entries of ``settings`` that are not fields of
-    ``TrainingConfig`` must be fields of the model and become its settings.
+    """Check the settings of a training and return them. Entries of ``settings`` that are not fields of
+    ``TrainingConfig`` must be fields of the model's configuration, and they are passed on to the model.
 
     Raises:
         InputError: the recipe, the model or a field is unknown, or a value is out of range.
@@ -158,8 +158,8 @@ def level_share(scans: Sequence[PrintedScan]) -> list[float]:
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
-    """Return the shares of pairs of neighbouring pixels whose levels differ by 0, 1, 2 and so on. Pairs along
-    rows and along columns are counted together.
+    """Return, for each level difference 0, 1, 2 and so on, the share of pairs of neighbouring pixels that
+    have this difference. Pairs along rows and pairs along columns are counted together.
     """
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]

@@ -18,19 +18,19 @@ from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
-# A window of this side, placed in one corner of each scan, is enough to fit a small model. Successive scans
-# use different corners.
+# A window with this side length, placed in one corner of each scan, contains enough pixels to fit a small
+# model. Successive scans use different corners.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Largest step of a parameter, whose unit is µm for a height and 1 for the raw number of a range. The
-# linearisation is not valid for larger steps.
+# Largest step of a parameter. Its unit is µm for a height, and 1 for a raw number (see ``layers.ranges``).
+# For larger steps, the linearisation is not valid.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
 
 def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Policy) -> list[float]:
-    """Fit ``model`` in place. The mean absolute error is minimised at every second row and column of one
-    window per scan.
+    """Fit ``model`` in place by minimising the mean absolute error. The fitted pixels are those in every
+    second row and column of one window per scan.
 
     If the policy contains line offsets (``full+rows``), they are not fitted, because they average out over a
     scan and hardly affect a small model.
@@ -150,8 +150,8 @@ class _Sample:
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> Array:
-    """Return the derivatives of the window's predicted height with respect to all parameters, computed in one
-    forward-mode pass. The result is float64 of shape (parameters, ny, nx).
+    """Return the derivatives of the window's predicted height with respect to all trainable parameters,
+    computed in one forward-mode pass. The result is float64 of shape (parameters, ny, nx).
     """
     prediction = _WindowPrediction(model, sample)
     named = {f"model.{name}": one for name, one in model.named_parameters() if one.requires_grad}
@@ -180,8 +180,8 @@ def _load(model: Simulator, vector: Array) -> None:
 
 
 class _WindowPrediction(nn.Module):
-    """A module that calls ``sample.predict``. For forward-mode derivatives, torch must replace the parameters
-    of the model, and it can do so only in modules.
+    """A torch module that calls ``sample.predict``. For forward-mode derivatives, torch must replace the
+    parameters of the model, which is possible only if the call is itself a module.
     """
 
     def __init__(self, model: Simulator, sample: _Sample):

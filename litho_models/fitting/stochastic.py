@@ -4,8 +4,8 @@ Before each round, the per-scan terms are estimated from predictions of whole sc
 measured heights, which are then the targets of the round. After each round, the validation scans are scored
 and a checkpoint is written. Random choices depend only on the seed and the step, so an interrupted and
 continued run gives the same result as an uninterrupted one. If there are several processes, they divide the
-crops of each step among themselves and add their gradients. Between rounds, every process does the same
-computations.
+crops of each step among themselves and add up their gradients. Everything between two rounds is computed by
+every process in the same way.
 """
 
 import math
@@ -45,13 +45,13 @@ def train_network(
     first_predictions_um: Callable[[], Sequence[np.ndarray]],
     checkpoints: CheckpointFolder | None = None,
 ) -> list[RoundRecord]:
-    """Train ``model`` in place, on a GPU if there is one. At the end, the model has the weights of the best
-    round.
+    """Train ``model`` in place, on a GPU if there is one. When the function returns, the model has the
+    weights of the best round.
 
     The best round is the one with the smallest error on the ``validation`` scans, or the last round if there
     are none. ``first_predictions_um`` returns the heights, µm, that a small model predicts for the training
-    scans; the per-scan terms of the first round are estimated from them. It is not called if the run
-    continues after its first round.
+    scans; the per-scan terms of the first round are estimated from them. This function is not called if an
+    interrupted run continues after its first round.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -97,8 +97,8 @@ def train_network(
 
 @contextmanager
 def _diverging(model: Simulator, last: int) -> Iterator[None]:
-    """Raise an InputError if weights of the model become infinite or NaN in the block, which contains the
-    steps up to number ``last``.
+    """Context manager for a block that takes the optimiser steps up to number ``last``. Raise an InputError
+    if weights of the model become infinite or NaN in this block.
     """
     try:
         yield
@@ -125,7 +125,7 @@ class _Targets:
     the per-scan terms, and the weight of each pixel. Unmeasured pixels have weight zero.
 
     Each layout is extended by ``overhang_px`` pixels on each side, where its outermost pixels are repeated.
-    The added pixels have weight zero, too.
+    The added pixels also have weight zero.
     """
 
     def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
@@ -143,7 +143,7 @@ def _step(
     state: TrainingState, targets: _Targets, config: TrainingConfig, step: int, device: torch.device
 ) -> Tensor:
     """Take one optimiser step. Return the weighted absolute error, µm, and the mean weight as one tensor of
-    shape (2,). A GPU may still be computing this tensor.
+    shape (2,). If a GPU is used, it may still be computing this tensor when the function returns.
     """
     for group in state.optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
@@ -152,7 +152,8 @@ def _step(
     own = batch[rank::count]
     state.optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=device)
-    # A process that has no crop of its own in this step computes the gradients of another crop with weight 0.
+    # If there are fewer crops than processes in this step, a process without a crop computes the gradients of
+    # some other crop with weight 0.
     for some in in_passes(own or batch[:1], device):
         loss, means = _losses(state.model, config, targets, some, device)
         share = len(some) / len(batch) if own else 0.0
@@ -166,8 +167,8 @@ def _step(
 def _losses(
     model: Simulator, config: TrainingConfig, targets: _Targets, windows: list[Window], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss of some windows, µm. For the record, also return a tensor of shape (2,) with this loss
-    and the mean weight of the pixels.
+    """Return the loss of some windows, µm. Also return a tensor of shape (2,), which contains this loss and
+    the mean weight of the pixels for the training record.
 
     A random crop is predicted together with its surroundings or, if the model runs on tiles, as one tile. A
     quadrant is treated as a separate layout without surroundings.
@@ -188,11 +189,11 @@ def _losses(
     with network_precision(_precision(config), device.type):
         prediction = predict(layout).float()
     if tile is not None:
-        # Each pixel gets the weight that it has when predicted tiles are blended.
+        # Each pixel has the same weight in the loss as in the blending of predicted tiles.
         window = blending_window(tile, weight)
         weight = weight * (window / window.mean())
-    # The mean is taken over all pixels, measured or not. Every crop thus has the same weight, whatever the
-    # number of crops in its group.
+    # The mean is taken over all pixels, measured or not. Every crop therefore has the same weight, whatever
+    # the number of crops in its group.
     loss = (weight * (prediction - height).abs()).mean()
     return loss, torch.stack([loss.detach(), weight.mean()])
 
@@ -211,7 +212,8 @@ def _precision(config: TrainingConfig) -> Precision:
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
     """Return the number of pixels by which tiles may extend beyond a scan in training. It is at least the
-    overlap of the tiles, as in prediction, and large enough for one tile to fit into the extended scan.
+    overlap of the tiles, which is the value used in prediction, and it is large enough for one tile to fit
+    into the extended scan.
     """
     if model.tile is None or config.crops != "random":
         return 0

@@ -1,5 +1,5 @@
-"""The card of a frozen model (``card.json``), which states how to use the model, how it was made, and its
-errors.
+"""The card of a frozen model (``card.json``), which states how to use the model, how the model was made, and
+how large its errors are.
 """
 
 from pathlib import Path
@@ -18,15 +18,15 @@ from litho_models.scan_terms import BackgroundUse
 from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
-# Texts that say on which scans an error was scored: on the training scans, or on held-out scans.
+# Texts that say whether an error was scored on the training scans or on held-out scans.
 TRAINED_ON, OUT_OF_FOLD = "development, trained on", "grouped, out of fold"
 
 EffectValues = dict[str, dict[str, float]]
-# Side to which an effect of undetermined role is attributed.
+# Side (printer or microscope) to which an effect is attributed if the measurements do not determine its side.
 Attribution = Literal["printer", "microscope"]
 
-# The package reads only these lists from `training` and `split`. All other entries there are only for
-# readers.
+# The package reads only these lists from the card fields `training` and `split`. All other entries of the two
+# fields are only for human readers.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
@@ -57,11 +57,11 @@ class ModelCard(RunFacts, Result):
 
     ``background`` is the mean contribution of the microscope to the training scans. It is used only for
     comparisons with measured heights and is never part of the height that the model predicts. ``at_bounds``
-    contains the fitted values that lie on a bound of their range: it maps the name of each to this bound.
-    ``baseline`` contains the gain and the error (``ScanFigures``) of each scan on which the model was
-    trained; ``litho-models check`` compares new prints with these values. ``attributed`` maps effects of
-    undetermined role to the side (printer or microscope) to which they were attributed when the model was
-    frozen.
+    maps the name of each fitted value that lies on a bound of its range to this bound. ``baseline`` contains
+    the gain and the error (``ScanFigures``) of each scan on which the model was trained; ``litho-models
+    check`` compares new prints with these values. For some effects, the measurements do not determine whether
+    they arise in the printer or in the microscope. ``attributed`` maps the name of each such effect to the
+    side (printer or microscope) to which it was attributed when the model was frozen.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -101,8 +101,8 @@ class ModelCard(RunFacts, Result):
 
     @property
     def held_out(self) -> CardMetric | None:
-        """Return the error on held-out scans. Return None if the model was not benchmarked, so that the card
-        states no such error.
+        """Return the error on held-out scans. If the model was not benchmarked, the card states no such
+        error, and the result is None.
         """
         return next((metric for metric in self.metrics if metric.split == OUT_OF_FOLD), None)
 

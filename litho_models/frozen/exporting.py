@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
 SUFFIXES = (".pt2", ".onnx")
-# Largest allowed difference between the heights of an exported program and of its model (0.01 nm).
+# Largest allowed difference, µm, between the height that an exported program computes and the height that its
+# model computes (0.01 nm).
 LARGEST_DIFFERENCE_UM = 1e-5
 _ITEM = torch.ops.aten._local_scalar_dense.default
 _FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um")
@@ -35,8 +36,9 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
     the heights that the program and the model predict for a random layout.
 
     The program receives a layout in µm, float32 of shape (1, 1, size_px, size_px), and returns the printed
-    height in µm with the same shape. It checks neither the pitch nor the range of the heights. Its metadata
-    states both, in the extra file ``card.json`` of a ``.pt2`` file or the ``metadata_props`` of an ONNX file.
+    height in µm with the same shape. It checks neither the pitch nor the range of the layout's heights. Both
+    are stated in its metadata, which is the extra file ``card.json`` in a ``.pt2`` file, or the
+    ``metadata_props`` of an ONNX file.
 
     Args:
         out: output file. Its suffix is ``.pt2`` (read by ``torch.export.load``) or ``.onnx`` (needs the extra
@@ -73,11 +75,11 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
 
 
 class _Numbers(TorchDispatchMode):
-    """A mode that records the Python numbers that a model reads from tensors (``Tensor.item``) in one run,
-    and replays them in another run.
+    """A torch mode that records the Python numbers which a model reads from tensors with ``Tensor.item`` in
+    one run, and returns the same numbers in a second run.
 
     These numbers are the radii of blur kernels and the end points of tables. They depend only on the weights,
-    so a program may contain them as constants.
+    so the exported program may contain them as constants.
     """
 
     def __init__(self, told: list[Any] | None = None):

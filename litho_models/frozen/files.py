@@ -1,8 +1,8 @@
-"""Write and load frozen models. A frozen model is a folder with weights and a card. Loading it runs no code
-from the folder.
+"""Write and load frozen models. A frozen model is a folder with weights and a card. Loading a frozen model
+runs no code from its folder.
 
-``model.safetensors`` contains the weights, ``card.json`` the card, and ``README.md`` the card as a page for
-readers. Only numbers, texts and names of known classes are read; nothing is unpickled.
+``model.safetensors`` contains the weights, ``card.json`` contains the card, and ``README.md`` shows the card
+as a page for people. Only numbers, texts and names of known classes are read; nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -42,16 +42,18 @@ def save_frozen(
     process_effects: EffectValues | None = None,
     **card_fields: Any,
 ) -> Path:
-    """Write a process model as a frozen model, which can be used for design. Return its folder.
+    """Write a process model as a frozen model, which can then be used for design. Return the folder of the
+    frozen model.
 
     Args:
         simulator: the fitted model.
-        folder: output folder. If it contains an older frozen model, this model is replaced completely.
+        folder: output folder. If the folder contains an older frozen model, the older model is replaced
+            completely.
         name: name of the frozen model in reports; by default, the name of its class of model.
         process_effects: effects of the printer that become part of the frozen model. The mapping contains the
             parameter values of each effect by name.
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …). Fields that
-            follow from the model itself are computed from it, even if they are given here.
+            follow from the model itself are computed from the model, even if values for them are given here.
 
     Raises:
         InputError: weights are not finite or not float32; a card field is unknown or has a wrong value; or an
@@ -61,8 +63,8 @@ def save_frozen(
     _check_numbers(state, f"weights of {simulator.name}")
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
-        # The file has no metadata: safetensors writes metadata in no fixed order, so the hash of the file
-        # would change from call to call.
+        # The file has no metadata. Safetensors writes metadata in no fixed order, so with metadata the hash
+        # of the file would change from call to call.
         (temporary / WEIGHTS_FILE).write_bytes(save(state))
         try:
             own = {
@@ -96,7 +98,7 @@ def load_frozen(
         source: a folder that ``save_frozen`` wrote, ``zoo:NAME`` for a model of the package, or
             ``hf://owner/name`` for a model that ``push`` shared.
         device: device on which the model is placed.
-        extrapolate: accept layouts with heights beyond the calibrated range.
+        extrapolate: accept layouts with heights beyond the model's calibrated range.
 
     Raises:
         InputError: there is no such folder, model of the zoo or repository; the card or the weights are
@@ -116,7 +118,8 @@ def load_frozen(
 
 
 def push(source: str | Path, repository: str, *, private: bool = False) -> str:
-    """Share a frozen model on the Hugging Face Hub. Return its address, which ``load_frozen`` accepts.
+    """Upload a frozen model to the Hugging Face Hub. Return the address of the uploaded model, which
+    ``load_frozen`` accepts.
 
     Args:
         source: the model to share, as for ``load_frozen``.
@@ -132,8 +135,8 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
 
 
 def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
-    """Load the model in the folder of a frozen model without its printer effects, and check the weights
-    against the card.
+    """Load the base model of a frozen model from its folder, without the printer effects that the frozen
+    model may contain. Check the weights against the card.
 
     Raises:
         InputError: the weights are missing or damaged, or do not belong to the model in the card.
@@ -189,8 +192,8 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     try:
         return known(config)
     except (ArithmeticError, ValueError) as error:
-        # Each value is in its own range, but some values contradict each other. For example, a starting value
-        # may exceed the upper bound.
+        # Each value of the card is inside its own range, but some values contradict each other. For example,
+        # a starting value may exceed the upper bound.
         raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
 
 

@@ -1,4 +1,4 @@
-"""Freeze the process model that a training or a closed loop wrote."""
+"""Freeze a process model, i.e. save the model that a training or a closed loop wrote as a frozen model."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ from litho_models.frozen.files import load_simulator, save_frozen
 # Name of the folder that holds the model in the output folders of `train` and `close-loop`.
 MODEL_FOLDER = "model"
 # Name of the part of a model that `Simulator.printer` leaves out. It is listed among the effects of
-# undetermined role.
+# undetermined role, i.e. effects that may arise in the printer or in the microscope.
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
     f"The stated errors are those of a model that also has {SCAN_AXIS}, a part for predicting measured maps. "
@@ -24,16 +24,18 @@ _WITHOUT_IT = (
 def freeze(
     source: str | Path, out: str | Path, attribute: Attribution | Mapping[str, Attribution] | None = None
 ) -> ModelCard:
-    """Write the process model of a run folder, or of an already frozen model, as a frozen model.
+    """Write a process model as a frozen model. The process model comes from a run folder or from another
+    frozen model.
 
     Args:
         source: a folder that ``train`` or ``close-loop`` wrote, or a frozen model (a folder or ``zoo:NAME``).
         out: output folder for the frozen model.
-        attribute: side (``printer`` or ``microscope``) to which effects of undetermined role are attributed:
-            one side for all of these effects, or a mapping from the name of an effect to its side. Effects
-            attributed to the printer become part of the frozen model; those attributed to the microscope do
-            not. The card records the attribution. The name ``scan-axis`` stands for the part of a base model
-            that acts along the lines of the scan.
+        attribute: side (``printer`` or ``microscope``) to which effects of undetermined role are attributed.
+            (The measurements do not show on which side these effects arise.) The value is either one side for
+            all of these effects, or a mapping from the name of an effect to its side. Effects attributed to
+            the printer become part of the frozen model; those attributed to the microscope do not. The card
+            records the attribution. The name ``scan-axis`` stands for the part of a base model that acts
+            along the lines of the scan.
 
     Raises:
         InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side

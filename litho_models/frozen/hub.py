@@ -1,5 +1,5 @@
-"""Download frozen models from the Hugging Face Hub, and upload them. Each model is a repository of three
-files.
+"""Download frozen models from the Hugging Face Hub, and upload them. Each model is a repository with three
+files: the weights, the card and the README page.
 """
 
 import re
@@ -16,7 +16,8 @@ _FILES = ["model.safetensors", "card.json", "README.md"]
 
 
 def fetched(address: str) -> Path:
-    """Return the folder of a model, after downloading it if the cache of huggingface_hub does not contain it.
+    """Return the folder of a model. If the cache of huggingface_hub does not contain the model, it is
+    downloaded first.
 
     Args:
         address: ``hf://owner/name`` or, for a certain revision, ``hf://owner/name@revision``.

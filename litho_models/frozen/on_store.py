@@ -21,13 +21,14 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
 
     Args:
         layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. It contains integer levels, or
-            grey values that represent levels. A file that ``litho-design`` exported is also accepted; the
-            file beside it states the pitch and the level height, which are checked.
+            grey values that represent levels. A file that ``litho-design`` exported is also accepted. The
+            file that ``litho-design`` wrote beside it states the pitch and the level height; both are
+            checked.
         out: file for the height: ``.gsf`` (opens in Gwyddion) or ``.npy``.
 
     Raises:
-        InputError: the layout cannot be read, has another pitch or has heights beyond the calibrated range,
-            or ``out`` has another suffix.
+        InputError: the layout cannot be read, its pitch is not that of the model, its heights are beyond the
+            calibrated range, or ``out`` has neither of the two suffixes.
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])
@@ -44,7 +45,9 @@ def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
-    """Return the background in the model's card, or None if the card has none for scans of this size."""
+    """Return the background (mean contribution of the microscope) stored in the model's card. Return None if
+    the card has no background for scans of this size.
+    """
     stated = model.card["background"]
     learned = Background.model_validate(stated) if stated is not None else None
     return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
@@ -58,8 +61,8 @@ def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
 
 
 def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Return True if the model was trained on the prints in this store. That is so if its card names the same
-    dataset, or if the store contains scans that were locked when the model was trained.
+    """Return True if the model was trained on the prints in this store. This is the case if the model's card
+    names the same dataset, or if the store contains scans that were locked when the model was trained.
     """
     same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
     return same_dataset or bool(locked_by_the_card(model, dataset))
@@ -69,10 +72,10 @@ def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.
 
-    Raw files are compared because they stay the same if the store is built anew. Other settings for levelling
-    or registration change every height in the store, and an added or missing scan changes which scans are
-    locked. If the card lists no raw files, the scan ids in its lock box are returned, but only for a dataset
-    of the same name.
+    Raw files are compared because they stay the same if the store is built anew. Heights and lock boxes do
+    not: other settings for levelling or registration change every height in the store, and an added or
+    missing scan changes which scans the store locks. If the card lists no raw files, the ids of the locked
+    scans that it names are returned instead, but only if the dataset has the same name.
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):

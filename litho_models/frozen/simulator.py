@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
     from litho_models.effects.chain import EffectChain
 
-# Tolerance of the calibrated range. Rounding to float32 may put the highest level slightly beyond the range,
-# while the next level would exceed it by a whole level height (100 nm in the first prints).
+# Tolerance of the calibrated range. Rounding to float32 may put the highest level slightly beyond the range.
+# The next level would exceed the range by a whole level height (100 nm in the first prints), which is far
+# more than this tolerance.
 _ROUNDING_UM = 1e-5
 
 
@@ -64,17 +65,17 @@ class FrozenSimulator(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile size of a model whose result depends on the size of its input, or None for other
-        models.
+        """Return the tile size if the result of the model depends on the size of its input. Otherwise return
+        None.
         """
         return self.simulator.tile
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
-        """Let the model predict in the given precision inside the block (see ``network_precision``). Outside
-        such a block, it predicts in float32.
+        """Context manager for a block in which the model predicts in the given precision (see
+        ``network_precision``). Outside such a block, the model predicts in float32.
 
-        If this precision is slower than float32 on this processor, a line on stderr says so.
+        If the given precision is slower than float32 on this processor, a warning on stderr says so.
         """
         warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
         before, self._precision = self._precision, precision
@@ -119,8 +120,9 @@ class FrozenSimulator(nn.Module):
             pitch_um: sampling of the layout; it is checked if given.
 
         Raises:
-            InputError: as for ``forward``. An error is also raised if the layout contains integers, which
-                would be levels instead of heights, or has fewer than two dimensions.
+            InputError: as for ``forward``. An error is also raised if the layout has fewer than two
+                dimensions, or if it contains integers, because integers would be level numbers instead of
+                heights.
         """
         self.check_geometry(pitch_um)
         if isinstance(layout_um, Tensor):
@@ -226,7 +228,7 @@ class FrozenSimulator(nn.Module):
         """Check that a pitch and a level height, µm, are those of the model. A value of None is not checked.
 
         Raises:
-            InputError: one of them differs.
+            InputError: a given value differs from that of the model.
         """
         for name, given in (("pitch_um", pitch_um), ("level_height_um", level_height_um)):
             wanted = self.card[name]

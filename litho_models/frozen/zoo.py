@@ -1,5 +1,5 @@
-"""Names and folders of the frozen models that come with the package (the zoo). They are the models in the
-benchmark table.
+"""Names and folders of the frozen models that come with the package (the zoo). They are the models that the
+benchmark table of the documentation compares.
 
 ``load_frozen("zoo:pbl")`` loads the model ``pbl``, and ``load_frozen("zoo:best")`` loads the model with the
 smallest error on held-out scans.
@@ -46,7 +46,7 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
 
     Args:
         source: path or name that the user typed.
-        other: further names that the caller accepts; the error message also lists them.
+        other: further names that the caller accepts. They are only listed in the error message.
 
     Raises:
         InputError: there is no such folder or model in the zoo, or the model cannot be downloaded.
