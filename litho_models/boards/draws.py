@@ -21,8 +21,8 @@ from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
 # Smallest and largest drawn size of a cause. The strength that gives the drawn size is found on four scans.
-# Measured on all scans, the size may be 13 % smaller. The smallest size is chosen so that the cause even then
-# exceeds the size from which causes count.
+# Measured on all scans, the size may be 13 % smaller. On the board ``singles``, the smallest size is chosen
+# so that a cause exceeds the size from which causes count even then.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)

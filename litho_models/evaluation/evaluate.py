@@ -55,7 +55,7 @@ def evaluate(
             background for fields of this size, none is added either, and the result says so.
         noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
             states is shown beside the errors.
-        extrapolate: accept layouts whose heights lie outside the range on which the model was trained.
+        extrapolate: accept layouts with heights outside the calibrated range that the model's card states.
         open_lock_box: also score the locked scans if the model was trained on these prints.
 
     Raises:

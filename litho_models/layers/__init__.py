@@ -1,1 +1,3 @@
-"""Building blocks of models: blurs, pointwise functions and numerical precision."""
+"""Building blocks of models: Gaussian blurs, functions that act on each pixel separately, ranges of fitted
+values, and the numerical precision of networks.
+"""

@@ -18,17 +18,17 @@ SUPPORT_SIGMAS = 4.0
 # Smaller standard deviations are replaced by this value. The weight of the next pixel is then negligible
 # (exp(-50)), and 1/sigma stays finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Size of the blocks for kernels with a radius below _WIDE_BLOCK_PX, and for kernels of this radius or more.
-# With wider blocks, more zeros of the band matrix are multiplied; with narrower blocks, the matrix products
-# are slower.
+# Sizes of the blocks in pixels: the first for kernels with a radius below _WIDE_BLOCK_PX, the second for
+# wider kernels. With wider blocks, more zeros of the band matrix are multiplied; with narrower blocks, the
+# matrix products are slower.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 # Largest radius of a kernel. No printed field is wider, and a larger radius would exhaust the memory.
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 Sigma = float | Tensor | tuple[float | Tensor, float | Tensor]
-# Rule for the radius of a kernel: four sigma or, as in the code of the paper's authors, three times sigma
-# rounded down to whole pixels.
+# Rule for the radius of a kernel: four sigma or three times sigma after sigma is rounded down to whole
+# pixels, as in the code of the paper's authors.
 Support = Literal["four-sigma", "three-whole-sigma"]
 
 
@@ -50,16 +50,16 @@ def gaussian_blur(
         sigma_um: standard deviation, µm, or a pair of standard deviations (along y, along x). If it is a
             tensor, gradients flow to it.
         pitch_um: pixel pitch of the field, µm.
-        edge: how the field continues beyond its edge: ``replicate`` repeats the outermost pixels, and
-            ``zero`` assumes zeros. The result then has the shape of the field. With None, the result contains
-            only the pixels that are at least the radius r from the edge, and has shape (..., ny - 2r, nx -
-            2r).
+        edge: how the field is padded beyond its edge: ``replicate`` repeats the outermost pixels, and
+            ``zero`` adds zeros. In both cases, the result has the shape of the field. With None, the field is
+            not padded, and the result contains only the pixels that are at least the radius r from the edge,
+            and has shape (..., ny - 2r, nx - 2r).
         radius_px: radius r of the kernel in pixels, or a pair of radii (along y, along x); by default four
             standard deviations, rounded up.
 
     Raises:
-        InputError: the pitch is not positive, the kernel is too wide, or the field has no pixels or is
-            narrower than the kernel.
+        InputError: the pitch is not positive, the kernel is too wide, the field has no pixels, or the field
+            is narrower than the kernel.
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
@@ -82,7 +82,7 @@ def gaussian_blur(
             if field.shape[axis] <= 2 * radius:
                 wanted = f"more than {2 * radius} px (twice the radius of the kernel)"
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
-            # For the blur along x, the lines of all samples are stacked to one image.
+            # For the blur along x, the lines of all samples are stacked into one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
             blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
@@ -107,7 +107,7 @@ def kernel_radius_px(sigma_px: float) -> int:
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
     """Return the radius of a kernel in whole pixels according to the rule ``support``. If ``cap_px`` is
-    given, the radius is at most this.
+    given, the radius is at most ``cap_px``.
     """
     radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
     return radius if cap_px is None else min(radius, cap_px)
@@ -152,7 +152,8 @@ class _Blur(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         samples, band, ctx.axis = inputs
         ctx.set_materialize_grads(False)
-        # The field is kept for the backward pass only if the width of the kernel is learned.
+        # The backward pass needs the field only if the width of the kernel is learned. Otherwise the field is
+        # not kept.
         ctx.save_for_backward(band, samples if ctx.needs_input_grad[1] else None)
         ctx.save_for_forward(band, samples)
 
@@ -183,11 +184,10 @@ class _Blur(torch.autograd.Function):
 
 def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
     """Return the windows that the blocks of each sample need. A window is a block with the radius of the
-    kernel added on both sides, so neighbouring windows overlap. Each result is a view of shape (blocks,
-    length of the other axis, window).
+    kernel added on both sides, so neighbouring windows overlap. The function returns one tensor per sample.
+    It is a view of shape (blocks, length of the other axis, window).
 
-    There is one result per sample, because a single matrix product over several samples would copy the
-    windows.
+    The samples are kept apart, because a single matrix product over several samples would copy the windows.
     """
     block, window = band.shape
     count = -(-(samples.shape[axis] - window + block) // block)
@@ -201,12 +201,13 @@ def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
 
 
 def _band(radius: int, sigma_px: Tensor) -> Tensor:
-    """Return the band matrix of a kernel. It has shape (block, block + 2 radius), and its row i contains the
+    """Return the band matrix of a kernel. The matrix has shape (block, block + 2 radius). Row i contains the
     kernel, centred on column i + radius.
     """
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
-    # Each row is a window on the zero-padded kernel. The windows come in reverse order, so they are flipped.
+    # Each row of the matrix is a window on the zero-padded kernel. ``unfold`` gives the windows in reverse
+    # order, so their order is flipped.
     block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
     kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
     return kernel.unfold(0, block + 2 * radius, 1).flip(0)

@@ -1,5 +1,5 @@
-"""Evaluate functions that act on each pixel separately. Pixels are evaluated in blocks, to limit the memory
-for the hidden values of networks.
+"""Evaluate functions that act on each pixel separately. Pixels are evaluated in blocks, which limits the
+memory for the hidden values of networks.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,7 +24,7 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
         function: receives the features of m pixels, as tensors of shape (m, ...), and returns their values,
             of shape (m,). It must accept any m.
         features: tensors of shape (n, ...), with one row for each pixel.
-        parameters: parameters of the function. Gradients flow to those that are trained.
+        parameters: parameters of the function. Gradients flow to those parameters that are trained.
     """
     learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
@@ -40,8 +40,8 @@ def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters
 
 
 class _WithSlopes(torch.autograd.Function):
-    """Compute the values of a function and their derivatives with respect to the features (slopes) together.
-    Only the slopes are kept for the backward pass.
+    """An operation that computes the values of a function together with their derivatives with respect to the
+    features (slopes). Only the slopes are kept for the backward pass.
 
     The slopes take as much memory as the features, but the backward pass need not evaluate the function
     again.
@@ -93,8 +93,9 @@ class PointwiseNet(nn.Module):
     """A network with one input and one output, which is applied to each pixel separately (1 x 1
     convolutions).
 
-    The network is a piecewise-linear function of one variable. It is therefore evaluated only at ``knots``
-    points, about a thousand, and interpolated between them, instead of being evaluated at every pixel.
+    The network is a piecewise-linear function of one variable. It is therefore not evaluated at every pixel,
+    but only at about a thousand points (knots), whose number is ``knots``. Between these points, its values
+    are interpolated.
     """
 
     def __init__(self, hidden: tuple[int, ...], leaky_slope: float, knots: int):

@@ -18,14 +18,16 @@ _UNITS = ("amx_bf16", "avx512_bf16", "bf16", "sve_bf16")
 
 @contextmanager
 def network_precision(precision: Precision, device_type: str) -> Iterator[None]:
-    """Let networks multiply in the given precision inside the block. Heights and blurs stay in float32."""
+    """Context manager for a block in which networks multiply matrices in the given precision. Heights and
+    blurs stay in float32.
+    """
     with torch.autocast(device_type, torch.bfloat16, enabled=precision == "bfloat16"):
         yield
 
 
 def warn_where_slower(precision: Precision, device_type: str) -> None:
-    """If this processor only emulates the given precision, print a warning on stderr, once per process, that
-    float32 is faster.
+    """If this processor only emulates the given precision, print a warning on stderr that float32 is faster.
+    The warning is printed once per process.
     """
     if precision != "float32" and device_type == "cpu" and not has_bfloat16_unit():
         _say("networks run in bfloat16, but this processor has no bfloat16 unit: float32 is faster")

@@ -1,9 +1,9 @@
-"""Ranges of fitted values, and the rule for when a value counts as lying on a bound of its range.
+"""Ranges of fitted values, and the rule that decides whether a value counts as lying on a bound of its range.
 
-A fit changes an unlimited raw number, and the model uses the corresponding value inside the range. Near a
-bound, the value hardly changes with the raw number, so a fit that reached the bound could not leave it again.
-Fits therefore keep raw numbers between -``FLAT_FROM`` and ``FLAT_FROM``. A value whose raw number has reached
-such a limit counts as lying on the bound.
+A fit does not change a value itself but a raw number without limits. The model uses the value inside the
+range that corresponds to the raw number. Near a bound, the value hardly changes with the raw number, so a fit
+that reached the bound could not leave it again. Fits therefore keep raw numbers between -``FLAT_FROM`` and
+``FLAT_FROM``. A value whose raw number has reached such a limit counts as lying on the bound.
 """
 
 import math
@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
 
-# Largest magnitude of a raw number. There, the slope of a sigmoid is 7 % of its maximum, and the distance of
-# the value from the bound is 2 % of the range.
+# Largest magnitude of a raw number. At this raw number, the slope of the sigmoid is 7 % of its maximum, and
+# the distance of the value from the bound is 2 % of the range.
 FLAT_FROM = 4.0
 _ROUNDING = 1e-4
 
@@ -62,7 +62,9 @@ class Range:
         return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
 
     def bound_at(self, raw: float) -> float | None:
-        """Return the bound on which the value of this raw number lies, or None if it lies on neither."""
+        """Return the bound on which the value of this raw number lies. Return None if it lies on neither
+        bound.
+        """
         low, high = self.raw_ends
         if raw <= low + _ROUNDING:
             return self.lower

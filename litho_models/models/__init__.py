@@ -39,7 +39,7 @@ MODELS: dict[str, type[Simulator]] = {
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
     """Register a class of models, so that all functions and commands of this process know it by its name.
 
-    Call this function in a plug-in to register the class in every process that a command starts.
+    To register the class in every process that a command starts, call this function in a plug-in.
 
     Raises:
         InputError: the class has no name, or its name is already taken.
@@ -62,7 +62,7 @@ def model_class(name: str) -> type[Simulator]:
 
 
 def require_models(names: Sequence[str]) -> None:
-    """Check a list of model names that a user gave.
+    """Check a list of model names that a user gave, and raise an error if it is not valid.
 
     Raises:
         InputError: the list is empty or is a single string, or a name is repeated or unknown.
@@ -80,7 +80,8 @@ def require_models(names: Sequence[str]) -> None:
 def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) -> list[str]:
     """Return the names of the parameters of a model that no fit changes.
 
-    These are the parameters that are fixed by default and those in ``fix``, without those in ``free``.
+    These are the parameters that are fixed by default, plus the parameters in ``fix``, minus the parameters
+    in ``free``.
 
     Raises:
         InputError: the model is unknown, or ``free`` names a parameter that is not fixed by default.
@@ -92,8 +93,8 @@ def fixed_numbers(name: str, fix: Sequence[str] = (), free: Sequence[str] = ()) 
 
 
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
-    """Build an untrained model. ``fields`` are values for fields of its configuration: geometry and
-    hyper-parameters.
+    """Build an untrained model. ``fields`` are values for fields of the model's configuration, which are its
+    geometry and its hyper-parameters.
 
     Raises:
         InputError: the model, a field or a parameter to fix is unknown, or a value is not allowed.

@@ -1,5 +1,5 @@
-"""Load weights that the code of the paper's authors trained into the models of variant ``authors``. The names
-of the weights are translated.
+"""Load weights that were trained with the code of the paper's authors, and use them in the models of variant
+``authors``. The names of the weights are translated from the authors' code to this package.
 
 Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
 """
@@ -37,8 +37,8 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
         fields: values for fields of the model's configuration, such as its geometry.
 
     Raises:
-        InputError: the weights belong to none of the three classes, or some weights are missing, unknown or
-            have the wrong size.
+        InputError: the weights do not belong to any of the three classes, or some weights are missing,
+            unknown or of the wrong size.
     """
     if not isinstance(weights, Mapping):
         hint = "read the authors' file with torch.load"
@@ -81,8 +81,8 @@ def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Ten
         alpha = float(state["raw_alpha"])
         if not alpha > 0:
             raise InputError("alpha of the authors' physics", got=alpha, wanted="a number above 0")
-        # The parameter in the authors' code is the steepness itself. The parameter here is the raw number of
-        # a range.
+        # In the authors' code, the parameter is the steepness itself. Here it is the raw number that
+        # corresponds to the steepness (see ``layers.ranges``).
         state["raw_alpha"] = steepness.raw(alpha)
     return state
 
@@ -106,7 +106,7 @@ def _fno_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         names |= {f"w{i}.{kind}": f"local.{i}.{kind}" for i in range(4)}
     state = {names.get(name, name): value for name, value in own.items()}
     for i in range(4):
-        # The parameter here contains the matrices for both signs of the frequency along y.
+        # Here, one parameter contains the matrices for both signs of the frequency along y.
         signs = [state.pop(f"conv{i}.weights{sign}", None) for sign in (1, 2)]
         pair = [matrix for matrix in signs if matrix is not None]
         if len(pair) == 2 and pair[0].shape == pair[1].shape:

@@ -1,5 +1,6 @@
-"""Simple models that every other model must beat. They range from the unchanged layout to models that are
-linear in features. In the formulas, M is the layout and H the printed height.
+"""Baselines: simple models with which every other model is compared, and which it should surpass. They range
+from the unchanged layout to models that are linear in features. In the formulas, M is the layout and H the
+printed height.
 """
 
 import torch
@@ -55,8 +56,8 @@ class BlurTableConfig(SimulatorConfig):
 
 class BlurTable(Simulator):
     """A blur followed by a fitted table: H = T(G_σ * M), where G_σ is a Gaussian and * a convolution. T
-    interpolates linearly between fitted heights at evenly spaced inputs. There are as many inputs as levels,
-    but at most 33.
+    interpolates linearly between fitted heights at evenly spaced inputs. The table has as many entries as the
+    layout has levels, but at most 33.
     """
 
     name = "blur-table"
@@ -75,7 +76,7 @@ class BlurTable(Simulator):
 
     @property
     def sigma_um(self) -> Tensor:
-        """Return the standard deviation of the blur, µm, which is between 0 and ``sigma_max_um``."""
+        """Return the standard deviation of the blur, µm. It is between 0 and ``sigma_max_um``."""
         return self.ranges["tau"].value(self.tau)
 
     @property
@@ -146,8 +147,8 @@ class LinearConfig(SimulatorConfig):
 
 
 class Linear(Simulator):
-    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs, the second to fourth
-    powers of one blur, the squared slopes of this blur, and 1.
+    """A weighted sum of features: H = w · φ(M). The features φ are Gaussian blurs of the layout, the second
+    to fourth powers of one of the blurs, the squared slopes of this blur, and the constant 1.
 
     The slopes along y and along x have separate weights, because the two axes of a print may differ.
     """

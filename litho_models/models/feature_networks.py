@@ -1,8 +1,9 @@
-"""Networks whose inputs are features with no parameters of their own. The features of a pixel describe either
-the layout around it, or the printed height along x.
+"""Networks whose inputs are features without parameters. The features of a pixel describe either the layout
+around the pixel, or the printed height along x.
 
-Because the features never change, they are computed once, and the networks are fitted to single pixels
-(``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes minutes.
+Because the features do not change during a fit, they are computed only once, and the networks are fitted to
+single pixels (``litho_models.fitting.pixels``). Such a fit takes seconds, while training on crops takes
+minutes.
 """
 
 from abc import abstractmethod
@@ -19,8 +20,8 @@ from litho_models.models.features import OfField, neighbours
 from litho_models.simulator import crop_border
 
 # Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is
-# the height change over the distance σ, relative to the height of the highest level; the value corresponds to
-# about 2 nm.
+# the height change over the distance σ, divided by the height of the highest level. The value corresponds to
+# a height change of about 2 nm.
 _LEAST_SLOPE = 2e-3
 
 Widths = tuple[float, ...]
@@ -56,8 +57,8 @@ class ScanAxisConfig(FeatureNetworkConfig):
 
 class FeatureNetwork(OfField):
     """A network that computes a contribution to the height, µm, from the features of each pixel. The
-    contribution is the sum of a linear part and of a network with hidden layers. Before training, both are
-    zero.
+    contribution is the sum of a linear function of the features and of a network with hidden layers. Before
+    training, both parts are zero.
     """
 
     # Whether the network may add a constant height.
@@ -109,7 +110,8 @@ class FeatureNetwork(OfField):
         """
         first, *later = self.layers
         assert isinstance(first, nn.Linear)
-        # The inputs are standardised by changing the weights instead, which saves a pass over the pixels.
+        # Instead of standardising the inputs, the weights that multiply them are changed accordingly, which
+        # saves a pass over the pixels.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
@@ -121,7 +123,7 @@ class FeatureNetwork(OfField):
     @abstractmethod
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
         """Return the slope times σ and the curvature times σ². ``height`` must have a margin of 1 px, which
-        the results lack.
+        is cropped from the results.
         """
 
     def _steepness(self, field: Tensor) -> list[Tensor]:
@@ -134,8 +136,8 @@ class FeatureNetwork(OfField):
 
 
 class Surroundings(FeatureNetwork):
-    """A network whose inputs are features of the layout near a pixel: blurs, slopes, displaced copies, and
-    the mean steepness. The features treat x and y alike.
+    """A network whose inputs are features of the layout near a pixel: blurs, slopes, displaced copies of the
+    layout, and the mean steepness. The features do not distinguish between x and y.
     """
 
     def features(self, field_um: Tensor) -> list[Tensor]:
@@ -164,8 +166,8 @@ class Surroundings(FeatureNetwork):
 
 
 class ScanAxis(FeatureNetwork):
-    """A network whose inputs are features of the printed height along x, the direction of the microscope's
-    lines: slopes, steps, and the mean steepness.
+    """A network whose inputs are features of the printed height along x: slopes, steps, and the mean
+    steepness. The microscope scans its lines in this direction.
 
     All features are 0 where the print does not change along x, so the network adds nothing there.
     """
@@ -198,8 +200,8 @@ class ScanAxis(FeatureNetwork):
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
-    """Apply a linear layer to values whose last axis is the pixels. ``values`` has shape (inputs, n), and the
-    result has shape (outputs, n).
+    """Apply a linear layer to values whose last axis numbers the pixels. ``values`` has shape (inputs, n),
+    and the result has shape (outputs, n).
     """
     if layer.bias is None:
         return layer.weight @ values

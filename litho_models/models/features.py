@@ -1,5 +1,5 @@
-"""Models whose height is a weighted sum of many features of the layout, such as blurs, slopes and products of
-these.
+"""Models in which the height is a weighted sum of many features of the layout, such as blurs, slopes and
+products of these.
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 # Below this value, the magnitude of a slope is smoothed, so that it has a derivative at 0. A slope here is a
-# height change per µm, relative to the height of the highest level.
+# height change per µm, divided by the height of the highest level.
 _LEAST_SLOPE = 1e-4
 
 
@@ -82,9 +82,9 @@ class OfField(nn.Module, ABC):
         self.register_buffer("scale", torch.ones(count))
 
     def standardise(self, seen: Sequence[Tensor]) -> None:
-        """Set the centre and the scale with which the inputs are standardised. ``seen`` contains the inputs
-        in each scan, as a tensor of shape (inputs, n). The centre is the mean over all scans, and the scale
-        is the standard deviation within a scan.
+        """Set the centre and the scale with which the inputs are standardised. ``seen`` contains one tensor
+        for each scan: the inputs at n pixels of the scan, with shape (inputs, n). The centre is the mean over
+        all scans, and the scale is the standard deviation within a scan.
         """
         centre = torch.stack([one.mean(dim=1) for one in seen]).mean(dim=0)
         spread = torch.stack([one.var(dim=1, correction=0) for one in seen]).mean(dim=0).sqrt()
@@ -137,15 +137,15 @@ class Features(OfField, Simulator):
         return self.weights @ self.completed(torch.stack(features))
 
     def completed(self, features: Tensor) -> Tensor:
-        """Add the features that are computed from φ(M), if the model has such features. ``features`` are φ(M)
-        at n pixels, and the result, of shape (weights, n), has one row for each weight.
+        """Add further features that are computed from φ(M), if the model has any. ``features`` contains φ(M)
+        at n pixels. The result has one row for each weight and therefore shape (weights, n).
         """
         return features
 
     def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Return the features φ(M) of the interior in two lists. The first list contains the simple features,
         such as blurs, slopes and displaced copies. The second list contains products of these features, and
-        1. Each feature is a map of shape (batch, 1, ny, nx).
+        the constant 1. Each feature is a map of shape (batch, 1, ny, nx).
         """
         config = self.config
         layout = layout_um / config.full_height_um
@@ -168,8 +168,8 @@ class Features(OfField, Simulator):
         return self.completed(torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)]))
 
     def _slopes(self, height: Tensor) -> list[Tensor]:
-        """Return the height, its slopes per µm, their magnitudes, and its second derivatives per µm².
-        ``height`` must have a margin of 1 px, which the results lack.
+        """Return the height, its slopes per µm, the magnitudes of the slopes, and its second derivatives per
+        µm². ``height`` must have a margin of 1 px, which is cropped from the results.
         """
         pitch, inner = self.pitch_um, crop_border(height, 1)
         up, down, left, right = neighbours(height, 1)
@@ -193,7 +193,9 @@ class Features(OfField, Simulator):
         return found
 
     def _streaks(self, layout: Tensor) -> list[Tensor]:
-        """Return blurs that are wide along one axis (y, then x) and one pixel wide along the other axis."""
+        """Return blurs of the layout that are wide along one axis and narrow (standard deviation of one
+        pixel) along the other axis. For each width, the blur that is wide along y comes first.
+        """
         wide, narrow = self.config.streak_sigmas_um, self.pitch_um
         pairs = [pair for sigma in wide for pair in ((sigma, narrow), (narrow, sigma))]
         return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
@@ -228,7 +230,8 @@ class RandomFeatures(Features):
     features. V and c are random and not fitted.
 
     The model is a network whose hidden layer is not trained (random features, Rahimi and Recht 2008). It can
-    represent more than products of two features, and its weights are still found in closed form.
+    represent more functions than products of two features can, and its weights are still found in closed
+    form.
     """
 
     name = "random-features"

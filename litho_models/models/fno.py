@@ -1,10 +1,11 @@
-"""FNO: the Fourier neural operator, which is the learned simulator of the paper that contains no physics.
+"""FNO: the Fourier neural operator. In the paper, it is the learned simulator without any knowledge of
+physics.
 
 The model is the two-dimensional operator of Li et al. 2020 (arXiv:2010.08895) with 12 x 12 modes and width
-24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of a local
-convolution and of a product in Fourier space, which acts on the whole layout. The operator treats the layout
-as periodic. A mode is defined by its number of periods per layout, so the result depends on the size of the
-layout. The variant ``default`` therefore applies the operator to tiles of one size.
+24; see arXiv:2309.17343, appendix "Fourier Neural Operator". The output of each layer is the sum of two
+parts: a local convolution, and a product in Fourier space, which acts on the whole layout. The operator
+treats the layout as periodic. A mode is defined by its number of periods per layout, so the result depends on
+the size of the layout. The variant ``default`` therefore applies the operator to tiles of one size.
 """
 
 import math
@@ -19,8 +20,8 @@ from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
-# Limit of the number of Fourier weights, so that a card cannot request too much memory. It is ninety times
-# the number in the paper.
+# Largest allowed number of Fourier weights. It prevents a model card from requesting too much memory, and is
+# ninety times the number in the paper.
 _MOST_MATRIX_ENTRIES = 30_000_000
 
 
@@ -32,7 +33,8 @@ class FnoConfig(SimulatorConfig):
     projection_channels: int = Field(
         128, ge=1, le=4096, description="number of hidden channels between the last two layers"
     )
-    # The paper uses 1 x 1. Then detail finer than the kept modes is mapped only pixel by pixel.
+    # The paper uses 1 x 1. With this size, detail that is finer than the kept modes is mapped only pixel by
+    # pixel, without regard to its surroundings.
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, px; must be odd")
     coordinates: bool = Field(False, description="whether y and x, scaled to 0 ... 1, are further inputs")
     padding_fraction: float = Field(
@@ -57,7 +59,7 @@ class FnoConfig(SimulatorConfig):
         "starts_as_layout": False,
     }
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
-        # This is 9 px for the published quadrants of 256 px.
+        # The value corresponds to 9 px for the published quadrants of 256 px.
         "paper": {**_PUBLISHED, "padding_fraction": 9 / 256},
         "authors": {**_PUBLISHED, "padding_px": 9, "width": 12},
     }
@@ -113,7 +115,7 @@ class Fno(Simulator):
         """
         config = self.config
         ny, nx = layout_um.shape[-2:]
-        # The input and the output are heights and need the precision of float32, even under autocast.
+        # The input and the output are heights, which need the precision of float32 even if autocast is on.
         # Channels are the last axis, so that sums over channels are matrix products.
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
@@ -157,8 +159,9 @@ class PeriodicConvolution(nn.Conv2d):
 
 
 class SpectralConvolution(nn.Module):
-    """A convolution that is computed in Fourier space. At each of the lowest frequencies k, the vector of
-    channels v̂(k) is multiplied by a matrix W(k). All other frequencies are set to zero.
+    """A convolution that is computed in Fourier space. At each of the lowest frequencies k, the vector v̂(k)
+    of the Fourier coefficients of all channels is multiplied by a matrix W(k). All other frequencies are set
+    to zero.
 
     The weights are stored as real numbers, so that they can be saved and converted like any other parameter.
     Their shape is (2, channels in, channels out, modes along y, modes along x, 2). The first axis is the sign
@@ -170,11 +173,11 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Convolve a field of shape (batch, ny, nx, channels). A small field, which has fewer frequencies
-        than there are modes, uses only some of the modes.
+        """Convolve a field of shape (batch, ny, nx, channels). If the field is so small that it has fewer
+        frequencies than there are modes, only some of the modes are used.
 
-        Only a few frequencies are kept. Products with their waves are therefore cheaper than fast Fourier
-        transforms.
+        Only a few frequencies are kept. Multiplying by the waves of these frequencies is therefore cheaper
+        than a fast Fourier transform.
         """
         ny, nx = field.shape[1:3]
         modes_y, modes_x = self.weight.shape[3:5]
@@ -199,15 +202,15 @@ def _waves(frequencies: Tensor, size: int, like: Tensor) -> Tensor:
     """Return the waves exp(2πi k n / N) for the given frequencies k and the pixels n = 0 … N - 1, where N is
     ``size``. The result has shape (frequencies, N) and the precision and device of ``like``.
     """
-    # The products k n are whole numbers. They are reduced to one period first, so the angles stay exact at
-    # any size.
+    # The products k n are whole numbers. They are reduced modulo N first, so that the angles stay exact for
+    # fields of any size.
     turns = torch.outer(frequencies, torch.arange(size)) % size
     angle = (2 * math.pi / size) * turns.double()
     return torch.complex(angle.cos().to(like), angle.sin().to(like))
 
 
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
-    """Apply a 1 x 1 convolution to features. Their last axis is the channels."""
+    """Apply a 1 x 1 convolution to features whose last axis numbers the channels."""
     return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
 
 
