@@ -24,8 +24,8 @@ from litho_data.foundation.kinds import Array
 
 # Radius at which a kernel is cut off, in units of λ / NA.
 _REACH = 4.0
-# Number of sample points along each side of a frequency cell. They are used to estimate the share of the cell
-# that the source fills. The number is odd, so one point is at the centre.
+# Number of sample points along each side of a frequency cell. The points are used to estimate the share of
+# the cell that the source fills. Their number is odd, so one point is at the centre of the cell.
 _COUNTED = 9
 
 
@@ -37,7 +37,7 @@ class Optics(NamedTuple):
         outer, inner: outer and inner radius of a round or ring-shaped source, relative to the radius of the
             pupil. If both are 0, the source is a point.
         defocus_um: distance of the resist from the focus, µm.
-        kernels: number of kernels that are used. They are the strongest ones.
+        kernels: number of kernels that are used. They are the kernels with the largest singular values.
     """
 
     wavelength_um: float
@@ -55,7 +55,8 @@ def kernel_reach_px(optics: Optics, pitch_um: float) -> int:
 
 def intensity(transmission: Tensor, optics: Optics, pitch_um: float) -> Tensor:
     """Return the intensity of the image of a mask, relative to that of an open mask. The mask has shape
-    (batch, 1, ny, nx). The result lacks a border as wide as the radius of the kernels.
+    (batch, 1, ny, nx). The result is smaller than the mask: a border as wide as the radius of the kernels is
+    cropped on each side.
     """
     reach = kernel_reach_px(optics, pitch_um)
     spectra = _spectra(optics, pitch_um, 2 * reach + 1, *transmission.shape[-2:])
@@ -66,8 +67,8 @@ def imaged_inside(transmission: Tensor, spectra: Tensor, reach_px: int) -> Tenso
     """Return the intensity of the image of a mask that is not periodic, without the outermost ``reach_px``
     pixels.
     """
-    # Fourier transforms spread rounding errors over the whole field. In double precision these are so small
-    # that tiles give the same result as the whole field.
+    # Fourier transforms spread rounding errors over the whole field. In double precision, the rounding errors
+    # are so small that computing the image in tiles gives the same result as computing it at once.
     image = imaged(transmission.double(), spectra.to(transmission.device))
     return functional.pad(image, (-reach_px,) * 4).to(transmission.dtype)
 
@@ -103,7 +104,7 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
             got=f"a ring of radii {optics.inner:g} to {optics.outer:g}",
             wanted="a wider ring",
         )
-    # All kernels are 0 at frequencies that no point of the source shifts into the pupil.
+    # All kernels are zero at frequencies that no point of the source shifts into the pupil.
     reach = 1 + np.hypot(y[source], x[source]).max() / cutoff
     bright = np.flatnonzero(np.hypot(y, x) / cutoff <= reach + 1e-9)
     shifted = y[source, None] + y[bright], x[source, None] + x[bright]
@@ -117,8 +118,8 @@ def transfer_functions(optics: Optics, pitch_um: float, shape: tuple[int, int]) 
 
 
 def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
-    """Return the share of each frequency cell that the source fills. ``y`` and ``x`` are the centres of the
-    cells and ``cell`` is their size, all relative to the radius of the pupil.
+    """Return the share of each frequency cell that the source fills. ``y`` and ``x`` are the coordinates of
+    the centres of the cells, and ``cell`` is the size of a cell. All are relative to the radius of the pupil.
     """
     inside = (np.arange(_COUNTED) + 0.5) / _COUNTED - 0.5
     filled = np.zeros(len(y))
@@ -130,8 +131,8 @@ def _filled(y: Array, x: Array, cell: Sequence[float], optics: Optics) -> Array:
 
 
 def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
-    """Return the complex amplitude that passes through the pupil at each frequency. Its phase is that of the
-    defocus.
+    """Return the complex amplitude that passes through the pupil at each frequency. The phase of this
+    amplitude comes from the defocus.
     """
     squared = (fy**2 + fx**2) * optics.wavelength_um**2
     inside = squared <= optics.na**2 * (1 + 1e-9)
@@ -142,7 +143,7 @@ def _pupil(fy: Array, fx: Array, optics: Optics) -> Array:
 @lru_cache(maxsize=2)
 def _spectra(optics: Optics, pitch_um: float, size_px: int, ny: int, nx: int) -> Tensor:
     """Crop the kernels of a lens to ``size_px`` pixels, and return their transfer functions on a field of
-    shape (ny, nx), as ``spectra_of`` does.
+    shape (ny, nx), in the form that ``spectra_of`` returns.
     """
     kernels = np.fft.ifft2(transfer_functions(optics, pitch_um, (size_px, size_px)))
     return spectra_of(np.fft.fftshift(kernels, axes=(-2, -1)), ny, nx)

@@ -1,8 +1,8 @@
-"""Parts from which modular models of printers are assembled. A part is a function that turns one field, such
-as a dose, into the next, with its parameters and the source of its formula.
+"""Parts from which modular models of printers are assembled. A part contains a function that turns one field,
+such as a dose, into the next field, the parameters of this function, and a reference for its formula.
 
-Fields have shape (batch, 1, ny, nx) and are relative to the full dose or the full height. A part may crop the
-field by its receptive radius.
+Fields have shape (batch, 1, ny, nx). Their values are relative to the full dose or to the full height. The
+field that a part returns may be cropped by the receptive radius of the part.
 """
 
 import math
@@ -24,9 +24,9 @@ from litho_models.layers.ranges import Range
 from litho_models.models.hopkins import Optics, imaged_inside, intensity, kernel_reach_px, spectra_of
 from litho_models.simulator import crop_border
 
-# Where the resist changes by less than this between neighbouring pixels, there is no edge.
+# If the resist changes by less than this between neighbouring pixels, there is no edge between them.
 FLATTEST = 5e-3
-# By default, the upper limit of a length is this multiple of its starting value.
+# By default, the upper limit of a length parameter is this multiple of its starting value.
 _WIDEST = 5.0
 _BIAS_PX = 5.0
 _CORNERS = 20.0
@@ -77,7 +77,8 @@ class Part:
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
     """Return the radius of a Gaussian spot in pixels."""
-    # The width is rounded, because the rounding errors of float32 must not change the size of the kernel.
+    # The width is rounded to fewer digits, so that rounding errors of float32 cannot change the size of the
+    # kernel.
     return kernel_radius_px(round(float(torch.as_tensor(sigma_um).detach()), 6) / pitch_um)
 
 
@@ -88,11 +89,11 @@ def illuminate(
     ``reach_px`` pixels on each side.
 
     One Gaussian describes light or a fine beam. A second, wide Gaussian describes backscattered electrons
-    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third Gaussian may be added, with a width between these
-    two.
+    (Chang, J. Vac. Sci. Technol. 12, 1271 (1975)). A third Gaussian with a width between these two may be
+    added.
 
     Args:
-        pattern: pattern to write, with the pixel pitch ``pitch_um``, µm; ``spots``: share and standard
+        pattern: pattern to write, whose pixel pitch is ``pitch_um``, µm; ``spots``: share and standard
             deviation (µm) of each Gaussian.
         reach_px: width of the cropped border; at least the radius of the widest Gaussian.
     """
@@ -105,8 +106,8 @@ def illuminate(
 
 
 def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
-    """Apply the response of a resist with a smooth threshold to the exposure. The response maps 0 to 0 and 1
-    to 1 (Wang et al. 2011, doi:10.1007/s00158-010-0602-y).
+    """Apply the response of a resist to the exposure. The response is a smooth threshold that maps 0 to 0 and
+    1 to 1 (Wang et al. 2011, doi:10.1007/s00158-010-0602-y).
     """
     low = torch.tanh(steepness * threshold)
     return (low + torch.tanh(steepness * (exposure - threshold))) / (
@@ -116,7 +117,7 @@ def project(exposure: Tensor, steepness: Tensor, threshold: Tensor) -> Tensor:
 
 def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
     """Return the share of the resist that a dose E converts: E^γ / (E^γ + η^γ), where γ is the contrast and η
-    the threshold. At the threshold, one half is converted.
+    the threshold. If the dose equals the threshold, one half of the resist is converted.
     """
     turned = exposure.clamp(min=1e-6) ** contrast
     return turned / (turned + threshold**contrast)
@@ -124,15 +125,16 @@ def hill(exposure: Tensor, contrast: Tensor, threshold: Tensor) -> Tensor:
 
 def contrast_curve(exposure: Tensor, contrast: Tensor, clearing: Tensor) -> Tensor:
     """Return the share of the depth to which a dose E is developed: 1 + γ log₁₀(E / E₀), where γ is the
-    contrast and E₀ the clearing dose. The share is limited to 0 ... 1, with rounded corners.
+    contrast and E₀ the clearing dose. The share is limited to 0 ... 1. At both limits, the curve has rounded
+    instead of sharp corners, so that it stays differentiable.
     """
     depth = 1 + contrast * torch.log10(exposure.clamp(min=1e-6) / clearing)
     return (functional.softplus(_CORNERS * depth) - functional.softplus(_CORNERS * (depth - 1))) / _CORNERS
 
 
 def etch(resist: Tensor, threshold: Tensor | float, bias_um: Tensor | float, pitch_um: float) -> Tensor:
-    """Return the coverage of each pixel by an etched film, which remains where the resist exceeds the
-    threshold. The result is cropped by one pixel on each side.
+    """Return, for each pixel, the share of its area that is covered by an etched film. The film remains where
+    the resist exceeds the threshold. The result is cropped by one pixel on each side.
 
     The edge of the film lies where the resist crosses the threshold, moved outward by the bias. A pixel that
     the edge crosses is partly covered. The coverage is a sigmoid, about one pixel wide, of the distance from
@@ -175,8 +177,8 @@ def _shrink(resist: Tensor, values: Values, pitch_um: float) -> Tensor:
 
 
 def kernels_part(name: str, file: str | Path) -> Part:
-    """Make a part that images a mask M with coherent kernels h_k from an NPY file. The intensity Σ_k |h_k *
-    M|² is scaled to 1 for an open mask.
+    """Make a part that images a mask M with coherent kernels h_k, which are read from an NPY file. The image
+    is the intensity Σ_k |h_k * M|², scaled so that an open mask has intensity 1.
 
     Args:
         name: name of the part.
@@ -296,7 +298,7 @@ PARTS = {
 
 
 def register_part(part: Part) -> Part:
-    """Register a part, so that models in this process can use its name in their ``parts``.
+    """Register a part. Models in this process can then name it in their setting ``parts``.
 
     Raises:
         InputError: the name of the part is already taken.

@@ -1,5 +1,5 @@
-"""PBL: physics-based learning. This is the main simulator of the paper, which has networks for the unknown
-steps of the process.
+"""PBL: physics-based learning. This is the main simulator of the paper. It models the known steps of the
+process by formulas and the unknown steps by networks.
 
 PBL is a chain of five steps:
 
@@ -58,16 +58,16 @@ class PblConfig(SimulatorConfig):
     sigma_diffusion_max_um: float = Field(
         2.5, gt=0, description="upper bound η of the diffusion, standard deviation, µm"
     )
-    # The diffusion blur starts wider than the radius of the areawise network (0.5 µm), because no other step
-    # of the chain can learn influences at larger distances.
+    # The starting width of the diffusion blur exceeds the radius of the areawise network (0.5 µm), because no
+    # other step of the chain can learn influences at larger distances.
     sigma_diffusion_init_um: float = Field(
         1.5, gt=0, description="diffusion before training, standard deviation, µm"
     )
     pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
     areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
-    # If True, the model returns the optically blurred layout before training and learns the difference. The
-    # networks in the paper start with random weights.
+    # If True, the untrained model returns the optically blurred layout, and the networks learn the difference
+    # of the print from it. The networks in the paper start with random weights.
     starts_as_blur: bool = True
     kernel_support: Support = "four-sigma"
     kernel_cap_px: int | None = Field(
@@ -126,12 +126,14 @@ class PblConfig(SimulatorConfig):
 
     @property
     def exposing(self) -> Part:
-        """Return the part for the illumination: the Gaussian spot, or the part that replaces it."""
+        """Return the part that models the illumination. It is the Gaussian spot, or the part that the
+        configuration names instead.
+        """
         return part_of(self.illumination or "spot")
 
     @property
     def exposing_values(self) -> dict[str, float]:
-        """Return the values of this part's parameters by name."""
+        """Return the values of the illumination part's parameters, keyed by name."""
         return {name: self.numbers.get(name, own.start) for name, own in self.exposing.numbers.items()}
 
     @model_validator(mode="after")
@@ -155,10 +157,11 @@ class Pbl(Simulator):
     g_shrink = 1 + net, g_mismatch(H) = H + net(H). The last layers of these networks are zero before
     training.
 
-    The variant ``default`` adds two feature networks to this chain. ``surroundings`` describes the influence
-    of the layout within some micrometres, which is the same along x and y. ``scan_axis`` describes how the
-    height along x influences the measured height. It is part of the fit so that the other networks do not
-    learn this influence; ``printer()`` leaves it out.
+    The variant ``default`` adds two feature networks to this chain. ``surroundings`` describes how the layout
+    within some micrometres of a pixel influences its height. This influence is the same along x and y.
+    ``scan_axis`` describes how the height along x influences the measured height. This influence may come
+    from the microscope. The network takes part in the fit so that the other networks do not learn the
+    influence, but ``printer()`` returns the model without it.
     """
 
     name = "pbl"
@@ -182,7 +185,7 @@ class Pbl(Simulator):
 
     @property
     def feature_networks(self) -> list[FeatureNetwork]:
-        """Return the feature networks of the model. They have the order of the fields that ``feature_fields``
+        """Return the feature networks of the model, in the order of the input fields that ``feature_fields``
         returns.
         """
         return [network for network in (self.surroundings, self.scan_axis) if network is not None]
@@ -195,7 +198,7 @@ class Pbl(Simulator):
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
-        """Replace the weights of this model's chain by those of the given chain."""
+        """Copy the weights of the given chain into the chain of this model."""
         self.load_state_dict(self.state_dict() | chain.state_dict())
 
     def _without(self, *parts: str) -> Pbl:

@@ -1,5 +1,5 @@
 """Physics: the parameterised simulator of the paper. It has few physical values: six by default, five in the
-variants ``paper`` and ``authors``, and more if the spot is fitted.
+variants ``paper`` and ``authors``, and more if the width of the spot is fitted.
 
 It is a chain of an optical blur, a threshold with a normalised tanh (projection; Zhou et al. 2014), a
 diffusion blur, a shrinkage that depends on the dose, and a height bias. See arXiv:2309.17343, appendix
@@ -44,8 +44,8 @@ class PhysicsConfig(SimulatorConfig):
     sigma_diffusion_max_um: float = Field(
         2.5, gt=0, description="upper bound of the diffusion, standard deviation, µm"
     )
-    # The starting values matter. Fits that start from a steep threshold in the middle of the range end with a
-    # nearly linear projection.
+    # The starting values influence the result. If a fit starts from a steep threshold in the middle of the
+    # range, it ends with a nearly linear projection.
     sigma_diffusion_init_um: float = Field(
         1.5, gt=0, description="diffusion before fitting, standard deviation, µm"
     )
@@ -59,8 +59,8 @@ class PhysicsConfig(SimulatorConfig):
         None, gt=0, description="gain before fitting; None: the gain is fixed at 1"
     )
     bias_init_um: float = Field(0.0, description="height bias before fitting, µm")
-    # With the value 1, the equations are in µm. With None, they are in units of the full height. The paper
-    # does not state this reference height.
+    # Reference height H₀. With the value 1, heights in the equations are in µm. With None, they are in units
+    # of the full height. The paper does not state its reference height.
     reference_height_um: float | None = Field(
         None, gt=0, description="height, µm, that counts as 1; None: the height of the highest level"
     )
@@ -100,7 +100,7 @@ class Physics(Simulator):
     The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
     ``default`` scales it by a fixed range, ``paper`` by the range of the dose in the layout, and ``authors``
     by the maximum of the dose in the layout. In ``paper`` and ``authors``, the height of a pixel therefore
-    depends on where the layout is cropped.
+    changes if the layout is cropped differently.
     """
 
     name = "physics"
@@ -140,8 +140,8 @@ class Physics(Simulator):
         return keys[self.config.spot]
 
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
-        """Return the standard deviation of the spot along y and along x, µm. A value that is not fitted is a
-        Python number.
+        """Return the standard deviation of the spot along y and along x, µm. If one of the two values is not
+        fitted, it is a Python number instead of a tensor.
         """
         keys = self._spot_keys or ("",)
         given = self.config.sigma_optical_um
@@ -179,8 +179,8 @@ class Physics(Simulator):
         """
         values = self.values
         optical, diffusion = self._radii_px(values)
-        # Beyond its edge, the layout is continued by repeating its outermost pixels. A margin as wide as the
-        # radius of the optical blur is enough, because farther outside the blurred layout no longer changes.
+        # The layout is padded by repeating its outermost pixels. A margin as wide as the radius of the
+        # optical blur is enough, because the blurred layout is constant farther outside.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
         blur = partial(gaussian_blur, pitch_um=self.pitch_um, edge=edge)
@@ -190,13 +190,13 @@ class Physics(Simulator):
         initial = crop_border(initial, margin if edge else diffusion)
         return self._develop(initial, crop_border(dose, margin), values)
 
-    # The methods below receive the physical values as an argument. The values are computed only once per
-    # pass, because every operation is slow in forward-mode differentiation.
+    # The methods below receive the physical values as an argument, so that the values are computed only once
+    # per pass. This saves time, because every operation is slow in forward-mode differentiation.
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        # The widths are rounded, because the rounding errors of float32 must not change the size of the
-        # kernel.
+        # The widths are rounded to fewer digits, so that rounding errors of float32 cannot change the size of
+        # the kernel.
         widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
         spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (

@@ -1,5 +1,5 @@
-"""Modular models of printers, assembled from parts. There is one class of model, with default settings for
-several machines.
+"""Modular models of printers, assembled from parts. One class implements all of these models, and subclasses
+contain default settings for several machines.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from litho_models.simulator import Simulator, SimulatorConfig, Variant
 
 class PrinterConfig(SimulatorConfig):
     """Configuration of a printer: its parts, in the order in which they act, and the values of their
-    parameters. A value is the starting value of a fitted parameter, or the fixed value of any other. A
-    parameter has the name ``part.parameter``.
+    parameters. For a fitted parameter, the value is its starting value; any other parameter keeps this value.
+    The name of a parameter has the form ``part.parameter``.
 
     Each parameter can also be set like a field of the configuration, under this name, such as
     ``spot.sigma_um``.
@@ -32,8 +32,8 @@ class PrinterConfig(SimulatorConfig):
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
-        """Make the configuration of a variant, as for other models. The fields may include parameters of
-        parts.
+        """Make the configuration of a variant, as for other models. ``fields`` may also contain values for
+        parameters of the parts.
         """
         own = {**cls.model_fields["numbers"].default, **fields.get("numbers", {})}
         own |= {name: value for name, value in fields.items() if "." in name}
@@ -56,7 +56,7 @@ class PrinterConfig(SimulatorConfig):
         return self
 
     def all_numbers(self) -> list[tuple[Part, str, Number]]:
-        """Return all parameters of all parts, each with its part and its name."""
+        """Return all parameters of all parts. Each comes with its part and with its name."""
         found = map(part_of, self.parts)
         return [(part, f"{part.name}.{key}", own) for part in found for key, own in part.numbers.items()]
 
@@ -88,7 +88,7 @@ class Printer(Simulator):
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """Return the fitted values. Their names have the form ``part.parameter``."""
+        """Return the values of the fitted parameters, keyed by names of the form ``part.parameter``."""
         return {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
 
     @property
@@ -102,8 +102,8 @@ class Printer(Simulator):
         return self.config.full_height_um * field
 
     def _chain(self) -> list[tuple[Part, dict[str, Any]]]:
-        """Return the parts, each with the values of its parameters by name. Values that are not fitted are
-        Python numbers.
+        """Return the parts in order. Each comes with the values of its parameters, keyed by name. Values that
+        are not fitted are Python numbers.
         """
         known = {**self.config.numbers, **self.values}
         found: dict[str, dict[str, Any]] = {name: {} for name in self.config.parts}

@@ -1,15 +1,16 @@
 """Test whether the mean of a monitored quantity has changed since the reference prints, at a given rate of
 false alarms.
 
-The test makes one comparison for each new print. It assumes that the mean steps at this print and stays
-changed until the last print. A t test with a pooled spread compares the values before the step, which include
-those of the reference prints, with the values after it. Student's t distribution holds for any number of
-reference prints, although their mean and spread are unknown. This is the likelihood-ratio test for a step in
-the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality Technology 35, 355). The rate of
-false alarms is divided among the comparisons, so it holds for all of them together, even if they are
-correlated (Bonferroni). A step should be noticed within ``SOON`` prints. Comparisons with at least that many
-prints after the step therefore get most of the rate. With three new prints, the test is nearly the t test of
-their mean, which is the best possible test if the spread is unknown.
+The test makes one comparison for each new print. This comparison assumes that the mean changes in a step at
+this print and stays changed until the last print. The values before the step, which include those of the
+reference prints, are compared with the values after it by a t test with a pooled spread. Student's t
+distribution holds for any number of reference prints, although their mean and spread are unknown. This is the
+likelihood-ratio test for a step in the mean with unknown parameters (Hawkins, Qiu and Kang 2003, J. Quality
+Technology 35, 355). The rate of false alarms is divided among the comparisons (Bonferroni). It therefore
+holds for all comparisons together, even if they are correlated. A step should be noticed within ``SOON``
+prints. Comparisons with at least that many prints after the step therefore get most of the rate. With three
+new prints, the test is nearly the t test of their mean, which is the best possible test if the spread is
+unknown.
 """
 
 from typing import NamedTuple
@@ -23,15 +24,16 @@ from litho_data.foundation.kinds import Array
 
 # Number of prints within which a step should be noticed.
 SOON = 3
-# Share of the rate of false alarms that each comparison with fewer than ``SOON`` prints after the step gets.
+# Share of the rate of false alarms that is allotted to each comparison with fewer than ``SOON`` prints after
+# the step.
 _YOUNG = 0.1
-# Largest step that is considered, in standard errors.
+# Largest size of a step that is considered, in units of its standard error.
 _LARGEST = 1e4
 
 
 class Series(NamedTuple):
-    """The value of a monitored quantity for each print, in printing order, and the variance of each value up
-    to a common factor. There are n reference prints and m new prints.
+    """The value of a monitored quantity for each print, in printing order, and the relative variance of each
+    value, which is its variance up to a common unknown factor. There are n reference prints and m new prints.
 
     Attributes:
         reference: values of the reference prints, with shape (..., n).
@@ -61,8 +63,8 @@ class Step(NamedTuple):
 
 
 def shares(new_prints: int) -> Array:
-    """Return the share of the rate of false alarms that each comparison gets, with shape (m,). The
-    comparisons have the order of their first changed print. The shares add up to 1.
+    """Return the share of the rate of false alarms that each comparison gets, with shape (m,). There is one
+    comparison for each of the m new prints, in printing order. The shares add up to 1.
     """
     young = min(SOON, new_prints) - 1
     old = new_prints - young
@@ -96,7 +98,8 @@ def likeliest_step(series: Series) -> tuple[Step, float]:
     """Return the most significant step, and an upper bound on its p value.
 
     Args:
-        series: values of shape (n,) and (m,), with n at least 2 and m at least 1.
+        series: values of one quantity, with shapes (n,) for the reference prints and (m,) for the new prints;
+            n is at least 2 and m at least 1.
     """
     sizes, errors = step_statistics(series)
     freedom = len(series.reference) + len(series.new) - 2
@@ -110,8 +113,9 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
     """Return the probability that a rise of the mean raises an alarm within ``SOON`` prints, or within all
     new prints if there are fewer.
 
-    The result is a lower bound. It is computed from the noncentral t distribution of a single comparison, in
-    which the assumed step is at the first print after the rise. All values are assumed to be Gaussian.
+    The result is a lower bound. It is computed from a single comparison, in which the assumed step is at the
+    first print after the rise. The statistic of this comparison has a noncentral t distribution. All values
+    are assumed to be Gaussian.
 
     Args:
         step: size of the rise, in units of the unknown spread of a print whose relative variance is 1.
@@ -126,7 +130,7 @@ def chance_to_notice(step: float, reference_variance: Array, new_variance: Array
 def noticeable_step(reference_variance: Array, new_variance: Array, rate: float, power: float = 0.9) -> float:
     """Return the size of a step that raises an alarm with probability ``power``, in units of the spread of a
     print whose relative variance is 1. The result is infinite if the step exceeds ten thousand standard
-    errors. The arguments are those of ``chance_to_notice``.
+    errors. The other arguments are those of ``chance_to_notice``.
     """
     error = _comparison(reference_variance, new_variance, rate)[2]
 
@@ -138,7 +142,8 @@ def noticeable_step(reference_variance: Array, new_variance: Array, rate: float,
 
 def _comparison(reference_variance: Array, new_variance: Array, rate: float) -> tuple[float, int, float]:
     """Consider the comparison of the last ``SOON`` prints with all prints before them. Return the value of t
-    above which it raises an alarm, its degrees of freedom, and its standard error.
+    above which this comparison raises an alarm, the degrees of freedom of t, and the standard error of the
+    step.
     """
     n, m = len(reference_variance), len(new_variance)
     soon = min(SOON, m)

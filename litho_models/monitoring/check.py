@@ -28,16 +28,16 @@ def check(
     false_alarms: float = DEFAULT_RATE,
     tolerance: float | None = None,
 ) -> Check:
-    """Compare new prints with reference prints, both relative to the predictions of a model. Write
-    ``check.json``, a report and tables.
+    """Test whether a printer has changed, by comparing new prints with reference prints. Each print is first
+    compared with the prediction of a model. Write ``check.json``, a report and tables.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store of the new prints. If the model was trained on prints of this store, its locked
             scans are left out.
         out: result folder.
-        reference: store of prints made before any change of the printer. By default, the reference is the
-            values of the training prints that the model's card contains.
+        reference: store of prints made before any change of the printer. By default, the values of the
+            training prints that the model's card contains are the reference.
         new: names of the new prints, if ``store`` also contains the reference prints. All other prints of the
             store are then reference prints.
         false_alarms: probability that prints of an unchanged printer raise an alarm in any monitored
@@ -60,8 +60,8 @@ def check(
         say(f"checking {len(dataset)} scans of {dataset.name}")
         found = gather(frozen, dataset, reference, new)
         parameters = frozen.card["parameters"]
-        # The error of the model on its training prints may be smaller than on unseen prints. The two cannot
-        # be compared then, so the error is not monitored.
+        # The error of the model on its training prints may be smaller than on unseen prints. In this case the
+        # two errors cannot be compared, so the error is not monitored.
         optimistic = wording.too_optimistic(found.reference, parameters)
         judged = judge(
             found.reference,

@@ -18,16 +18,16 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
 FEWEST_REFERENCE_PRINTS = 4
-# If the reference prints are lower than half or higher than twice the predicted heights, the model describes
-# another printer.
+# If the measured heights of the reference prints are less than half or more than twice the predicted heights,
+# the model is taken to describe another printer.
 _OWN_GAIN = (0.5, 2.0)
 
 
 class Figures(NamedTuple):
     """The monitored values of the reference scans and of the new scans. ``dropped`` lists the excluded scans
-    with the reason, and ``words`` describes the reference.
+    with the reasons for their exclusion, and ``words`` describes the reference in words.
 
-    ``between`` says whether new prints may have been made between reference prints.
+    ``between`` is True if new prints may have been made between reference prints.
     """
 
     reference: list[ScanFigures]
@@ -40,8 +40,8 @@ class Figures(NamedTuple):
 def gather(
     frozen: FrozenSimulator, dataset: Store, reference: str | Path | None, new: Sequence[str]
 ) -> Figures:
-    """Compute the monitored values of the scans of the new prints and of the reference prints. Only scans at
-    one dose are kept.
+    """Compute the monitored values of the scans of the new prints and of the reference prints. Only scans
+    that have the dose of most reference scans, or that state no dose, are kept.
 
     Raises:
         InputError: there is no reference, or more than one; a print is unknown; a store has another pitch or
@@ -83,8 +83,8 @@ def _require_prints(names: Sequence[str], rows: Sequence[ScanFigures], dataset: 
 
 
 def _of_card(frozen: FrozenSimulator, dataset: Store) -> list[ScanFigures]:
-    """Return the monitored values of the prints on which the model was trained. They are in the card of the
-    model. Raise an InputError if the store contains these prints.
+    """Return the monitored values of the prints on which the model was trained. The values are read from the
+    model's card. Raise an InputError if the store contains these prints.
     """
     hint = "use --reference STORE, or --new PRINT to compare it with the other prints of this store"
     if not frozen.card["baseline"]:
@@ -126,8 +126,8 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
 
 
 def _of_one_dose(found: Figures) -> Figures:
-    """Keep only the scans whose dose is that of most reference scans. Other doses change the gain on purpose.
-    Scans that state no dose are kept.
+    """Keep only the scans whose dose is that of most reference scans. Scans with another dose are excluded,
+    because their gain was changed on purpose. Scans that state no dose are kept.
     """
     doses = Counter(row.dose for row in found.reference if row.dose is not None)
     if not doses:

@@ -1,5 +1,5 @@
-"""Judge each monitored quantity: whether it has changed, and when to measure again. This module needs neither
-files nor models, only the values of the scans.
+"""Judge for each monitored quantity whether it has changed, and estimate when it should be measured again.
+This module needs neither files nor models, only the values of the scans.
 """
 
 from collections.abc import Sequence
@@ -45,10 +45,10 @@ def forecast(values: np.ndarray, variance: np.ndarray, reference: np.ndarray, to
     """Fit a straight trend to the values of all prints, and estimate the number of prints until the drift may
     reach the tolerance.
 
-    The drift is the change since the model was made: the slope of the trend times the number of prints since
-    then. The model is taken to have been made at the middle of the reference prints. The 95 % bound on the
-    drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift. Sudden
-    steps are not forecast; they raise an alarm.
+    The drift is the change since the model was made. It is the slope of the trend times the number of prints
+    since then. The model is taken to have been made at the middle of the reference prints. The 95 % bound on
+    the drift uses the steeper end of the slope's confidence interval. The forecast assumes a steady drift.
+    Sudden steps are not forecast; they raise an alarm.
 
     Args:
         values: one value per print in printing order, with shape (n,); at least three.
@@ -90,9 +90,11 @@ def judge(
             reference prints.
         rate: probability of a false alarm if nothing has changed. It is divided among the quantities in
             proportion to their weights.
-        tolerance: largest allowed relative drift; by default three times the spread between reference prints.
-        between: whether new prints may have been made between reference prints. If so, the trend is fitted in
-            the common printing order; otherwise all new prints come after the reference prints.
+        tolerance: largest allowed relative drift of a quantity; by default three times its spread between
+            reference prints.
+        between: True if new prints may have been made between reference prints. The trend is then fitted to
+            all prints in their common printing order. If False, all new prints are taken to come after the
+            reference prints.
     """
     return [
         _judged(figure, reference, new, own, tolerance, between=between)
@@ -101,7 +103,7 @@ def judge(
 
 
 def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
-    """Return the part of the rate of false alarms that each quantity gets."""
+    """Return the part of the rate of false alarms that is allotted to each quantity."""
     total = sum(figure.weight for figure in figures)
     return [rate * figure.weight / total for figure in figures]
 

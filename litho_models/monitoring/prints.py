@@ -19,9 +19,10 @@ _LEAST_GAIN = 0.01
 class Figure(NamedTuple):
     """A monitored quantity.
 
-    ``words`` is the name of the quantity in sentences, and ``causes`` lists what may change it. ``of``
-    returns the logarithm of the quantity for one scan, so that differences are relative: a step of 0.03 is 3
-    %. ``weight`` is the share of the rate of false alarms that the quantity gets.
+    ``words`` is the name of the quantity in sentences, and ``causes`` lists what may change it. ``of`` is a
+    function that returns the logarithm of the quantity for one scan. Differences of logarithms are relative
+    changes: a step of 0.03 is 3 %. ``weight`` determines the share of the rate of false alarms that is
+    allotted to the quantity.
     """
 
     name: str
@@ -35,7 +36,8 @@ FIGURES = (
     Figure(
         "gain",
         "height gain",
-        # The gain of a failed print may be near or below 0, so a lower limit is needed.
+        # The gain of a failed print may be near or below 0, where its logarithm is very low or does not
+        # exist. The gain is therefore limited from below.
         lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
         "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
         "height tells them apart",
@@ -91,7 +93,9 @@ class Spread(NamedTuple):
 
 
 def in_order(rows: Sequence[ScanFigures]) -> list[str]:
-    """Return the names of the prints in printing order. The place of a print is that of its first scan."""
+    """Return the names of the prints in printing order. The position of a print in this order is that of its
+    first scan.
+    """
     return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
@@ -108,9 +112,9 @@ def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
     """Compute the mean and the spread of a quantity over at least two prints. A one-way analysis of variance
     divides the spread into its variance between prints and within prints.
 
-    The division is needed because the value of a print with one scan varies more than a mean over four scans.
-    Prints with several scans show how much of the variation comes from the scans. If the estimate of the
-    variance between prints is negative, it is set to 0.
+    The division is needed because the value of a print with one scan varies more than the value of a print
+    with four scans, which is a mean. Prints with several scans show how much of the variation comes from the
+    scans. If the estimate of the variance between prints is negative, it is set to 0.
     """
     prints = print_values(rows, figure)
     n = len(prints.values)
@@ -153,11 +157,11 @@ class FigureCheck(Record):
 
     ``mean`` and ``spread`` are those of the reference prints. ``p`` is an upper bound on the p value of a
     change. An alarm is raised if ``p`` is at most ``alarm_at``, which is this quantity's part of the rate of
-    false alarms. ``noticeable_step`` is the rise r that raises an alarm in 9 of 10 cases within three new
-    prints, or within all new prints if there are fewer than three. A fall by r/(1 + r) raises an alarm
-    equally often. ``noticeable_step`` is None if the rise would exceed a factor of e. ``trend`` is the change
-    from print to print, fitted to all prints. ``measure_again_in`` is the number of prints until the 95 %
-    bound on the drift reaches ``tolerance``.
+    false alarms. ``noticeable_step`` is the rise r that raises an alarm with a probability of 90 % within
+    three new prints, or within all new prints if there are fewer than three. A fall by r/(1 + r) raises an
+    alarm equally often. ``noticeable_step`` is None if the rise would exceed a factor of e. ``trend`` is the
+    change from print to print, fitted to all prints. ``measure_again_in`` is the number of prints until the
+    95 % bound on the drift reaches ``tolerance``.
     """
 
     name: str

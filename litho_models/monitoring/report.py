@@ -53,8 +53,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
     """Draw one monitored quantity of all prints, relative to the mean of the reference prints. Large dots are
-    prints and small dots are scans. One band shows the spread of the reference prints; another, if there is
-    an alarm, marks the changed prints.
+    prints and small dots are scans. One band shows the spread of the reference prints. If there is an alarm,
+    a second band marks the changed prints.
     """
     from matplotlib.ticker import MaxNLocator
 

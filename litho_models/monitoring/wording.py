@@ -11,16 +11,16 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# If all new prints are higher, flatter or steeper than every reference print by this factor, their layouts
-# are of another kind.
+# If the heights or slopes of all new prints differ from those of every reference print by more than this
+# factor, the new layouts are taken to be of another kind.
 _OTHER_KIND = 1.1
-# Largest amount, in units of the spread, by which the error on training scans may be too small without
-# raising the rate of false alarms noticeably.
+# The error on training scans is smaller than on unseen scans. If this difference is at most the value below,
+# in units of the spread, it does not raise the rate of false alarms noticeably.
 _BEARABLE_OPTIMISM = 0.25
 
 
 def verdict(checks: Sequence[FigureCheck], rate: float) -> list[str]:
-    """Return the verdict as sentences, the most important one first."""
+    """Return the verdict as a list of sentences, with the most important sentence first."""
     return _sentences("verdict", checks=checks, rate=rate, soon=SOON)
 
 
