@@ -35,13 +35,13 @@ def analyse_noise(
     """Analyse the noise of the prints in a store. Write ``noise.json``, a report and CSV tables.
 
     Args:
-        store: dataset store. Scans whose use is stated as substrate, flat or steps, and scans that state a
-            dose, are also analysed.
+        store: dataset store. Scans of a bare substrate, of a flat print or of steps (as the store states
+            their use) and scans that state a dose are also analysed.
         out: result folder.
         residuals: result folder of ``litho-models benchmark``, or a frozen model (a folder or ``zoo:NAME``).
-            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. If none of
-            the scans was used to train the model, which always holds for a benchmark, it also contains the
-            noise budget.
+            The analysis then also contains the uncertainty σ(x) of each pixel and its calibration. It also
+            contains the noise budget if none of the scans was used to train the model, which is always the
+            case for a benchmark.
         model: name of a model in the benchmark; by default the best model.
         seed: seed of the random choice of pixels.
 
@@ -61,8 +61,8 @@ def analyse_noise(
         spread = None if residuals is None else read_residuals(dataset, residuals, model)
         found = reference_prints(references, dataset.level_height_um)
         dose, notes = dose_matrix(every)
-        # The dose matrix also uses locked scans, because it does not judge any model, and there is often only
-        # one print at a dose.
+        # The dose matrix also uses locked scans. This is harmless, because the matrix does not judge any
+        # model, and it is necessary, because there is often only one print at a dose.
         of_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
         in_matrix = [scan_id for scan_id in locked if scan_id in of_matrix]
         dropped = [
@@ -109,8 +109,8 @@ def analyse_noise_of_files(
     Args:
         out: result folder.
         flat, substrate, steps: scan files of a flat print, of the bare substrate and of a print of steps.
-        unit, size_um: unit of the heights and size of the scan along y and x, µm, if the files do not state
-            them.
+        unit, size_um: unit of the heights, and size of the scan along y and x, µm. Both are needed only if
+            the files do not state them.
         level_height_um: nominal height of one step, µm.
 
     Raises:

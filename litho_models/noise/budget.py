@@ -1,8 +1,8 @@
 """Estimate the noise of ordinary prints from the residuals of a model on held-out scans.
 
-There are two upper estimates. The first compares residuals at pixels whose surroundings in the layout are
-similar (``estimated_floor``). The second is the roughness in areas where the layout is flat, because the
-errors of a model are small there.
+There are two estimates of an upper limit of the noise. The first compares residuals at pixels whose
+surroundings in the layout are similar (``estimated_floor``). The second is the roughness in areas where the
+layout is flat. In such areas the errors of a model are small, so nearly all of the residual is noise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,8 +27,8 @@ class FlatLevel(Record):
     """The residual at the pixels of one level where the layout is flat: its rms (``sigma_nm``) and its mean
     absolute value (``mae_nm``).
 
-    The terms of the policy ``full+rows`` are removed from each scan. ``ci95_nm`` is the 95 % confidence
-    interval of ``sigma_nm`` over prints.
+    The terms of the policy ``full+rows``, which include line offsets, are removed from each scan first.
+    ``ci95_nm`` is the 95 % confidence interval of ``sigma_nm`` over prints.
     """
 
     level: int
@@ -38,9 +38,9 @@ class FlatLevel(Record):
     mae_nm: float
 
 
-# Older results also contain a correlation length, which is ignored.
+# Older result files also contain a correlation length, which is ignored.
 class NoiseBudget(Record, extra="ignore"):
-    """Two upper estimates of the noise of prints.
+    """Two estimates of an upper limit of the noise of prints.
 
     ``floor`` is the first estimate. ``flat_levels`` is the second; it covers the quarter of the pixels where
     the layout is flattest. At these pixels, the slope of the layout is at most ``flat_slope``.

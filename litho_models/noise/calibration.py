@@ -1,5 +1,5 @@
-"""Test whether a stated spread of the residuals is calibrated, on prints that were not used to fit the
-spread.
+"""Test whether a stated spread (standard deviation) of the residuals is calibrated. The test uses prints that
+were not used to fit the spread.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,19 +35,20 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.statistics import Interval, rms
 
 _FOLDS = 5
-# Number of pixels of each scan that are used in the fit. Roughness is correlated over ten pixels and more, so
-# more pixels would add no information.
+# Number of pixels of each scan that are used in the fit. Roughness is correlated over distances of ten pixels
+# and more, so more pixels would add hardly any information.
 _PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
 _BINS = 8
 _MEANS = ("nll", "crps_nm", "ence", "ause")
 
 
-# Older results also contain values of ensembles and bounds for whole scans, which are ignored.
+# Older result files also contain values for ensembles of models and bounds for whole scans, which are
+# ignored.
 class ScanCalibration(Record, extra="ignore"):
     """The calibration on one scan: the negative log-likelihood and the continuous ranked probability score
-    (for both, lower is better), the coverage at the levels of ``Calibration.levels``, and the rms of the
-    residual divided by its stated standard deviation.
+    (for both, lower is better), the share of residuals inside the stated intervals (coverage) for each of
+    ``Calibration.levels``, and the rms of the residual divided by its stated standard deviation.
 
     ``ence`` and ``ause`` are fractions, for which 0 is best (see ``spread_scores``).
     """
@@ -66,7 +67,8 @@ class Calibration(Record, extra="ignore"):
 
     Args:
         name: whether the spread is constant or depends on covariates.
-        levels: coverages that the intervals of a calibrated spread would have.
+        levels: nominal coverages of the intervals. If the spread is calibrated, the observed coverages equal
+            them.
         nll, crps_nm, coverage, ence, ause: means of the values of ``ScanCalibration`` over scans.
         pit: histogram of the probability integral transform. The transform of a pixel is the probability that
             the stated distribution gives to residuals below the observed one. The 20 bins add up to one. If
@@ -113,7 +115,8 @@ class SpreadAnalysis(Record, extra="ignore"):
     to all scans.
 
     ``nuisance`` names the terms that were removed from the residuals. ``left_out`` says whether prints or
-    scans are left out of each fit of the spread. The fit is then judged on what it left out.
+    scans are left out of each fit of the spread. Each fit is judged on the prints or scans that were left out
+    of it.
     """
 
     model: str
@@ -129,7 +132,7 @@ class SpreadAnalysis(Record, extra="ignore"):
 
 class Stated(NamedTuple):
     """The stated distribution of the residuals of one scan. ``scale_nm`` is the scale of the distribution at
-    each pixel, and ``tails`` is its shape.
+    each pixel, and ``tails`` is the shape of the distribution.
     """
 
     scale_nm: Array
@@ -194,7 +197,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
 def calibrate(
     name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[Array], stated: Sequence[Stated]
 ) -> Calibration:
-    """Judge a stated spread on every scan, and average the results over the scans."""
+    """Compute the calibration of a stated spread on every scan, and average the results over the scans."""
     rows, histograms = [], []
     for scan, residual, (scale, tails) in zip(scans, residuals_nm, stated, strict=True):
         scored = np.isfinite(residual)
@@ -230,8 +233,8 @@ def _bins(
     residuals_nm: Sequence[Array],
     stated: Sequence[Stated],
 ) -> Iterator[SigmaBin]:
-    """Yield the bins: one with all pixels, one for each level, and, for every other covariate, bins with
-    equal numbers of pixels.
+    """Yield the bins of pixels. There is one bin with all pixels and one bin for each level. For every other
+    covariate, there are several bins with equal numbers of pixels.
     """
     pool = Pool(scans, [np.isfinite(residual) for residual in residuals_nm])
     residual = pool.of(residuals_nm)

@@ -1,9 +1,9 @@
-"""Evaluate a dose matrix, which is a set of prints at different doses: height, roughness and lost steps at
-each dose, and the recommended dose.
+"""Evaluate a dose matrix, which is a set of prints at different doses: determine height, roughness and lost
+steps at each dose, and recommend a dose.
 
 The paper searches for a laser power in this way (appendix "Mask and optical elements fabrication"). The
-evaluation uses all scans that state a dose. Their layouts are step ladders, or any layouts with areas of one
-level that are wider than the blur of the printer.
+evaluation uses all scans that state a dose. The layouts of these scans are step ladders, or any layouts in
+which areas of one level are wider than the blur of the printer.
 """
 
 from collections.abc import Sequence
@@ -24,13 +24,15 @@ _GUARD_UM = 1.0
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
 _FEWEST_LEVELS = 3
-# Distances over which the surroundings of a pixel are averaged. They exceed the distance above, because
-# diffusion reaches up to 2.5 µm.
+# Distances over which the surroundings of a pixel are averaged. They exceed the distance to a change of level
+# above, because diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
 
 class LevelHeight(Record):
-    """The printed height of one level above the lowest printed level, from all scans at one dose together."""
+    """The printed height of one level, measured from the lowest printed level. It is computed from all scans
+    at one dose together.
+    """
 
     level: int
     height_nm: float
@@ -80,12 +82,12 @@ class DoseMatrix(Record):
 
 
 def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
-    """Judge all doses that scans state. Return the dose matrix, or None if there is none, and notes that say
-    which doses are not judged, and why.
+    """Judge all doses that scans state. Return the dose matrix, and notes that say which doses are not
+    judged, and why. If too few doses can be judged, None takes the place of the matrix.
 
     A dose is judged only if three levels have areas that are wide enough to measure. A matrix needs two such
-    doses. Among the doses that lose the fewest steps, the dose whose heights are nearest to the nominal
-    heights is recommended.
+    doses. The recommended dose is the one whose heights are nearest to the nominal heights, among those doses
+    at which the fewest steps are lost.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
@@ -147,8 +149,8 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
 
 def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     """Return the mean and the standard deviation of the height of each level, computed from pixels far from
-    every change of level. The datum, the tilt and the effect of the surroundings are removed from each scan
-    first.
+    every change of level. Before that, the datum, the tilt and the effect of the surrounding layout are
+    removed from each scan.
     """
     found: dict[int, list[Array]] = {}
     for scan in scans:

@@ -26,14 +26,14 @@ from litho_models.noise.texture import Texture, texture
 from litho_models.scoring.statistics import Interval, interval, rms
 
 _SQUARE_WITHIN = 0.01
-# Smallest number of pixels that must be measured in both of two prints of one layout.
+# Two prints of one layout are compared only if at least this number of pixels is measured in both of them.
 _FEWEST_PIXELS = 64
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A scan from which the noise is measured. ``use`` says what it shows: ``substrate``, ``flat`` or
-    ``steps``.
+    """A scan from which the noise is measured. ``use`` says what the scan shows: the bare substrate
+    (``substrate``), a flat print (``flat``) or a print of steps (``steps``).
     """
 
     id: str
@@ -58,8 +58,8 @@ class ReferencePrints(Record):
 
 
 def store_references(store: Store) -> list[Reference]:
-    """Return the levelled scans of substrates, flat prints and steps in a store. Each scan is on its own
-    grid, not on that of a layout.
+    """Return the levelled scans of substrates, flat prints and steps in a store. The heights of each scan are
+    on the grid of the scan itself, not on that of a layout.
     """
     pitches = store.recorded_pitches_um()
     return [

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
-# Texts that say which terms each policy fits to a scan before the noise is computed.
+# Texts that say which terms are fitted to a scan under each policy before the noise is computed.
 _FREE = {
     "none": "nothing fitted",
     "offset": "the zero height of each scan fitted",

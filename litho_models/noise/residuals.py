@@ -1,5 +1,5 @@
-"""Compute the residuals of a model on the scans of a store. The predictions come from the cache of a
-benchmark, which predicts held-out scans, or from a frozen model.
+"""Compute the residuals of a model on the scans of a store. The predictions come either from the cache of a
+benchmark, which contains predictions of held-out scans, or from a frozen model.
 """
 
 from collections.abc import Sequence
@@ -43,15 +43,15 @@ class Residuals(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Some pixels of several scans, treated as one list of n pixels. ``used`` contains a mask for each scan,
-    of shape (ny, nx), which marks these pixels.
+    """Some pixels of several scans, treated as one list of n pixels. ``used`` contains one mask of shape (ny,
+    nx) for each scan, which is True at these pixels.
     """
 
     scans: Sequence[PrintedScan]
     used: Sequence[Array]
 
     def of(self, maps: Sequence[Array]) -> Array:
-        """Return the values of ``maps``, which contains one map for each scan, at these pixels. The result
+        """Return the values of ``maps`` at these pixels. ``maps`` contains one map for each scan. The result
         has shape (n,).
         """
         return np.concatenate([field[use] for field, use in zip(maps, self.used, strict=True)])
@@ -66,7 +66,7 @@ class Pool(NamedTuple):
 
 def read_residuals(store: Store, source: str | Path, model: str | None = None) -> Residuals:
     """Return the residuals (measured minus predicted height) of each scan, after the per-scan terms are
-    removed. The terms removed from a pixel are fitted to other pixels.
+    removed. The terms that are removed from a pixel were fitted to other pixels.
 
     The scored pixels, the policy and the background are those of the benchmark or, for a frozen model, those
     of ``evaluate``. The mean absolute value of the residuals is therefore the error that the benchmark or

@@ -1,5 +1,5 @@
-"""The record ``noise.json``. It contains all results about the noise of a dataset, and the noise floor that
-follows from them.
+"""The record ``noise.json``. The record contains all results about the noise of a dataset, and the noise
+floor that follows from these results.
 """
 
 import numpy as np

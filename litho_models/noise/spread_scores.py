@@ -1,5 +1,5 @@
-"""Score a stated spread of residuals. Some scores have a closed form for a Gaussian or Student's t
-distribution; two others (ENCE and AUSE) assume no distribution.
+"""Score a stated spread of residuals. Some scores are computed in closed form for a Gaussian or Student's t
+distribution; two others (ENCE and AUSE) do not assume any distribution.
 
 The continuous ranked probability score (CRPS) of a Gaussian is equation 21 of Gneiting and Raftery 2007,
 doi:10.1198/016214506000001437, with the opposite sign.
@@ -26,8 +26,8 @@ class Tails:
     freedom: float = float("inf")
 
     def log_likelihood(self, residual: Array, scale: Array | float) -> Array:
-        """Return the logarithm of the probability density of each residual. The unit in which residual and
-        scale are given adds a constant.
+        """Return the logarithm of the probability density of each residual. The result depends on the unit of
+        residual and scale: another unit adds a constant to it.
         """
         return student.logpdf(residual / scale, self.freedom) - np.log(scale)
 
@@ -50,9 +50,9 @@ class Tails:
         return float(student.std(self.freedom))
 
     def probability_below(self, z: Array | float) -> Array:
-        """Return the probability of values below z, the probability integral transform. If z is the residual
-        divided by its scale, and if scale and distribution are right, this probability is uniformly
-        distributed.
+        """Return the probability of values below z (the probability integral transform). Let z be the
+        residual divided by its scale. If both the scale and the distribution are right, this probability is
+        uniformly distributed over the pixels.
         """
         return student.cdf(z, self.freedom)
 
@@ -64,7 +64,8 @@ class Tails:
 
     def covered(self, residual: Array, scale: Array | float, level: float) -> Array:
         """Return, for each pixel, whether its residual lies within the central interval that has the
-        probability ``level``. If the spread is calibrated, this holds for the share ``level`` of the pixels.
+        probability ``level``. If the spread is calibrated, the share of pixels for which it does is
+        ``level``.
         """
         return np.abs(residual) <= self.half_width(level) * scale
 
@@ -105,8 +106,8 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
 
 
 def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
-    """Divide values into bins with equal numbers of values. Return the limits of the bins and the number of
-    the bin of each value. If values repeat, there may be fewer bins.
+    """Divide values into bins with equal numbers of values. Return the limits of the bins, and for each value
+    the number of its bin. If values repeat, there may be fewer than ``bins`` bins.
     """
     limits = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
     return limits, np.searchsorted(limits[1:-1], values, side="right")
@@ -114,7 +115,7 @@ def equal_counts(values: Array, bins: int) -> tuple[Array, Array]:
 
 def sparsification_error(residual: Array, sigma: Array) -> float:
     """Return the area under the sparsification error (AUSE). It states how well σ ranks the pixels by their
-    error; 0 is perfect.
+    error, with 0 for a perfect ranking.
 
     Pixels are removed in two orders: those with the largest σ first, and those with the largest absolute
     residual ``|r|`` first. For each order, the mean ``|r|`` of the remaining pixels is a function of the

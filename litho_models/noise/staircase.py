@@ -16,11 +16,11 @@ from litho_models.noise.spread_scores import GAUSSIAN
 from litho_models.scan_terms.term import smooth_shapes
 from litho_models.scoring.statistics import rms
 
-# Smallest readability of a step that can be told from the next. At most 2.5 % of the pixels of each of its
-# treads then lie beyond the middle between the two heights.
+# Smallest readability at which neighbouring steps can be told apart. With this readability, at most 2.5 % of
+# the pixels of each of the two treads lie beyond the middle between their heights.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # Pixels closer than this to an edge are not used. The distance is at least three standard deviations of the
-# printer's blur.
+# printer's blur, so that the blurred edges are left out.
 _GUARD_UM = 0.75
 # Width of the narrowest tread that is searched for, as a fraction of the width of the field.
 _NARROWEST_TREAD = 1 / 25
@@ -70,7 +70,7 @@ def step_print(
     pitch_um: tuple[float, float],
     level_height_um: float,
 ) -> StepPrint:
-    """Find the treads of a staircase, which rises along x or y, and judge its steps.
+    """Find the treads (areas of one height) of a staircase that rises along x or y, and evaluate its steps.
 
     Args:
         scan_id: name of the scan in the result.
@@ -98,7 +98,7 @@ def step_print(
                 height_nm=step.height_nm,
                 uncertainty_nm=step.uncertainty_nm,
                 sigma_nm=sigma,
-                # Rounding to float32 changes a height of 1 µm by up to 6e-5 nm, so a smaller σ is
+                # Rounding to float32 changes a height of 1 µm by up to 6e-5 nm, so a σ below this value is
                 # meaningless.
                 readability=abs(step.height_nm) / max(sigma, 1e-4),
                 misread=_misread(first, second),
@@ -118,13 +118,13 @@ def step_print(
 
 
 def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int]]:
-    """Find the axis along which a staircase rises, and the pixels at which a new tread starts, in ascending
-    order.
+    """Find the axis along which a staircase rises. Also return the indices of the pixels at which a new tread
+    starts, in ascending order.
 
-    A piecewise-constant function is fitted to the profile of the staircase, whose values are medians across
-    it. The fit minimises the squared error plus a price for each edge. The price is the amount by which an
-    edge between two treads reduces the squared error if the treads have the narrowest width and their heights
-    differ by half a level.
+    A piecewise-constant function is fitted to the profile of the staircase. The value of the profile at each
+    position is the median along the edges. The fit minimises the squared error plus a price for each edge.
+    The price is the amount by which an edge between two treads reduces the squared error if the treads have
+    the narrowest width and their heights differ by half a level.
 
     Raises:
         InputError: there is no edge along either axis.
@@ -134,7 +134,7 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
         profile = np.nanmedian(height_um, axis=0 if axis == "x" else 1)
         profile = profile[np.isfinite(profile)]
         narrowest = max(3, int(len(profile) * _NARROWEST_TREAD))
-        # If two pieces of w pixels each, whose heights differ by d, are joined to one, the squared error
+        # If two pieces of w pixels each are joined to one, and their heights differ by d, the squared error
         # grows by w d²/2.
         price = narrowest * (level_height_um / 2) ** 2 / 2
         edges = _piecewise_constant(profile, price, narrowest)
@@ -152,7 +152,7 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
 
 def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[int]:
     """Return the edges of the piecewise-constant function that minimises the squared error plus ``price`` for
-    each edge. It is found by dynamic programming.
+    each edge. The minimum is found by dynamic programming.
     """
     size = len(profile)
     sums = np.concatenate([[0.0], np.cumsum(profile)])

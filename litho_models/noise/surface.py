@@ -1,4 +1,4 @@
-"""Measure the roughness of a surface, such as the bare substrate or a flat print."""
+"""Measure the roughness of a surface that should be flat, such as the bare substrate or a flat print."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -44,8 +44,8 @@ class SurfaceNoise(Record, extra="ignore"):
 
 
 class PrintNoise(Record, extra="ignore"):
-    """The roughness that a print adds to the substrate, nm. Its square is that of the flat print minus that
-    of the substrate: ``print² = flat² − substrate²``.
+    """The roughness that a print adds to that of the substrate, nm. Its square is the squared roughness of
+    the flat print minus the squared roughness of the substrate: ``print² = flat² − substrate²``.
 
     ``print_nm`` is None if the flat print is not rougher than the substrate.
     """
@@ -87,8 +87,8 @@ def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -
 
 
 def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
-    """Return the height minus its background, µm, which is fitted to the measured pixels by least squares.
-    The result is float64 and has the shape of ``height_um``.
+    """Return the height minus its background, µm. The background is fitted to the measured pixels by least
+    squares. The result is float64 and has the shape of ``height_um``.
     """
     level = np.zeros(height_um.shape)
     return height_um - fitted_terms(height_um, level, np.isfinite(height_um), BACKGROUNDS[background])[1]

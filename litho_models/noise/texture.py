@@ -1,5 +1,5 @@
-"""Describe the texture of flat surfaces: whether it consists of lines, in which direction, and with which
-period.
+"""Describe the texture of flat surfaces: whether it consists of lines, in which direction the lines run, and
+with which period they repeat.
 
 The paper says that the roughness of its flat print is line-shaped and not periodic (arXiv:2309.17343).
 """
@@ -21,9 +21,9 @@ class Period(Record, extra="ignore"):
 
     Args:
         period_um: distance at which the lines repeat, µm.
-        share: fraction of the sum of squares of the line means that belongs to this period.
+        share: fraction of the sum of squares of the line means that this period accounts for.
         p: probability that a smooth spectrum has a peak at least this high at any frequency.
-        amplitude_nm: amplitude of this period, as root mean square over the surfaces.
+        amplitude_nm: amplitude of the oscillation with this period, as root mean square over the surfaces.
         coherence: 1 if the lines have the same phase on all surfaces, relative to the first pixel of each
             array.
     """
@@ -40,8 +40,9 @@ class Lines(Record):
 
     Args:
         along: axis along which the lines run: ``x`` (rows) or ``y`` (columns).
-        share: variance of the means of the lines, as a fraction of the variance of the surface. It is above
-            zero even for a surface without lines, so compare the values of the two axes.
+        share: variance of the means of the lines, as a fraction of the variance of the surface. This share is
+            above zero even for a surface without lines. To find out whether there are lines, compare the
+            shares of the two axes.
         period: strongest period of the means of the lines; None if there are fewer than 64 lines.
     """
 
@@ -116,8 +117,8 @@ def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lin
 
 
 def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
-    """Return the mean of each line. The heights have a mean of zero, so a line without measured pixels gets
-    the mean of the surface.
+    """Return the mean of each line. A line without measured pixels gets the value zero, which is the mean of
+    the surface, because the mean of all heights was subtracted before.
     """
     measured = np.isfinite(height_um)
     return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)

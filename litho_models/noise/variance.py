@@ -1,10 +1,11 @@
-"""Fit σ(x), the spread of a residual at each pixel. Its logarithm is a linear function of covariates, which
-describe the layout at the pixel and the position of the pixel.
+"""Fit σ(x), the spread of a residual at each pixel. The logarithm of the spread is modelled as a linear
+function of covariates, which describe the layout at the pixel and the position of the pixel.
 
 The model of the height is fitted first and then kept fixed. Then the scale s of its residuals on held-out
 scans is fitted as ln s² = X β by maximum likelihood, where the residuals follow Student's t distribution.
-With these two stages, a wide spread cannot hide errors of the predicted height (compare Seitzer et al. 2022,
-arXiv:2203.09168). There are only a few covariates, because tens of scans determine no more coefficients.
+Because the fit has these two stages, a wide spread cannot hide errors of the predicted height (compare
+Seitzer et al. 2022, arXiv:2203.09168). Only a few covariates are used, because some tens of scans do not
+determine more coefficients.
 """
 
 import numpy as np
@@ -30,8 +31,8 @@ COVARIATES = (
     "radius²",
     "radius⁴",
 )
-# Degrees of freedom of Student's t that are tried. They range from much heavier tails than residuals of
-# prints have to a Gaussian.
+# Numbers of degrees of freedom of Student's t distribution that are tried. The smallest gives much heavier
+# tails than residuals of prints have, and the largest gives a Gaussian.
 _FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
 # Standard deviation of the optical spot. The layout is blurred by it before its slope is computed.
 _SLOPE_BLUR_UM = 0.2
@@ -81,7 +82,7 @@ def place_maps(scan: PrintedScan) -> dict[str, Array]:
 
 def covariates_of(places: dict[str, Array]) -> Array:
     """Return the covariates φ of each pixel, with shape (..., covariates). ``places`` is the result of
-    ``place_maps``, or the values of these maps at some pixels.
+    ``place_maps``, or a dict of the same form that contains only the values at some pixels.
     """
     level, slope, edge, radius2 = (places[name] for name in PLACES)
     between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
@@ -112,8 +113,8 @@ def fit_log_scale(covariates: Array, residual: Array, tails: Tails = GAUSSIAN) -
     """Fit β of ln s² = X β by maximum likelihood, for a given shape of the distribution. Each step of the
     Fisher scoring is β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
 
-    Here w are weights and I is the Fisher information of a pixel about ln s². I does not depend on s, so one
-    matrix serves all steps.
+    Here w are weights and I is the Fisher information of a pixel about ln s². I does not depend on s, so the
+    same matrix is used in all steps.
 
     Args:
         covariates: matrix X, of shape (pixels, k). Some of its columns must add up to a constant.

@@ -1,5 +1,5 @@
-"""Predict whole layouts of any size in tiles. For models with a receptive radius, the result equals that of
-one pass over the whole layout. For other models, the result is blended from overlapping tiles.
+"""Predict layouts of any size tile by tile. For a model with a receptive radius, the result is the same as if
+the whole layout were computed at once. For other models, the result is blended from overlapping tiles.
 """
 
 from collections.abc import Callable
@@ -36,8 +36,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
     """Predict the height, µm, of the pixels that are at least the receptive radius r from the edge of the
     layout. For a layout of shape (batch, 1, ny, nx), the result has shape (batch, 1, ny - 2r, nx - 2r).
 
-    The height is differentiable in the layout. It is computed in tiles of at most ``tile_px`` pixels, which
-    does not change the result.
+    The height is differentiable in the layout. It is computed in tiles whose sides are at most ``tile_px``
+    pixels. The division into tiles does not change the result.
 
     Raises:
         InputError: the model has no receptive radius, or the layout has no interior.
@@ -90,8 +90,8 @@ def blend_tiles(
         function: receives tiles of shape (batch, 1, T, T) and returns their heights with the same shape.
         layout_um: layout of any size, µm, with shape (batch, 1, ny, nx).
         tile: side T of the tiles and their overlap.
-        border_px: width of the border that is cropped from the result. It must be less than half the width of
-            the layout. Tiles that lie entirely in the border are not computed.
+        border_px: width, in pixels, of the border that is cropped from each side of the result. It must be
+            less than half the width of the layout. Tiles that lie entirely in the border are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.
