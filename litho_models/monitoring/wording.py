@@ -11,8 +11,8 @@ from litho_models.monitoring.prints import WATCHED, FigureCheck, in_order
 from litho_models.scan_terms import Blocks
 from litho_models.scoring.printer_state import ScanFigures
 
-# If the heights or slopes of all new prints differ from those of every reference print by more than this
-# factor, the new layouts are taken to be of another kind.
+# The new layouts are taken to be of another kind if the relief (or the steepness) of all new prints is
+# greater, or of all new prints is smaller, than that of every reference print by more than this factor.
 _OTHER_KIND = 1.1
 # The error on training scans is smaller than on unseen scans. If this difference is at most the value below,
 # in units of the spread, it does not raise the rate of false alarms noticeably.

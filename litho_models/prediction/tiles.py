@@ -132,9 +132,9 @@ def blend_tiles(
 
 
 def blending_window(tile: Tile, like: Tensor) -> Tensor:
-    """Return the weight of each pixel of a tile for blending, with shape (T, T), where T is the side of the
-    tile. Across the overlap, the weight rises as sin², so that the weights of two neighbouring tiles add up
-    to one.
+    """Return the weight of each pixel of a tile for blending. The result has shape (T, T), where T is the
+    side of the tile. Across the overlap, the weight rises as sin², so that the weights of two neighbouring
+    tiles add up to one.
 
     Raises:
         InputError: an overlap of more than half a tile.

@@ -1,4 +1,5 @@
-"""Compare a predicted film with a measured film by its area and by its missing, extra or merged features.
+"""Compare a predicted film with a measured film by the area of the film and by missing, extra or merged
+features.
 
 A pixel belongs to the film if it is higher than half the height of the film; other pixels belong to the
 ground. A feature is a connected part of the film or of the ground that has at least four pixels.
@@ -21,8 +22,8 @@ FILMS_TEXT = (
 
 
 class FilmErrors(NamedTuple):
-    """The errors of a predicted film. ``area_error_percent`` is the error of its area, relative to the
-    measured area; it is None if the measured area is zero. The other fields count features.
+    """The errors of a predicted film. ``area_error_percent`` is the error of the predicted area, relative to
+    the measured area. It is None if the measured area is zero. The other fields count features.
     """
 
     area_error_percent: float | None
@@ -32,8 +33,8 @@ class FilmErrors(NamedTuple):
 
 
 def films_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> FilmErrors:
-    """Compare the film of a scan with the predicted film. The measured map without the per-scan terms is the
-    prediction plus the residual.
+    """Compare the film of a scan with the predicted film. The measured map, from which the per-scan terms are
+    removed, is computed as prediction plus residual.
     """
     return film_errors(prediction_um + residual_um, prediction_um, film_edge_um(scan))
 
@@ -47,8 +48,8 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
     """Compare a measured with a predicted film.
 
     Args:
-        measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
-        expected_um: predicted height, µm, with the same shape and without NaN.
+        measured_um: measured height, µm, of shape (ny, nx). Pixels that are not scored are NaN.
+        expected_um: predicted height, µm, with the same shape. It contains no NaN.
         edge_um: height of the contour that is the edge of a film, µm.
     """
     known = np.isfinite(measured_um)
@@ -66,7 +67,8 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
     """Find the connected parts of two masks. For each part that is large enough, count the parts of the other
-    mask that it touches. Return the counts of the first and of the second mask.
+    mask that it touches. Return the counts for the parts of the first mask, and the counts for the parts of
+    the second mask.
     """
     from scipy.ndimage import label
 
@@ -79,7 +81,8 @@ def _partners(first: Array, second: Array) -> tuple[Array, Array]:
         [np.bincount(own[kept], minlength=len(size)) for own, size in zip(pairs, large, strict=True)]
         for kept in (slice(None), real)
     )
-    # A part that touches only parts below the size limit has a partner, but does not merge parts.
+    # If a part touches only parts that are smaller than the size limit, it counts as having a partner, but
+    # not as merging several parts.
     found = [
         np.where(many > 0, many, np.minimum(any_, 1)) for many, any_ in zip(counted, touched, strict=True)
     ]

@@ -1,10 +1,10 @@
 """Separate noise from errors of a model by comparing residuals at pixels whose surroundings in the layout are
 similar (gamma test).
 
-What residuals in similar surroundings have in common could still be learned by a model of the layout.
-Differences between them are noise (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is
-compared with pixels of other scans. The datum, the gain and the bow of a single scan therefore count as
-noise.
+The part that residuals in similar surroundings have in common could still be learned by a model of the
+layout. The differences between such residuals are noise (Stefánsson, Končar and Jones 1997,
+doi:10.1007/BF01413858). Each pixel is compared with pixels of other scans. The datum, the gain and the bow of
+a single scan therefore count as noise.
 """
 
 from collections.abc import Sequence
@@ -17,8 +17,8 @@ from litho_data.store import PrintedScan
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
-# Number of pixels with which each pixel is compared. With more partners, some would be less similar. With
-# fewer, the mean of the products of two differences would be noisier.
+# Number of pixels (partners) with which each pixel is compared. With more partners, some partners would be
+# less similar. With fewer partners, the mean of the products of two differences would be noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 
@@ -45,12 +45,12 @@ class LikePixels(NamedTuple):
         The residual r₀ of a pixel and the residuals r₁ ... r_m of its partners are noise plus a misfit that
         is the same for similar surroundings. The mean of (r₀ − r_j)(r₀ − r_k) over all j ≠ k is therefore the
         variance of the noise in r₀ alone, whatever the noise of the partners. Half the squared difference of
-        two residuals would be too small for pixels with rare surroundings, because these are rougher than
-        their partners.
+        two residuals would be a simpler estimate. But it would be too small for pixels with rare
+        surroundings, because such pixels are rougher than their partners.
 
         Args:
-            residuals: one residual map per scan, of shape (ny, nx). The results are in the square of its
-                unit.
+            residuals: one residual map per scan, of shape (ny, nx). Both results have the squared unit of
+                these maps.
         """
         value = np.empty(len(self.owner))
         for number, residual in enumerate(residuals):
@@ -65,11 +65,11 @@ def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int
     """Draw a random sample of pixels. For each of them, find the most similar pixels of other scans.
 
     Two pixels are similar if their surroundings in the layout are similar. Only scans at the same dose are
-    compared, because the dose changes the height even for equal layouts.
+    compared, because the dose changes the height even if the layouts are equal.
 
     Args:
-        scans: scans to compare. The result is None unless at least three of them have the same dose and the
-            layouts are not flat.
+        scans: scans to compare. The result is None if fewer than three of them have the same dose, or if the
+            layouts are flat.
         scored: for each scan, a mask of shape (ny, nx) that is True at the pixels that may be drawn.
         seed: determines which pixels are drawn.
     """
@@ -117,8 +117,8 @@ def _surroundings(scan: PrintedScan) -> Array:
 
 
 def blurred_layout_um(scan: PrintedScan, sigma_um: float) -> Array:
-    """Return the layout of a scan, µm, blurred by a Gaussian of standard deviation ``sigma_um``. Beyond its
-    edge, the layout is continued by repeating its outermost pixels. The result is float64 of shape (ny, nx).
+    """Return the layout of a scan, µm, blurred by a Gaussian of standard deviation ``sigma_um``. Before the
+    blur, the layout is padded by repeating its outermost pixels. The result is float64 of shape (ny, nx).
     """
     from scipy.ndimage import gaussian_filter
 

@@ -2,8 +2,8 @@
 report shows all metrics with their unit and an explanation.
 
 A metric is computed by a function that receives one scan, the prediction of the model, and the residual
-without the per-scan terms. In results, the metrics of ``MetricValues`` are fields, and all others are listed
-under ``metrics``.
+without the per-scan terms. In result files, each metric that is a field of ``MetricValues`` has its own
+entry. All other metrics are listed under the entry ``metrics``.
 """
 
 import math
@@ -24,7 +24,7 @@ MetricFunction = Callable[[PrintedScan, Array, Array], float | None]
 
 
 class Metric(NamedTuple):
-    """The name and the unit of a metric, and the rule that combines its values over scans."""
+    """The name and the unit of a metric, and the rule by which its values for single scans are combined."""
 
     name: str
     unit: str
@@ -95,7 +95,7 @@ def register_metric(
     Results then contain ``metrics: {"worst_pixel_nm": …}`` for each scan and for the model.
 
     Args:
-        name: name of the metric: letters, digits and underscores.
+        name: name of the metric, which consists of letters, digits and underscores.
         unit: unit of the metric, with the same characters; ``1`` for a metric without a unit.
         function: function that computes the metric of one scan, as described above.
         explanation: sentence that explains the metric in the report.
@@ -146,8 +146,8 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
 
 
 def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
-    """Combine the metrics of scans into the metrics of a model. Each is the mean or the sum of the values
-    that are known. Return them as the fields of ``MetricValues``.
+    """Combine the metrics of scans into the metrics of a model. Each metric is the mean or the sum of its
+    values over those scans for which it is known. Return them as the fields of ``MetricValues``.
     """
     values = {}
     for metric in registered_metrics():
@@ -160,7 +160,9 @@ def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
 
 
 def _as_fields(values: Mapping[str, float | None]) -> dict[str, Any]:
-    """Arrange metrics as the fields of ``MetricValues``. Those without a field are put under ``metrics``."""
+    """Arrange metrics as the fields of ``MetricValues``. Metrics that have no field there are put under
+    ``metrics``.
+    """
     own = {key: value for key, value in values.items() if key in ScanRow.model_fields}
     return {**own, "metrics": {key: value for key, value in values.items() if key not in own}}
 

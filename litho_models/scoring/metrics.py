@@ -13,8 +13,8 @@ from litho_models.scan_terms import Blocks, CrossFit, NuisanceProtocol, cross_fi
 from litho_models.scoring.records import ScanErrors
 from litho_models.scoring.statistics import rms
 
-# The designed elements are used with the red line of a helium-neon laser: its wavelength, and the difference
-# of the refractive index between resist and air at this wavelength.
+# The designed optical elements are used with the red line of a helium-neon laser. The two values are the
+# wavelength of this line, and the refractive index of the resist minus that of air at this wavelength.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
@@ -22,8 +22,8 @@ class PrintGain(NamedTuple):
     """A straight line fitted to a scan, measured height = slope · predicted height + intercept, and the
     standard error of its slope.
 
-    A value is None if it cannot be computed: there is no slope for a constant prediction, and no standard
-    error if there is only one block.
+    A value is None if it cannot be computed. A constant prediction has no slope, and with only one block
+    there is no standard error.
     """
 
     slope: float | None
@@ -38,9 +38,9 @@ def print_gain(
     scan.
 
     Residuals of neighbouring pixels are correlated, so the standard error is computed from blocks of pixels
-    (Liang and Zeger 1986). In each block, the products of residual and regressor are summed. The sums of
-    different blocks are assumed to be independent. This holds if the blocks are wide compared with the
-    correlation length, which is 7 px on the measured prints.
+    (Liang and Zeger 1986). In each block, the products of residual and regressor (predicted height) are
+    summed. The sums of different blocks are assumed to be statistically independent. This holds if the blocks
+    are wide compared with the correlation length, which is 7 px on the measured prints.
 
     Args:
         height_um, prediction_um: measured and predicted height, µm, of shape (ny, nx).
@@ -63,10 +63,11 @@ def print_gain(
 
 
 def scan_errors(scan_id: str, height_um: Array, prediction_um: Array, free: CrossFit) -> ScanErrors:
-    """Compute the errors of a prediction on one scan, over the pixels that ``cross_fit`` scores. Measured and
-    predicted height have shape (ny, nx) and are in µm; ``free`` is the result of ``cross_fit`` for them.
+    """Compute the errors of a prediction on one scan, over the pixels that ``cross_fit`` selects for scoring.
+    Measured and predicted height have shape (ny, nx) and are in µm; ``free`` is the result of ``cross_fit``
+    for them.
 
-    The slope and the intercept of ``print_gain`` are the gain and the offset of the print.
+    The gain and the offset of the print are the slope and the intercept that ``print_gain`` fits.
 
     Raises:
         InputError: no pixel is scored.
@@ -98,8 +99,9 @@ def residual_um(scan: PrintedScan, expected_um: Array, protocol: NuisanceProtoco
 
 
 def mean_error_nm(scans: Sequence[PrintedScan], heights_um: Iterable[Array]) -> float:
-    """Return the datum-free error of a model with the policy ``offset``, nm, averaged over scans.
-    ``heights_um`` contains the predicted height of each scan, µm, of shape (ny, nx).
+    """Return the error of a model after an offset is fitted to each scan (datum-free error with the policy
+    ``offset``), nm, averaged over scans. ``heights_um`` contains the predicted height of each scan, µm, of
+    shape (ny, nx).
     """
     protocol = NuisanceProtocol()
     residuals = (residual_um(*pair, protocol) for pair in zip(scans, heights_um, strict=True))

@@ -25,7 +25,8 @@ NOISE_FILE = "noise.json"
 
 
 class PolicyFloor(Record):
-    """The noise floor under one nuisance policy, nm, with 95 % confidence intervals over prints.
+    """The noise floor for one nuisance policy (set of per-scan terms), nm, with 95 % confidence intervals
+    over prints.
 
     ``k`` is the number of terms that are fitted to each scan; with line offsets, it is their effective
     number. The intervals are None if there are fewer than six prints.
@@ -43,10 +44,11 @@ class NoiseFloor(Record):
     """The noise floor: the error that noise alone causes, nm. ``kind`` says how it was estimated, and
     ``source`` says from what.
 
-    ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error under the
-    policy ``offset``. ``by_policy`` contains the floors under each policy. It is empty in older result files,
-    or if only the floor under ``offset`` is known. The kinds ``lower-bound`` and ``literature`` occur in
-    older files; ``lower-bound`` is also used by closed loops on fewer than three scans.
+    ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
+    policy ``offset``, with which an offset is fitted to each scan. ``by_policy`` contains the floors for each
+    policy. It is empty in older result files, or if only the floor for the policy ``offset`` is known. The
+    kinds ``lower-bound`` and ``literature`` occur in older files; ``lower-bound`` is also used by closed
+    loops on fewer than three scans.
     """
 
     mae_nm: float | None
@@ -56,11 +58,11 @@ class NoiseFloor(Record):
     by_policy: list[PolicyFloor] = Field(default_factory=list)
 
     def at(self, policy: str) -> PolicyFloor | None:
-        """Return the noise floor under this policy, or None if it is unknown."""
+        """Return the noise floor for the given policy. Return None if it is unknown."""
         return next((row for row in self.by_policy if row.policy == policy), None)
 
     def mae_at(self, policy: str) -> float | None:
-        """Return the floor of the mean absolute error under this policy, nm, or None if it is unknown."""
+        """Return the floor of the mean absolute error for the given policy, nm, or None if it is unknown."""
         row = self.at(policy)
         return row.mae_nm if row else self.mae_nm if policy == "offset" else None
 
@@ -85,7 +87,8 @@ class _StatedFloor(Result, extra="ignore"):
 
 
 def stated_floor(dataset_name: str, analysis: str | Path | None) -> NoiseFloor:
-    """Return the noise floor that a noise analysis states. If no analysis is given, the floor is unknown.
+    """Return the noise floor that a noise analysis states. If no analysis is given, the returned record says
+    that the floor is unknown.
 
     Args:
         dataset_name: name of the dataset for which errors are reported.
@@ -110,15 +113,15 @@ def estimated_floor(
     blocks: Blocks | None = None,
     seed: int = 0,
 ) -> NoiseFloor:
-    """Estimate an upper limit of the noise floor under every policy, from the predictions of a model for
+    """Estimate an upper limit of the noise floor for every policy, from the predictions of a model for
     held-out scans.
 
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
         maps_um: height map that the model predicts for each scan, µm, of shape (ny, nx).
-        blocks: blocks that decide to which pixels terms are fitted and which pixels are scored. Use the same
-            blocks as for the errors that are compared with the floor.
+        blocks: blocks of pixels that determine to which pixels terms are fitted and which pixels are scored.
+            Use the same blocks as for the errors that are compared with the floor.
         seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
@@ -150,10 +153,10 @@ def floor_of_residuals(
 ) -> NoiseFloor:
     """Estimate an upper limit of the noise floor from the residuals of a model on held-out scans.
 
-    On a random sample of pixels, ``LikePixels`` finds the fraction of the squared error that pixels with
-    similar surroundings do not have in common. The floor is the error over all scored pixels times the square
-    root of this fraction. For the mean absolute error, this assumes that noise and residual have the same
-    ratio of mean absolute value to standard deviation. The noise need not be Gaussian for this, because
+    On a random sample of pixels, ``LikePixels`` estimates which fraction of the squared error is noise, i.e.
+    not common to pixels with similar surroundings. The floor is the error over all scored pixels times the
+    square root of this fraction. For the mean absolute error, this assumes that noise and residual have the
+    same ratio of mean absolute value to standard deviation. The noise need not be Gaussian for this, because
     nearly all of the residual is noise. If half of the squared error came from a misfit with another
     distribution (a Laplace distribution beside Gaussian noise, or the reverse), the floor would be wrong by
     up to 6 %.
@@ -161,11 +164,12 @@ def floor_of_residuals(
     Args:
         model: its name, for ``source``.
         scans: held-out scans.
-        freed: residuals under each policy, as returned by ``freed_by_policy``. They must include the policy
-            ``offset``.
+        freed: residuals of each scan, keyed by policy, as returned by ``freed_by_policy``. The policy
+            ``offset`` must be among the keys.
         seed: decides which pixels are drawn.
     """
-    # The scans are sorted by id, so that the same pixels are drawn whatever their order.
+    # The scans are sorted by id, so that the same pixels are drawn whatever the order in which the scans are
+    # given.
     order = sorted(range(len(scans)), key=lambda number: scans[number].id)
     scans = [scans[number] for number in order]
     scored = [np.isfinite(freed["offset"][number].residual_um) for number in order]

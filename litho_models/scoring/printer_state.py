@@ -25,10 +25,10 @@ class ScanFigures(Record):
     ``gain`` is the slope of the measured height as a function of the predicted height. ``gain_error`` is its
     standard error, which is computed from blocks of pixels and is None if there is only one block (see
     ``print_gain``). ``error_nm`` is the mean absolute error under the policy ``full``, which also fits the
-    gain (7 terms). The terms are fitted to other pixels than those that are scored. ``order`` is the position
-    of the scan in printing order. ``relief_nm`` and ``steepness`` are the standard deviation and the rms
-    slope of the predicted height, which characterise the layout. ``held_out`` is True if the model was not
-    trained on the scan.
+    gain (7 terms). The pixels to which these terms are fitted are not those on which the error is scored.
+    ``order`` is the position of the scan in printing order. ``relief_nm`` and ``steepness`` are the standard
+    deviation and the rms slope of the predicted height, which characterise the layout. ``held_out`` is True
+    if the model was not trained on the scan.
     """
 
     scan: str
@@ -59,7 +59,7 @@ def scan_figures(
         held_out: True if the model was not trained on the scan.
 
     Raises:
-        InputError: ``cross_fit`` cannot process the scan, for example because it is too small.
+        InputError: ``cross_fit`` cannot process the scan, for example because the scan is too small.
     """
     blocks = Blocks()
     residual = cross_fit(scan.height_um, prediction_um, scan.valid, POLICIES["full"], blocks).residual_um

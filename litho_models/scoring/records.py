@@ -27,8 +27,8 @@ LEADING["sem"] = "edge_mean_nm"
 
 
 class Prediction(NamedTuple):
-    """What a model predicts for a scan: the height of the print and what the microscope adds to it
-    (``background_um``), if this is known. Both are maps in µm, of shape (ny, nx).
+    """What a model predicts for a scan: the height of the print and, if known, the height that the microscope
+    adds to it (``background_um``). Both are maps in µm, of shape (ny, nx).
     """
 
     height_um: Array
@@ -36,7 +36,7 @@ class Prediction(NamedTuple):
 
     @classmethod
     def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """Make a prediction from the height of a print and a learned background, if there is one."""
+        """Make a prediction from the height of a print and, if there is one, a learned background."""
         ny, nx = height_um.shape
         return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
@@ -52,8 +52,8 @@ class Prediction(NamedTuple):
 
 
 class PolicyError(Record):
-    """The mean absolute error under one nuisance policy, nm, with its 95 % confidence interval over scans.
-    ``k`` is the number of terms that are fitted to each scan.
+    """The mean absolute error for one nuisance policy (set of per-scan terms), nm, with its 95 % confidence
+    interval over scans. ``k`` is the number of terms that are fitted to each scan.
     """
 
     policy: Policy
@@ -67,8 +67,8 @@ class MetricValues(Record):
     ``metric_registry``).
 
     ``ssim`` is explained at ``structural_similarity``, and the metrics of edges at ``EdgePlacement``. All
-    other metrics are in ``metrics``; their keys contain name and unit. A metric is None if there was nothing
-    to compare, or if the result file is older than the metric.
+    other metrics are in ``metrics``; their keys contain name and unit. A metric is None if the scan contained
+    nothing to compare, or if the result file was written before the metric existed.
     """
 
     ssim: float | None = None
@@ -84,14 +84,14 @@ class MetricValues(Record):
         return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-# Older results also contain the standard error of the intercept, which is ignored.
+# Older result files also contain the standard error of the intercept, which is ignored.
 class ScanErrors(Record, extra="ignore"):
     """The errors of one model on one scan, over the scored pixels.
 
     ``mae_abs_nm`` and ``bias_nm`` (measured minus predicted) are computed with nothing fitted to the scan.
-    The errors with ``datum_free`` in their name are computed after per-scan terms are removed, which are
-    fitted to other pixels. ``slope`` and ``intercept_nm`` are the gain and the offset of the measured height
-    relative to the predicted height (see ``print_gain``).
+    The errors with ``datum_free`` in their name are computed after per-scan terms are removed. These terms
+    are fitted to other pixels than the scored ones. ``slope`` and ``intercept_nm`` are the gain and the
+    offset of the measured height relative to the predicted height (see ``print_gain``).
     """
 
     pixels: int
@@ -113,14 +113,15 @@ class ScanRow(MetricValues, ScanErrors):
     print: str
 
 
-# Older results also contain the spread of the line offsets, which is ignored.
+# Older result files also contain the spread of the line offsets, which is ignored.
 class ModelScores(MetricValues, extra="ignore"):
     """All scores of one model. Errors are means over scans, counts are sums over scans, and confidence
     intervals come from resampling scans.
 
     ``without_background`` contains the same errors as ``by_policy``, but computed without the background of
-    the protocol. It covers only the policies without smooth terms, and is empty if the protocol has no
-    background. ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes through the print.
+    the protocol. It contains only the policies without smooth terms such as tilt, and is empty if the
+    protocol has no background. ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes
+    through the print.
     """
 
     model: str
@@ -158,7 +159,9 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """Return the leading error of each scan by its id. The error is NaN if a film has no edges."""
+        """Return the leading error of each scan, nm, keyed by scan id. The error is NaN if a film has no
+        edges.
+        """
         values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
         return {scan: math.nan if value is None else value for scan, value in values.items()}
 
@@ -168,8 +171,8 @@ class Paired(Record):
     second model, averaged over scans. A negative mean favours the first model. ``first_better`` counts the
     scans in which the first model is better.
 
-    ``over_prints`` is the same comparison, but with whole prints as units. It is None if there is only one
-    print, and in older result files.
+    ``over_prints`` is the same comparison, but with prints instead of scans as independent units. It is None
+    if there is only one print, and in older result files.
     """
 
     first: str
@@ -183,8 +186,8 @@ class Paired(Record):
 
 
 def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Paired:
-    """Compare the leading errors of two models on the same scans. The scans are paired by id, because results
-    list them in the order of the folds.
+    """Compare the leading errors of two models on the same scans. The scans are paired by id, because each
+    result lists its scans in the order of its folds, which may differ.
 
     Raises:
         InputError: the two models were scored on different scans.

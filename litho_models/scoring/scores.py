@@ -15,7 +15,8 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms. Only the errors under these policies depend on a smooth background.
+# Policies without smooth terms such as tilt. Only with these policies do the errors depend on a smooth
+# background, because smooth terms would absorb it.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
 
 
@@ -25,8 +26,8 @@ def score_model(
     predictions: Sequence[Prediction],
     protocol: NuisanceProtocol,
 ) -> ModelScores:
-    """Score the predictions of one model. The main scores follow the given protocol; the mean absolute error
-    is also computed under every other policy.
+    """Score the predictions of one model. The main scores are computed with the terms of the given protocol.
+    The mean absolute error is also computed for every other policy (set of per-scan terms).
 
     Args:
         name: name of the model.

@@ -1,5 +1,5 @@
-"""Compare the shapes in a measured and a predicted map by their structural similarity and by the placement of
-their edges.
+"""Compare the shapes in a measured map with those in a predicted map, by the structural similarity of the
+maps and by the positions of the edges.
 
 The edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds them
 by linear interpolation between pixels. Nothing is smoothed, so the roughness of the measured contours is part
@@ -20,7 +20,7 @@ SSIM_SIGMA_PX = 1.5
 SSIM_WINDOW_PX = 11
 SEARCH_UM, FILM_SEARCH_PX = 0.5, 10.0
 _CANDIDATES, _MOST_HEIGHTS = 8, 24
-# Half the length of the longest possible piece of a contour, which is the diagonal of a pixel.
+# Half the length of the longest possible piece of a contour. The longest piece is the diagonal of a pixel.
 _HALF_PIECE_PX = 0.5 * 2**0.5
 SIMILARITY_TEXT = (
     f"SSIM is computed with a Gaussian window (σ {SSIM_SIGMA_PX:g} px, width {SSIM_WINDOW_PX} px) and a data "
@@ -36,14 +36,14 @@ EDGES_TEXT = (
 
 
 class EdgePlacement(NamedTuple):
-    """The distances between measured and expected contours, and counts. The contours are divided into pieces,
-    each of which lies within one pixel.
+    """The distances between measured and expected contours, and numbers of pieces of contours. The contours
+    are divided into pieces, each of which lies within one pixel.
 
     A piece of a measured contour has a partner if an expected contour of the same height passes within the
-    search distance and rises to the same side. ``mean_nm`` and ``p95_nm`` are the mean and the 95th
-    percentile of the distances of the pieces with a partner; they are None if no piece has one. ``matched``
-    and ``unmatched`` count the pieces with and without a partner. ``unmatched_expected`` counts the pieces of
-    expected contours without a partner.
+    search distance, and if both maps rise to the same side of the contours. ``mean_nm`` and ``p95_nm`` are
+    the mean and the 95th percentile of the distances of the pieces with a partner; they are None if no piece
+    has one. ``matched`` and ``unmatched`` count the pieces with and without a partner. ``unmatched_expected``
+    counts the pieces of expected contours without a partner.
     """
 
     mean_nm: float | None
@@ -84,7 +84,7 @@ def structural_similarity(measured_um: Array, expected_um: Array) -> float | Non
     pixels.
 
     Args:
-        measured_um: (ny, nx) in µm; pixels that are not scored are NaN.
+        measured_um: measured map, µm, of shape (ny, nx). Pixels that are not scored are NaN.
         expected_um: expected map, µm, with the same shape.
 
     Returns:

@@ -1,6 +1,6 @@
 """Confidence intervals and tests whose units are scans or prints. The pixels of a scan are correlated, so
-whole scans are resampled, and sign-flip tests flip the sign of whole scans. The scans of a print may share a
-day and a batch; then prints are the units instead of scans.
+whole scans are resampled, and sign-flip tests flip the sign of whole scans. If a dataset has several scans
+per print, these scans may share a day and a batch. In this case, prints are the units instead of scans.
 """
 
 from collections.abc import Hashable, Sequence
@@ -24,11 +24,11 @@ PERMUTATIONS = 1999
 # last bits, which would change published results.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 # Largest number of scans for which a test uses every combination of signs, in screening and in a comparison
-# of two models. Screening tests all directions at once. Its limit is one scan lower, which halves its table
-# of signs.
+# of two models. Screening tests all directions at once and therefore needs more memory. Its limit is one scan
+# lower, which halves the size of its table of signs.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
-# The combinations include the observed signs. This factor keeps rounding errors from placing their sum below
-# the observed sum.
+# The combinations of signs include the observed signs. With this factor, rounding errors cannot exclude the
+# observed signs from the combinations that are counted.
 _ROUNDING = 1 - 1e-12
 
 
@@ -51,7 +51,7 @@ def bootstrap_interval(
 
     Args:
         values: one value per scan.
-        groups: print of each scan, if whole prints are resampled instead of scans.
+        groups: print of each scan. If it is given, whole prints are resampled instead of scans.
     """
     sums, counts = _by_group(values, groups)
     if sums.size < 2:
@@ -104,8 +104,8 @@ def interval(values: Sequence[float]) -> Interval:
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> Array:
     """Return combinations of signs for a sign-flip test, with shape (combinations, count). The first row is
-    the observed signs, all +1. For up to ``exact_scans`` scans, all combinations are returned; for more, the
-    observed signs and 9,999 random combinations.
+    the observed signs, all +1. For up to ``exact_scans`` scans, all combinations are returned. For more
+    scans, the observed signs and 9,999 random combinations are returned.
     """
     if count <= exact_scans:
         return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
@@ -150,8 +150,8 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test whether the mean of a difference, which is given for each scan, could be chance. The units are
-    scans or, if ``groups`` states the print of each scan, prints.
+    """Test whether the mean of a difference could be chance. The difference is given for each scan. The
+    independent units are scans or, if ``groups`` states the print of each scan, prints.
 
     Raises:
         InputError: no difference is given.
@@ -223,6 +223,7 @@ def by_print(values: Array, prints: Sequence[Hashable], seed: int = 0) -> ByPrin
     f = float(ratios[0])
     size = (len(members) - float((counts**2).sum()) / len(members)) / between
     icc = max((f - 1) / (f + size - 1), 0.0)
-    # The factor keeps rounding errors from placing the statistic of the observed order below itself.
+    # With this factor, rounding errors cannot exclude the observed order from the permutations that are
+    # counted.
     p = float((ratios >= f * (1 - 1e-12)).mean())
     return ByPrint(f=f, degrees=(between, within), icc=icc, p=p)

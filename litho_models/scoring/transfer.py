@@ -29,7 +29,7 @@ class LevelError(Record):
 
 class TransferCurves(Record, extra="ignore"):
     """A comparison of the spectra of the predicted height H and the measured height Z, along x and along y.
-    At each frequency, it states the gain |H·Z*| / |Z|² and the coherence γ².
+    For each frequency, it contains the gain |H·Z*| / |Z|² and the coherence γ².
 
     ``error_psd_x`` and ``error_psd_y`` are the one-sided power spectral density of the error, nm² per
     cycle/µm. The mean of each line is removed first.
@@ -46,7 +46,7 @@ class TransferCurves(Record, extra="ignore"):
 
 def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) -> list[LevelError]:
     """Return the bias (measured minus predicted) and the standard deviation of the error for each layout
-    level. Only scored pixels count.
+    level. Only scored pixels are used.
 
     Args:
         scans: the scans.
@@ -92,11 +92,12 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Return an array of shape (5, bands). Its rows are the cross power, the power of the measurement, the
-    power of the prediction, the error density, and the number of terms. Each value is a sum over all lines
-    and over the frequencies of one band.
+    """Compute sums over frequency bands. The result has shape (5, bands). Its rows are the cross power, the
+    power of the measurement, the power of the prediction, the error density, and the number of terms. Each
+    value is a sum over all lines and over the frequencies of one band.
 
-    The error density is one-sided, in µm² per cycle/µm. The number of terms is that of its sum.
+    The error density is one-sided, in µm² per cycle/µm. The number of terms is the number of values that were
+    added in the sum of the error density.
     """
     window = np.hanning(height.shape[1])
     measured, predicted = (

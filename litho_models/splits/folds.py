@@ -2,8 +2,8 @@
 ``litho_data.store.lock_box``.
 
 Except in the split ``paper``, whole scans are held out, because the quadrants of one scan share its datum,
-tip and day. Every choice follows from a hash of the scan ids and a seed, so the same ids always give the same
-split.
+the tip of the microscope and the day. Every choice follows from a hash of the scan ids and a seed, so the
+same ids and the same seed always give the same split.
 """
 
 from collections.abc import Sequence
@@ -86,7 +86,7 @@ def plan_folds(
 ) -> list[Fold]:
     """Return the folds of a split. In the split ``paper``, training and held-out sets contain quadrants of
     the same scans, and locked scans are used. The other splits use the locked scans only if ``open_lock_box``
-    is set: they are then held out in one more fold.
+    is set. The locked scans are then held out in an additional fold.
 
     Raises:
         InputError: there are too few scans, there are no locked scans although ``open_lock_box`` is set, or
@@ -145,8 +145,8 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
 
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
-    """Return one fold per print, in the order of the names of the prints. Each fold is the list of the ids of
-    all scans of its print, which it holds out.
+    """Return one fold per print, in the order of the names of the prints. Each fold holds out all scans of
+    its print and is given as the list of their ids.
 
     Raises:
         InputError: there are fewer than two prints, or an id is repeated.
@@ -164,11 +164,11 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 
 
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
-    """Draw a quarter of all quadrants at random. Return them as the held-out crops. The paper draws 24 of 96
-    quadrants in this way.
+    """Draw a quarter of all quadrants at random, and return these quadrants as the held-out crops. The paper
+    draws 24 of 96 quadrants in this way.
 
-    The training set and the held-out set both contain quadrants of the same scans, so errors are too small.
-    Use this split only for comparison with the paper.
+    The training set and the held-out set both contain quadrants of the same scans, so errors are
+    underestimated. Use this split only for comparison with the paper.
     """
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
