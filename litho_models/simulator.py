@@ -157,15 +157,14 @@ class Simulator(nn.Module, ABC):
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
         """Return the same height as ``forward``, µm, but with ``border_px`` pixels cropped on each side.
 
-        A model without a receptive radius overrides this method if it can leave out the computation of the
-        border. For models with a receptive radius, ``predict_inside`` computes only the pixels that are
-        needed.
+        A model without a receptive radius overrides this method if it can skip the computation of the border.
+        For models with a receptive radius, ``predict_inside`` computes only the pixels that are needed.
         """
         return crop_border(self(layout_um), border_px)
 
     def printer(self) -> Simulator:
-        """Return the model of the printer alone. This is the model itself, unless it also contains a model of
-        the microscope.
+        """Return the model of the printer alone. If the model also describes the microscope, that part is
+        left out. Otherwise the model itself is returned.
         """
         return self
 

@@ -1,7 +1,7 @@
 """Compare the causes that a loop names with the planted causes, and the error of its corrected model with the
 error of the true models.
 
-The rules were stated in docs/blind_trials.md before any board was run.
+The rules for both comparisons were stated in docs/blind_trials.md before any board was run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from litho_models.scan_terms.grouped import label_of
 # contains this value.
 _EXPONENT = {"cubic-slope-loss": 3.0}
 _DISPLACED = "s-shaped-axis"
-# This form consists of line offsets, so a loop that reports line offsets has noticed it.
+# The form ``periodic-lines`` consists of line offsets, so a loop that reports line offsets counts as having
+# noticed it.
 _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 

@@ -32,8 +32,8 @@ from litho_models.simulator import Simulator
 
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
-# The search for a strength uses four scans, spread over the printing order and over both cut-off frequencies
-# of the layouts. The size of the cause is then measured on all scans.
+# The search for a strength uses four scans, which are spread over the printing order and over the two cut-off
+# frequencies with which layouts are drawn. The size of the cause is then measured on all scans.
 _SOUGHT_ON = 4
 _PRECISION = 0.03
 
@@ -97,8 +97,8 @@ def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
     If the draw has a form that changes the printer (``base``), this form comes first in the result.
 
     If a cause cannot reach its drawn size, it is planted at its largest allowed strength, and the size at
-    this strength is recorded. It is not replaced by another cause. For a trial of kind ``alias``, the
-    strength is chosen by the change of the scans before the refit, because the refit absorbs most of this
+    this strength is recorded. It is not replaced by another cause. For a trial of kind ``alias``, the drawn
+    size is compared with the change of the scans before the refit, because the refit absorbs most of this
     change.
     """
     drawn = [*([draw.base] if draw.base else []), *draw.causes]

@@ -49,8 +49,8 @@ class Draw(Record):
 
     Attributes:
         seed: determines the layouts, the noise, and the random values of knobs and forms.
-        printer: parameters that differ from those of the default printer; ``base``: form that changes the
-            printer so that the Physics model cannot imitate it.
+        printer: the parameters in which the printer of this trial differs from the default printer; ``base``:
+            form that changes the printer so that the Physics model cannot imitate it.
     """
 
     number: int
@@ -179,7 +179,8 @@ class Answer(Result):
     corrected_values: dict[str, float] = Field(default_factory=dict)
 
 
-# Older results also contain the verdict of the loop and its base model; both are ignored.
+# Older result files also contain the verdict of the loop and the name of its base model. Both entries are
+# ignored.
 class Trial(Result, extra="ignore"):
     """The result of one judged trial. For a failed trial, ``errors`` is None and ``failure`` says why it
     failed.

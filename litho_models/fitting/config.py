@@ -28,8 +28,8 @@ PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
 class TrainingConfig(Record):
-    """Settings of one fit. A fit by least squares uses only those in ``LEAST_SQUARES_FIELDS``; the other
-    settings apply to stochastic gradient descent.
+    """Settings of one fit. A fit by least squares uses only the settings in ``LEAST_SQUARES_FIELDS``. The
+    other settings apply only to stochastic gradient descent.
 
     ``nuisance`` is the policy, i.e. the name of the set of terms that are fitted to each scan together with
     the model. These terms never become part of the model. The gain of a scan is not fitted in training,

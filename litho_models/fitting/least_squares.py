@@ -67,7 +67,8 @@ class Rules:
     """Settings of a fit.
 
     Attributes:
-        loss: whether the sum of absolute residuals or of squared residuals is minimised.
+        loss: ``absolute`` to minimise the sum of absolute residuals, ``squares`` to minimise the sum of
+            squared residuals.
         term_weight: weight, with the loss ``squares``, of the part of a residual that the terms of the scan
             can explain. The weight is large enough to determine the part of these terms that is common to all
             scans (the common datum). It is small enough that the terms of a single scan do not bias the
@@ -75,7 +76,7 @@ class Rules:
         pinned: number of scan terms, with the loss ``absolute``, whose mean over the scans is held at zero.
             They are the first rows of ``Linearised.basis``.
         steps: largest number of steps.
-        relative_gain: the fit ends after a step that reduces the loss by less than this fraction.
+        relative_gain: the fit ends after a step that reduces the loss by less than this fraction of the loss.
         tries: largest number of attempts at one step. Each attempt uses ten times the damping of the previous
             one.
         lowest_damping: lower limit of the damping.
@@ -171,8 +172,8 @@ class NormalEquations:
 
     @classmethod
     def at(cls, linear: Sequence[Linearised], terms: Array | None, rules: Rules) -> NormalEquations:
-        """Set up the equations from the linearised scans and the present values of their terms. ``terms`` has
-        shape (scans, k); with the loss ``squares`` it is None.
+        """Set up the equations from the linearised scans and the present values of the scans' terms.
+        ``terms`` has shape (scans, k); with the loss ``squares`` it is None.
         """
         count = len(linear[0].jacobian)
         if terms is None:
@@ -245,9 +246,9 @@ def with_residuals(linear: Sequence[Linearised], left: Sequence[Array]) -> list[
 
 
 def eliminated(part: Linearised, term_weight: float) -> tuple[Array, Array, float]:
-    """Return the normal matrix, the right side and the weighted sum of squares of one scan, after its terms
-    are eliminated. The part of each column that the terms of the scan can explain is multiplied by the weight
-    ``term_weight``.
+    """Eliminate the per-scan terms from the normal equations of one scan. Return the remaining normal matrix,
+    the right side and the weighted sum of squared residuals. The part of each column that the terms of the
+    scan can explain is multiplied by the weight ``term_weight``.
     """
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])

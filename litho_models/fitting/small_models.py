@@ -74,15 +74,15 @@ class ModelProblem:
 
     def room(self, vector: Array) -> Room | None:
         """Return the smallest and largest step that keep all values inside the ranges of the model. Return
-        None for a linear model, which may take any step.
+        None for a linear model, for which any step is allowed.
         """
         return None if self._model.is_linear else parameter_room(self._model, vector)
 
 
 def parameter_room(model: nn.Module, vector: Array) -> Room:
     """Return the smallest and the largest step from ``vector`` that ``STEP_LIMIT`` and the ranges of the
-    model allow. ``vector`` and both results have shape (p,), with one entry per trainable number of the
-    model.
+    model allow. ``vector``, the smallest step and the largest step have shape (p,), with one entry per
+    trainable number of the model.
     """
     ranges = model.ranges if isinstance(model, Simulator) else {}
     free = (-np.inf, np.inf)

@@ -46,8 +46,9 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int = 512) ->
         size_px: side of the layouts, in pixels.
 
     Raises:
-        InputError: the suffix is neither of the two; ``onnx`` is not installed; the format does not support
-            an operation of the model; or the heights of program and model differ by more than 0.01 nm.
+        InputError: the suffix is neither ``.pt2`` nor ``.onnx``; ``onnx`` is not installed; the format does
+            not support an operation of the model; or the heights of program and model differ by more than
+            0.01 nm.
     """
     target = Path(out)
     if target.suffix not in SUFFIXES:

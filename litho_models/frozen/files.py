@@ -123,8 +123,8 @@ def push(source: str | Path, repository: str, *, private: bool = False) -> str:
 
     Args:
         source: the model to share, as for ``load_frozen``.
-        repository: ``owner/name`` of the repository. It is created if it does not exist, and is then private
-            if ``private`` is set.
+        repository: ``owner/name`` of the repository. If the repository does not exist, it is created. A new
+            repository is private if ``private`` is set.
 
     Raises:
         InputError: ``load_frozen`` cannot load the model, the repository rejects the upload, or

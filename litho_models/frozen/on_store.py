@@ -20,10 +20,10 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     array of shape (ny, nx).
 
     Args:
-        layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. It contains integer levels, or
-            grey values that represent levels. A file that ``litho-design`` exported is also accepted. The
-            file that ``litho-design`` wrote beside it states the pitch and the level height; both are
-            checked.
+        layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. The file contains the level
+            number of each pixel, or grey values that represent level numbers. A file that ``litho-design``
+            exported is also accepted. The file that ``litho-design`` wrote beside it states the pitch and the
+            level height; both are checked.
         out: file for the height: ``.gsf`` (opens in Gwyddion) or ``.npy``.
 
     Raises:

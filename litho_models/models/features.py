@@ -61,7 +61,9 @@ class OfField(nn.Module, ABC):
         """Return the receptive radius of the features, in pixels."""
 
     def _point(self) -> Tensor:
-        """Return a field of zeros of the smallest possible size, whose interior is a single pixel."""
+        """Return a field of zeros of the smallest possible size, i.e. a field whose interior is a single
+        pixel.
+        """
         side = 2 * self.reach_px + 1
         return torch.zeros(1, 1, side, side)
 
@@ -93,15 +95,15 @@ class OfField(nn.Module, ABC):
 
 
 class Features(OfField, Simulator):
-    """A weighted sum of features of the layout: H = w · φ(M). For the features, the layout M is divided by
-    the height of the highest level.
+    """A weighted sum of features of the layout: H = w · φ(M). Before the features are computed, the layout M
+    is divided by the height of the highest level.
 
     The features φ are:
 
     - blurs, their cubes, and the products of any two blurs;
     - slopes along y and x at several blurs, with their magnitudes, products and second derivatives;
-    - copies of the layout that are displaced to one side, and the magnitudes of the height differences
-      between the layout and these copies;
+    - displaced copies of the layout, one for each direction (up, down, left, right), and the magnitudes of
+      the height differences between the layout and these copies;
     - blurs along one axis;
     - the steepness of the surroundings along each axis.
 
@@ -179,8 +181,9 @@ class Features(OfField, Simulator):
         return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
 
     def _displaced(self, layout: Tensor) -> list[Tensor]:
-        """Return copies of the layout that are displaced to each of the four sides. Also return the
-        magnitudes of the height differences between the layout and each copy, and between opposite copies.
+        """For each step length, return copies of the layout that are displaced up, down, left and right by
+        this length. Also return the magnitudes of the height differences between the layout and each copy,
+        and between copies displaced in opposite directions.
         """
         steps, found = self._steps_px(), []
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])

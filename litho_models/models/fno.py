@@ -192,7 +192,8 @@ class SpectralConvolution(nn.Module):
             along_x = torch.complex(*(parts_x @ field).chunk(2, dim=2))
             spectra = (waves_y.conj() @ along_x.flatten(2)).unflatten(2, (kept_x, -1))
             mixed = torch.einsum("byxi,ioyx->byxo", spectra, matrices)
-            # Each frequency along x also represents its negative, unless the two are equal.
+            # Each frequency along x also represents the negative frequency, unless both are the same (zero
+            # and the Nyquist frequency).
             shares = (1 + (2 * k_x % nx).sign()).to(field)[:, None] / (ny * nx)
             lines = (waves_y.T @ (shares * mixed).flatten(2)).unflatten(2, (kept_x, -1))
             return parts_x.T @ torch.cat([lines.real, lines.imag], dim=2)

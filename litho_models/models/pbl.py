@@ -157,10 +157,10 @@ class Pbl(Simulator):
     g_shrink = 1 + net, g_mismatch(H) = H + net(H). The last layers of these networks are zero before
     training.
 
-    The variant ``default`` adds two feature networks to this chain. ``surroundings`` describes how the layout
-    within some micrometres of a pixel influences its height. This influence is the same along x and y.
-    ``scan_axis`` describes how the height along x influences the measured height. This influence may come
-    from the microscope. The network takes part in the fit so that the other networks do not learn the
+    The variant ``default`` adds two feature networks to this chain of steps. ``surroundings`` describes how
+    the layout within some micrometres of a pixel influences its height. This influence is the same along x
+    and y. ``scan_axis`` describes how the height along x influences the measured height. This influence may
+    come from the microscope. The network takes part in the fit so that the other networks do not learn the
     influence, but ``printer()`` returns the model without it.
     """
 
@@ -194,7 +194,7 @@ class Pbl(Simulator):
         return self if self.scan_axis is None else self._without("scan_axis")
 
     def chain(self) -> Pbl:
-        """Return the model without its feature networks. What remains is the chain of the paper."""
+        """Return the model without its feature networks, which is the chain of steps in the paper."""
         return self._without("surroundings", "scan_axis") if self.feature_networks else self
 
     def take(self, chain: Simulator) -> None:
@@ -232,8 +232,8 @@ class Pbl(Simulator):
         return height
 
     def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the height of the interior that the chain predicts, and the field that is the input of each
-        feature network. All are in µm.
+        """Return the height of the interior that the chain predicts and, for each feature network, the field
+        from which its features are computed. All are in µm.
         """
         along = 0 if self.scan_axis is None else self.scan_axis.reach_px
         printed = self._chain(crop_border(layout_um, self.reach_px - self._chain_px - along))
@@ -291,7 +291,8 @@ class Pbl(Simulator):
 
     def _shrink_by_table(self, dose: Tensor) -> Tensor:
         # A blur averages, so the dose stays in the range of the blur's input, which is the output of the
-        # threshold network. The range of this output is that of its values at the knots, whatever the layout.
+        # threshold network. For any layout, the range of this output is the range of the network's values at
+        # the knots.
         full = self.config.full_height_um
         knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
         reachable = self.thresh.at_knots(0.0, full).detach()

@@ -94,8 +94,9 @@ class Physics(Simulator):
     S depends on G_diffusion * Ĥ. M is the layout, H the printed height, g a gain and b a height bias.
 
     In the variant ``default``, H₀ is the nominal height of the highest level, and the gain is fitted. Without
-    it, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1. A
-    threshold below 0 lies below the lowest level. The projection then uses only the concave part of the tanh.
+    it, the highest level would always print at H₀ + b. In ``paper`` and ``authors``, H₀ is 1 µm and g is 1.
+    If the threshold is below 0, it lies below the lowest level, and the projection uses only the concave part
+    of the tanh.
 
     The shrinkage factor is S = κ + (1 - κ) · u, where u is the diffused dose scaled to 0 ... 1. The variant
     ``default`` scales it by a fixed range, ``paper`` by the range of the dose in the layout, and ``authors``

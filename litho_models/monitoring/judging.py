@@ -1,5 +1,5 @@
 """Judge for each monitored quantity whether it has changed, and estimate when it should be measured again.
-This module needs neither files nor models, only the values of the scans.
+The functions of this module work on values of scans and need neither files nor models.
 """
 
 from collections.abc import Sequence

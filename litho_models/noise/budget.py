@@ -56,7 +56,9 @@ class NoiseBudget(Record, extra="ignore"):
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
-    """Compute both estimates of the noise from the residuals of one model on held-out scans."""
+    """Compute the two upper estimates of the noise (see ``NoiseBudget``) from the residuals of one model on
+    held-out scans.
+    """
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))

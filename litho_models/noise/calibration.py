@@ -140,11 +140,12 @@ class Stated(NamedTuple):
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit two models of the spread of the residuals, and judge both: a constant spread, and one that depends
-    on covariates. For each print, they are fitted to the other prints and judged on this print.
+    """Fit two models of the spread of the residuals, and judge each: a constant spread, and a spread that
+    depends on covariates. For each print, both models are fitted to all other prints and judged on this
+    print.
 
-    If there are fewer than three prints, groups of scans are left out instead. The shape and the scale of the
-    distribution are fitted together.
+    If there are fewer than three prints, groups of scans are left out of the fits instead of prints. The
+    shape and the scale of the distribution of residuals are fitted together.
 
     Raises:
         InputError: there are fewer than three scans.

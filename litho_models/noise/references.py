@@ -134,8 +134,9 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     variance of the noise is half the variance of the difference between two such prints. Return None if there
     are no repeated prints.
 
-    The mean absolute value of the noise is the mean absolute difference divided by √2. This is exact for
-    Gaussian noise, and correct within a few percent for other noise (see ``estimated_floor``).
+    The mean absolute value of the noise is the mean absolute difference divided by √2. This relation is exact
+    for Gaussian noise, and correct within a few percent for other distributions of the noise (see
+    ``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:

@@ -57,8 +57,8 @@ class Tails:
         return student.cdf(z, self.freedom)
 
     def half_width(self, level: float) -> float:
-        """Return half the width, in units of the scale, of the central interval that has the probability
-        ``level``.
+        """Return half the width of the central interval that contains a residual with the probability
+        ``level``. The unit is the scale of the distribution.
         """
         return float(student.ppf(0.5 + level / 2, self.freedom))
 
@@ -72,9 +72,9 @@ class Tails:
     def crps(self, residual: Array, scale: Array | float) -> Array:
         """Return the continuous ranked probability score in the unit of the residual.
 
-        The score generalises the absolute error to predictions with a stated spread. As the scale approaches
-        0, the score approaches the absolute value of the residual. For Student's t, the formula is that of
-        Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        The score is a generalisation of the absolute error to predictions that state a spread. As the scale
+        approaches 0, the score approaches the absolute value of the residual. For Student's t, the formula is
+        that of Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
         """
         z, n = residual / scale, self.freedom
         density, slope = student.pdf(z, n), z * (2 * student.cdf(z, n) - 1)
@@ -96,7 +96,8 @@ def normalised_calibration_error(residual: Array, sigma: Array) -> float:
     contains n independent pixels, the result is about ``1/√(π n)`` by chance, even for a perfect σ.
 
     Args:
-        residual, sigma: (pixels,), both in the same unit.
+        residual, sigma: residual and stated standard deviation of each pixel, in the same unit, each of shape
+            (pixels,).
     """
     number = equal_counts(sigma, _BINS)[1]
     count = np.bincount(number)
@@ -124,7 +125,8 @@ def sparsification_error(residual: Array, sigma: Array) -> float:
     their mean ``|r|``, so that their order does not matter.
 
     Args:
-        residual, sigma: (pixels,), both in the same unit. At least one residual must not be zero.
+        residual, sigma: residual and stated standard deviation of each pixel, in the same unit, each of shape
+            (pixels,). At least one residual must not be zero.
     """
     error = np.abs(residual)
     value, group = np.unique(sigma, return_inverse=True)

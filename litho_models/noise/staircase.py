@@ -1,5 +1,5 @@
-"""Evaluate prints of steps (staircases): the areas between the steps (treads), the heights of the steps, and
-whether neighbouring levels can be told apart (readability).
+"""Evaluate prints of steps (staircases): find the areas of constant level (treads), measure the heights of
+the steps between them, and judge whether neighbouring levels can be told apart (readability).
 """
 
 from itertools import pairwise
@@ -33,7 +33,8 @@ class Step(Record, extra="ignore"):
     Args:
         readability: height of the step divided by ``sigma_nm``, the standard deviation of single pixels on
             its two treads.
-        misread: share of the pixels of both treads whose height is nearer to that of the other tread.
+        misread: share of the pixels of the step's two treads whose height is nearer to that of the other
+            tread than to that of their own tread.
     """
 
     height_nm: float
@@ -176,8 +177,8 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
-    """Return the columns of each tread, without a zone of ``guard_px`` pixels at both edges. The zone is at
-    most a third as wide as the tread.
+    """Return the range of columns of each tread, without a zone of ``guard_px`` pixels along each of its two
+    edges. The zone is at most a third as wide as the tread.
     """
     ends = pairwise([0, *edges_px, shape[1]])
     insets = [(start, stop, min(guard_px, (stop - start) // 3)) for start, stop in ends]

@@ -98,7 +98,7 @@ def layout_slope(scan: PrintedScan) -> Array:
 
 def fit_spread(covariates: Array, residual: Array) -> tuple[Array, Tails]:
     """Fit the scale of the residuals (β in ln s² = X β) and the shape of their distribution by maximum
-    likelihood. Return both.
+    likelihood. Return β and the shape.
     """
     best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
     for tails in map(Tails, _FREEDOMS):
@@ -154,6 +154,6 @@ def scale_nm(beta: Array, covariates: Array) -> Array:
 
 
 def variance_model(beta: Array, tails: Tails) -> VarianceModel:
-    """Return the fitted coefficients as a record."""
+    """Return the fitted coefficients and the shape of the distribution as a record."""
     freedom = None if np.isinf(tails.freedom) else tails.freedom
     return VarianceModel(covariates=list(COVARIATES), coefficients=beta.tolist(), freedom=freedom)

@@ -65,9 +65,9 @@ def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tenso
     """Predict the height, µm, of the pixels that are at least ``border_px`` pixels from the edge of the
     layout. The height is differentiable in the layout.
 
-    The border must be less than half as wide as the layout. The result equals that of ``predict_field`` with
-    the border cropped. If the model allows it, only the pixels of the result are computed (see
-    ``FrozenSimulator.inside``).
+    The border must be less than half as wide as the layout. The result is the same as that of
+    ``predict_field`` after the border is cropped. If the model allows it, only the pixels of the result are
+    computed (see ``FrozenSimulator.inside``).
     """
     reach = model.reach_px
     if reach is None:
@@ -84,7 +84,7 @@ def blend_tiles(
     is a weighted mean over the tiles that contain it, with weights that add up to one.
 
     The first tile starts ``overlap_px`` pixels outside the layout, where the outermost pixels of the layout
-    are repeated. The weights thus add up to one at the edge of the layout, too.
+    are repeated. The weights therefore also add up to one at the edge of the layout.
 
     Args:
         function: receives tiles of shape (batch, 1, T, T) and returns their heights with the same shape.

@@ -66,9 +66,9 @@ def film_errors(measured_um: Array, expected_um: Array, edge_um: float) -> FilmE
 
 
 def _partners(first: Array, second: Array) -> tuple[Array, Array]:
-    """Find the connected parts of two masks. For each part that is large enough, count the parts of the other
-    mask that it touches. Return the counts for the parts of the first mask, and the counts for the parts of
-    the second mask.
+    """Find the connected parts of two masks. For each part of a mask that is large enough, count the parts of
+    the other mask that it touches. Return the counts for the parts of the first mask, and the counts for the
+    parts of the second mask.
     """
     from scipy.ndimage import label
 

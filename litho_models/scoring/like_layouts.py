@@ -62,7 +62,7 @@ class LikePixels(NamedTuple):
 
 
 def like_pixels(scans: Sequence[PrintedScan], scored: Sequence[Array], seed: int = 0) -> LikePixels | None:
-    """Draw a random sample of pixels. For each of them, find the most similar pixels of other scans.
+    """Draw a random sample of pixels. For each of these pixels, find the most similar pixels of other scans.
 
     Two pixels are similar if their surroundings in the layout are similar. Only scans at the same dose are
     compared, because the dose changes the height even if the layouts are equal.

@@ -99,12 +99,12 @@ def register_metric(
         unit: unit of the metric, with the same characters; ``1`` for a metric without a unit.
         function: function that computes the metric of one scan, as described above.
         explanation: sentence that explains the metric in the report.
-        over_scans: whether the metric of a model is the ``mean`` or the ``sum`` of its values for the scans,
-            without those that are None.
+        over_scans: ``mean`` or ``sum``: how the values of single scans are combined to the metric of a model.
+            Values that are None are left out.
 
     Raises:
         InputError: the name or the unit is not an identifier, the name is already taken, or ``over_scans`` is
-            neither of the two.
+            neither ``mean`` nor ``sum``.
     """
     metric = Metric(name, unit, over_scans)
     if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):

@@ -2,8 +2,8 @@
 maps and by the positions of the edges.
 
 The edges are contours of both maps at the heights halfway between nominal levels. Marching squares finds them
-by linear interpolation between pixels. Nothing is smoothed, so the roughness of the measured contours is part
-of the error.
+by linear interpolation between pixels. The maps are not smoothed, so the roughness of the measured contours
+is part of the error.
 """
 
 from typing import NamedTuple

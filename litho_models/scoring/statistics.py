@@ -122,7 +122,7 @@ def one_sided_flip_p(values: Array) -> float:
 
 def smallest_flip_p(count: int) -> float:
     """Return the smallest p value that a two-sided sign-flip test of this many scans or prints can give. If
-    all combinations of signs are used, it is 2 divided by their number.
+    all combinations of signs are used, this p value is 2 divided by the number of combinations.
 
     With six prints, for example, p is at least 2 / 2^6 = 0.031, however large the difference.
     """
