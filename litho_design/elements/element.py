@@ -40,22 +40,25 @@ class Element(nn.Module):
 
     Args:
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
-        layout: geometry and levels, or changes to the defaults, such as ``{"size_px": 256}``.
+        layout: geometry and number of levels of the layout, or a mapping of changes to the default layout
+            settings, such as ``{"size_px": 256}``.
         resin: name of a resin, or a function from the wavelength in µm to its refractive index.
         surroundings: refractive index above the relief.
         absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
         kind: ``thin`` or ``thick``. For ``thick``, the wave is propagated through the relief by the wave
             propagation method; the relief must be in air.
-        tile_px: side of the overlapping tiles in which an element is printed if it is larger than a tile. The
-            backward pass recomputes the tiles, so the memory needed depends on the tile and not on the
-            element. None prints the element in one piece.
+        tile_px: side, in pixels, of the overlapping tiles into which an element larger than one tile is
+            divided. The prints of the tiles are predicted one after the other, and the backward pass
+            recomputes them, so the memory needed depends on the size of a tile and not on that of the
+            element. With None, the print of the whole element is predicted at once.
         seed: seed of the random levels at the start.
         device, extrapolate: as for ``load_printer``.
 
     Raises:
-        InputError: ``load_printer`` refuses the model, the printer has no gradients, or the refractive index
-            of the resin does not exceed that of the surroundings. The error is also raised if tiles are
-            requested for a model whose print depends on the position, or if a thick element is not in air.
+        InputError: ``load_printer`` rejects the model, the printer model provides no gradients, or the
+            refractive index of the resin does not exceed that of the surroundings. The error is also raised
+            if tiles are requested for a model whose print depends on the position, or if a thick element is
+            not in air.
     """
 
     def __init__(
@@ -128,7 +131,9 @@ class Element(nn.Module):
         return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
 
     def optics(self, wavelength_um: float) -> Optics:
-        """Return the optics of the element at this wavelength: wavelength, index step and kind."""
+        """Return the optical settings of the element at this wavelength: the wavelength, the refractive index
+        step and the kind of element (thin or thick).
+        """
         if not SHORTEST_UM < wavelength_um < LONGEST_UM:
             wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
             hint = "convert nm or metres to µm, or use as_torchoptics(unit_um=1e6) for metres"
@@ -143,7 +148,9 @@ class Element(nn.Module):
         return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
 
     def start_from_levels(self, levels: np.ndarray) -> None:
-        """Set the free levels to those of a layout of shape (size, size). Its levels need not be integers."""
+        """Set the free levels to the values in ``levels``, an array of shape (size, size). The values need
+        not be integers.
+        """
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
@@ -169,8 +176,8 @@ class Element(nn.Module):
             unit_um: size of this unit of length in µm, for example 1e6 if your program uses metres.
 
         Raises:
-            InputError: torchoptics is not installed, or the element is thick and therefore not described by a
-                complex factor.
+            InputError: torchoptics is not installed, or the element is thick, so that one complex factor per
+                pixel cannot describe it.
         """
         try:
             from litho_design.elements.in_torchoptics import PrintedElement

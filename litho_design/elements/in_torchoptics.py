@@ -15,13 +15,14 @@ class PrintedElement(PolychromaticModulationElement):
 
     Args:
         element: the printed element, whose parameters become those of this module.
-        z, offset: as in torchoptics.
+        z, offset: position of the element along and across the axis, as in torchoptics.
         unit_um: size, in µm, of the unit of length that your program uses in torchoptics.
     """
 
     def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
         size, pitch = element.layout.size_px, element.layout.pitch_um
-        # A field fits only if its spacing agrees to the last bit, but 0.1 / 1e6 is not exactly 1e-7.
+        # torchoptics accepts a field only if its spacing equals that of the element to the last bit, but 0.1
+        # / 1e6 is not exactly 1e-7. The spacing is therefore rounded to 12 digits.
         super().__init__((size, size), z, float(f"{pitch / unit_um:.12g}"), offset)
         self.element, self.unit_um = element, unit_um
 

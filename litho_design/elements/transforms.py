@@ -1,5 +1,5 @@
-"""Make printing work in ``torch.func`` and ``torch.compile``, which cannot trace the models' own
-gradients.
+"""Make printer models usable inside ``torch.func`` and ``torch.compile``, which cannot trace the custom
+gradients that the models define.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ Print = Callable[[Tensor], Tensor]
 
 
 def printed_anyhow(run: Print, level: Tensor) -> Tensor:
-    """Return ``run(level)``. If a transform of ``torch.func`` cannot trace this call, it is computed as one
-    opaque step.
+    """Return ``run(level)``. If a transform of ``torch.func`` cannot trace this call, the call is treated as
+    one opaque operation.
     """
     if "torch._dynamo" in sys.modules:
         run = torch.compiler.disable(run)

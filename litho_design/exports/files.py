@@ -48,8 +48,8 @@ _SUFFIX: dict[str, str] = {
 }  # fmt: skip
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
-# Largest number of pixels for the formats that are not written in parts. For more pixels, these formats would
-# need about 3 GiB of memory (images) or more (solids).
+# Largest number of pixels of a layout for the formats that are written in one piece, not band by band. For
+# more pixels, these formats would need about 3 GiB of memory (images) or more (solids).
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
@@ -78,7 +78,7 @@ def export(
     marks: bool = False,
     **job: Any,
 ) -> Path:
-    """Write a layout as a file for the printer, with the sidecar ``<file>.json``.
+    """Write a layout as a file for the printer, and the sidecar ``<file>.json``, which describes the file.
 
     Before the export finishes, the file is read back and compared with the layout. ``tiff`` and ``gds`` are
     written and read one band of rows at a time, so memory does not grow with the height of an element.
@@ -95,7 +95,8 @@ def export(
             ``grey,height_um`` that gives the printed height of each grey value. Without it, the grey value is
             linear in height.
         marks: add an orientation mark and a flat witness area beside the element (see ``with_marks``).
-        job: changes to ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode": "piezo"}``.
+        job: changes to the default settings of ``PrintJob``, such as ``pedestal_um=2`` or ``gwl={"mode":
+            "piezo"}``.
 
     Returns:
         Path of the exported file.
@@ -153,8 +154,8 @@ def export(
         back = exported_rows(file, record.model_dump())
         if not all(np.array_equal(back[rows], levels[rows]) for rows in bands_of(levels, _BAND_PX)):
             raise AssertionError(f"the {format} file does not contain the layout that was exported")
-        # The sidecar is moved last. Until then, the file has no sidecar or an outdated one, so it cannot be
-        # read back by mistake.
+        # The sidecar is moved to the folder last. Until then, the exported file has no sidecar or an outdated
+        # one, so ``import_levels`` cannot read an unfinished export by mistake.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
             part.replace(place / part.name)
     return place / name

@@ -1,5 +1,5 @@
-"""Write layouts as GDSII, one band of rows at a time. The file has one layer per level, and blocks that are
-equal share one cell.
+"""Write layouts as GDSII, one band of rows at a time. The file has one layer per level, and equal blocks of
+pixels share one GDS cell.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def write_gds(
     layers: GdsLayers,
     parts: Mapping[str, Box] | None = None,
 ) -> int:
-    """Write rectangles in units of 1 µm on a grid of 1 nm, with y upwards. Return the number of rectangles in
-    the file.
+    """Write a layout as rectangles. Coordinates are in µm on a grid of 1 nm, and y points upwards. Return the
+    number of rectangles in the file.
 
     Layer k contains the pixels with level >= k (``cumulative``; k starts at 1) or the pixels with level == k
     (``exclusive``; k starts at 0). Runs of such pixels along a row are merged with equal runs in the rows

@@ -1,5 +1,5 @@
-"""Write layouts as GWL for Nanoscribe printers. In each slice, every run of pixels in a row is written as
-lines.
+"""Write layouts as GWL for Nanoscribe printers. In each slice, every run of adjacent pixels in a row is
+written as parallel lines.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _PIEZO_UM = 300.0
 
 
 def write_gwl(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float, job: PrintJob) -> int:
-    """Write one field after the other, each from the lowest slice of the pedestal upwards. Return the number
-    of lines.
+    """Write the write fields one after the other, each from the lowest slice of the pedestal (base) upwards.
+    Return the number of lines that the laser writes.
 
-    The lines of a slice lie at the middle of its thickness. Perpendicular to the lines, each line lies at the
-    middle of its hatching distance. A line runs along x from the first edge to the last edge of a run of
+    The lines of a slice lie at the middle of its thickness. Each line lies in the middle of a strip whose
+    width is the hatching distance. A line runs along x from the first edge to the last edge of a run of
     pixels that reach the slice. The origin of x and y is the lower left corner of the element, and y points
     upwards. In galvo mode, the stage moves to the middle of each field, which is then the origin.
 

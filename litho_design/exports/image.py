@@ -15,8 +15,8 @@ from litho_design.printers.layout import LayoutSettings
 
 _UM_PER_CM = 1e4
 _STRIP_PX = 64
-# Offsets in a TIFF have 32 bits. A file beyond this size, which leaves room for the tags, is written as a
-# BigTIFF.
+# Offsets in a classic TIFF have 32 bits. If the pages need more bytes than this limit, the file is written as
+# a BigTIFF. The limit leaves room for the tags.
 _CLASSIC_BYTES = 2**32 - 2**24
 
 
@@ -42,8 +42,8 @@ def measured_greys(layout: LayoutSettings, bits: int, curve: str | Path) -> list
             both columns must increase from row to row.
 
     Raises:
-        InputError: the file is not such a table, the height of a level is outside the measured range, or two
-            levels would have the same grey value.
+        InputError: the file is not a table with these columns, the height of a level is outside the measured
+            range, or two levels would have the same grey value.
     """
     try:
         table = np.atleast_1d(np.genfromtxt(curve, delimiter=",", names=True, dtype=float))

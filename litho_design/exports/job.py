@@ -1,4 +1,6 @@
-"""Settings of a print job that the layout does not contain: format, base, slices and lines."""
+"""Settings of a print job that the layout does not contain: those of the file format, of the base under the
+element, and of the slices and lines in which it is printed.
+"""
 
 from __future__ import annotations
 

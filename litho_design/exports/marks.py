@@ -18,7 +18,8 @@ Box = tuple[int, int, int, int]
 # An F looks different in all eight orientations.
 _LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 _STROKE_UM = 1.0
-# Width of the middle part of the witness area, which lies beyond the reach of the printer from the edges.
+# Width of the middle part of the witness area. Its distance from the edges exceeds the reach of the printer,
+# so the edges do not affect its printed height.
 _FLAT_UM = 4.0
 
 
@@ -50,7 +51,7 @@ def with_marks(
     changes the print of another. The element and both marks consist of whole cells.
 
     Args:
-        guard_um: reach of the printer, µm.
+        guard_um: reach of the printer, µm, i.e. the distance up to which a level affects the print.
         level_heights_um: printed height, µm, of a wide uniform field of each level.
 
     Returns:

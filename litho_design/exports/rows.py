@@ -27,7 +27,7 @@ class LevelRows(Protocol):
 
 @dataclass(frozen=True)
 class RingRows:
-    """The level map of a lens in rings, which computes only those rows that are requested.
+    """The level map of a lens that consists of rings. Only those rows that are requested are computed.
 
     Args:
         ring_level: level of each pixel along the radius, uint8. In the corners of the map, beyond the

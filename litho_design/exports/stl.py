@@ -15,7 +15,8 @@ _HEADER_BYTES = 80
 # If two columns touch only along an edge, the higher column is moved away from the edge by this share of a
 # cell.
 _APART = 1 / 128
-# Directions (x, y) from a point to the cells around it: south-west, south-east, north-west, north-east.
+# Directions (x, y) from a grid point to the four cells around it: south-west, south-east, north-west,
+# north-east.
 _WAY = np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)], np.float32)
 _BELOW = -1
 
@@ -91,10 +92,10 @@ def step_solid(levels: np.ndarray) -> np.ndarray:
 
 
 def _corner(point: np.ndarray, z: np.ndarray, way: int | np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Return the positions x, y and z, shape (n, 3), of grid points.
+    """Return the positions (x, y, z) of n grid points. The result has shape (n, 3).
 
-    The points are given as row and column, shape (n, 2). Those marked in ``moved`` are shifted slightly in
-    the direction ``way``, towards one of the cells around them.
+    ``point`` contains the row and the column of each point, shape (n, 2). Points that are True in ``moved``
+    are shifted slightly in the direction ``way``, towards one of the cells around them.
     """
     at = point[:, ::-1] + _APART * moved[:, None] * _WAY[way]
     return np.concatenate([at, z[:, None]], axis=1).astype(np.float32)

@@ -19,20 +19,21 @@ from litho_design.optimisation.phases import gerchberg_saxton
 _ITERATIONS = 40
 _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
-# Names of the figures that are defined for any image.
+# Names of the scores that are defined for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
 
 
 def hologram_baselines(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
 ) -> dict[str, dict[str, float]]:
-    """Return a dict of the scores that a black image and ideal elements have in the optics of ``bench``.
+    """Return the scores of a black image and of ideal elements in the optics of ``bench``, keyed by the name
+    of the baseline.
 
     ``diffraction-limited`` is an element with free amplitude and phase whose image has a flat phase, found by
     forty Gerchberg-Saxton steps. ``continuous phase`` has one arbitrary phase per cell and needs neither a
-    printer nor levels. The search for these phases starts from Gerchberg-Saxton and takes a hundred descent
-    steps on the loss of the design. The loss that they reach is one of the scores. ``weighted GS`` also has
-    one phase per cell, found by forty weighted Gerchberg-Saxton steps.
+    printer nor levels. The search for these phases starts from the result of the Gerchberg-Saxton algorithm
+    and takes a hundred descent steps on the loss of the design. The loss after these steps is one of the
+    scores. ``weighted GS`` also has one phase per cell, found by forty weighted Gerchberg-Saxton steps.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
@@ -56,8 +57,8 @@ def hologram_baselines(
 
 @torch.no_grad()
 def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
-    """Search for the phases that put the most power on the signal, starting from a print, and return the
-    share of the power that reaches the signal.
+    """Starting from a print, search for the phases of the element that send the most power to the signal.
+    Return the share of the power that reaches the signal.
 
     The signal is the set of pixels whose target exceeds 0.5. Each step is u <- exp(j arg P^H S P u), where u
     is the wave behind the element, P is the propagator and S is the mask of the signal; every pixel has its

@@ -71,8 +71,8 @@ class HologramScore(Record):
 
 
 class WindowedHologramScore(HologramScore):
-    """The score of a hologram with a signal window. The loss and the figure of the window ignore light
-    outside the window, but the other figures count such light as an error.
+    """The score of a hologram with a signal window. The loss and ``si_psnr_window_db`` ignore light outside
+    the window, but the other scores count such light as an error.
     """
 
     si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
@@ -88,8 +88,9 @@ def hologram_score(
     window of 11 px and sigma 1.5, and a data range of 1.
 
     Args:
-        waves: one pair for each wave: the share of the light in this wave, and its complex field in the image
-            plane for unit incident power, 1/µm, shape (m, m).
+        waves: one pair (share, field) for each wave. The first item is the share of the light in this wave.
+            The second is the complex field of the wave in the image plane for unit incident power, in 1/µm, a
+            tensor of shape (m, m).
         element: complex field just behind the element, shape (n, n), on pixels of the same size. The mean of
             this field determines the zero order, which is the share of the power that continues undiffracted
             as a plane wave.
@@ -114,9 +115,9 @@ def hologram_score(
 def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Blur a target image of shape (m, m) to the resolution of an element of the same size.
 
-    The target is convolved with the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes,
-    where NA is the sine of the angle, seen from the image, between the axis and the edge of the element. The
-    target is dark beyond the window.
+    The target is convolved with the intensity in the focus of a square aperture, sinc^2(2 NA x / wavelength)
+    along both axes, where NA is the sine of the angle, seen from the image, between the axis and the edge of
+    the element. Outside its window, the target is taken to be dark.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):

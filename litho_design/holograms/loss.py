@@ -15,8 +15,9 @@ from litho_design.holograms.settings import HologramLoss
 
 
 def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
-    """Return a mask, shape (size, size), of the pixels near the target's light. Only these pixels count in
-    the error. Return None if all pixels count.
+    """Return a boolean mask, shape (size, size), of the pixels on which the error of the image is computed:
+    those within ``signal_window_um`` of a pixel whose target is above zero. Return None if the error is
+    computed on all pixels.
     """
     if not settings.signal_window_um:
         return None
@@ -40,8 +41,8 @@ def hologram_loss(
         target: target intensity in [0, 1], shape (size, size).
         counted: boolean mask of the pixels that count in the error, shape (size, size), or None if all pixels
             count.
-        total: function that sums values over the pixels of the whole image. It is needed only if the other
-            arguments cover a part of the image.
+        total: function that sums values over the pixels of the whole image. It is needed only if ``share``,
+            ``target`` and ``counted`` cover only a part of the image.
     """
     total = total or torch.sum
     efficiency = total(share[target > 0])

@@ -22,11 +22,12 @@ class HologramLoss(Record):
     """Settings of the loss of a hologram, which is RMSE(target, image) + efficiency_weight * (1 -
     efficiency).
 
-    With ``signal_window_um``, only pixels within this distance of the target's light count in the error. The
-    error ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco 2008,
-    doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target: ``paper`` divides
-    it by its mean over the target's light, and ``least-squares`` multiplies it by the factor that gives the
-    smallest error. The efficiency is the share of the incident power on pixels whose target is above zero.
+    With ``signal_window_um``, the error is computed only on pixels within this distance of a pixel whose
+    target is above zero. It ignores light elsewhere (mixed-region amplitude freedom: Pasienski and DeMarco
+    2008, doi:10.1364/OE.16.002176). ``scale`` says how the image is scaled to match the target: ``paper``
+    divides the image by its mean, weighted with the target, and ``least-squares`` multiplies it by the factor
+    that gives the smallest error. The efficiency is the share of the incident power on pixels whose target is
+    above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(

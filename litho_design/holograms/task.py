@@ -91,8 +91,8 @@ class HologramTask(Task):
         return figures | self._inside_window(seen)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels that print the phases of ``gerchberg_saxton`` (weighted if the start is
-        ``wgs``).
+        """Return the levels whose print has the phases that ``gerchberg_saxton`` finds. If the start is
+        ``wgs``, the weighted form of the algorithm is used.
         """
         search = self.settings.search
         phase, _ = gerchberg_saxton(
@@ -135,14 +135,16 @@ class HologramTask(Task):
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
-    """Return a note if diffraction will blur the strokes of the target in any layout."""
+    """Return a list with one note if diffraction will blur the strokes of the target in any layout.
+    Otherwise, return an empty list.
+    """
     layout, optics = settings.layout, settings.optics
     stroke_um = stroke_width_px(target) * layout.pitch_um
     finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
     if stroke_um >= finest_um:
         return []
     near_um = stroke_um / finest_um * optics.distance_um
-    # Round down to two digits, so that nothing is too fine at the advised distance.
+    # The advised distance is rounded down to two digits, so that no stroke is too fine at this distance.
     digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
     near_um = math.floor(near_um / digit_um) * digit_um
     return [

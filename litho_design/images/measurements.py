@@ -15,7 +15,7 @@ Levelling = Literal["none", "plane", "bow"]
 @dataclass(frozen=True)
 class MeasuredSource:
     """A height map of the printed part. If the file does not state the unit and the size, pass ``unit`` and
-    ``size_um`` (one side, or y and x).
+    ``size_um`` (the side of a square map, or the lengths along y and x).
 
     Use ``aligned`` for elements that look the same at several positions or in several orientations, such as a
     lens cap or a blaze.

@@ -14,11 +14,11 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of random draws within the uncertainty of a measurement. With this number, their rms is known to
-# 25 %.
+# Number of variants of a measurement that are drawn at random within its uncertainty. The rms change over
+# this number of variants is known to 25 %.
 DRAWS = 8
-# Errors of a print are alike over long distances. A fit therefore hides more of them than it would if they
-# were independent, by this factor (found with ``benchmarks.coverage``).
+# The errors of a print are correlated over long distances. A fit to the print therefore absorbs more of these
+# errors than it would absorb of independent errors, by this factor (found with ``benchmarks.coverage``).
 HIDDEN = 1.5
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
@@ -34,10 +34,11 @@ def white_noise(values: np.ndarray) -> float:
 
 
 def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
-    """Return two standard deviations of the noise in a photograph of shape (ny, nx): that of the noise in the
-    dark, and that of the noise proportional to the light, relative to the light.
+    """Return the standard deviations of two kinds of noise in a photograph of shape (ny, nx). The first value
+    is that of the noise in the dark, in counts. The second is that of the noise proportional to the light, as
+    a share of the light.
 
-    The second value includes speckle.
+    The second kind includes speckle.
 
     The variance at the highest frequencies is fitted by dark^2 + (share * light)^2, where ``dark`` and
     ``share`` are the two standard deviations.
@@ -62,15 +63,17 @@ def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 def estimated(
     score: Callable[[T], Record], measured: Record, noisier: Iterable[T], elsewhere: Iterable[T]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Correct the figures of a measurement for noise and for what the registration and the levelling have
-    fitted. Return the corrected figures, and the standard deviation of each.
+    """Correct the scores of a measurement for noise, and for the errors of the print that the registration
+    and the levelling have absorbed. Return two dicts, keyed by the name of the score: the corrected scores,
+    and their standard deviations.
 
     The measurement already contains noise, and each variant in ``noisier`` adds the same amount of noise
-    again. Their mean change therefore estimates how much noise changed the figure, and is subtracted (bias
-    correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Each variant in ``elsewhere`` is a
-    measurement that the registration and the levelling cannot distinguish from the best fit. Fits make a
-    print look more like the expected one than it is, so the mean change of these variants is added. Variants
-    come in pairs with opposite signs, so figures that are linear in a change are not corrected for it.
+    again. The mean change of a score over these variants therefore estimates how much noise changed the
+    score, and is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Each
+    variant in ``elsewhere`` is a measurement that the registration and the levelling cannot distinguish from
+    the best fit. Fits make a print look more like the expected one than it is, so the mean change of these
+    variants is added. Variants come in pairs with opposite signs, so the mean change of a score that is
+    linear in the variation is zero.
     """
     noise, place = (dict(_changes(score, measured, variants)) for variants in (noisier, elsewhere))
     figures = {
@@ -83,7 +86,9 @@ def estimated(
 def _changes(
     score: Callable[[T], Record], measured: Record, variants: Iterable[T]
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield how every figure in ``measured`` changes over variants of the measurement."""
+    """Yield the name of every score in ``measured``, and the changes of this score over the variants of the
+    measurement.
+    """
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
     for name, value in measured.model_dump(exclude_none=True).items():
         yield name, np.array([one[name] for one in scores]) - value

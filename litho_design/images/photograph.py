@@ -25,8 +25,9 @@ _SMALLEST_CORRELATION = 0.45
 # Largest allowed share of pixels clipped at the bright or dark end. A larger share would change the
 # similarity.
 _LARGEST_SATURATED = 0.01
-# Deviations of log(gamma) from 0 above which a photograph is rejected, and above which a remark is made. For
-# prints close to the expected one, the counts seem to grow as the light to a power of 0.9 to 1.1.
+# Limits of the deviation of log(gamma) from 0, where gamma is the exponent with which the counts grow with
+# the light. Above the first limit, a photograph is rejected; above the second, a remark is made. Even for
+# prints close to the expected one, the fitted gamma lies between 0.9 and 1.1, not exactly at 1.
 _LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
 # Standard deviation of the loss of light in the corners, which depends on the objective.
@@ -34,12 +35,14 @@ _VIGNETTING_SD = 0.1
 # A tilt is accepted if it reduces the unexplained variance to less than this share of the variance without a
 # tilt.
 _NEEDED = 0.93
-# Chance of a tilt this large at random: 0.1 %, from chi squared with two degrees of freedom.
+# A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
+# probability of 0.1 % (two degrees of freedom).
 _TILT_SURE = 13.8 * HIDDEN**2
-# Images of prints by different models of the same printer differ in size by this standard deviation, so a
-# photograph of unknown scale cannot tell the scale better.
+# Images of prints by different models of the same printer differ in size by this standard deviation, so the
+# scale of a photograph cannot be determined more accurately from its image.
 _PRINT_SCALE_SD = 0.01
-# Standard deviation of the plausible tilts of a camera, over half the window.
+# Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
+# over half the window.
 _TILT_SD = 0.1
 # Number of tiles along each side of the window.
 _TILES = 6
@@ -56,9 +59,9 @@ class CameraRecord(Record):
     ``orientation`` is the operation that brings the photograph into the orientation of the image;
     ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the standard deviation of
     the noise in the dark, and ``noise_share`` is that of the additional noise, relative to the light.
-    ``vignetting_sd`` is the possible loss of light in the camera's corners. ``blur_um`` is the standard
-    deviation of the fitted blur in addition to that of the expected image. The counts are proportional to a
-    power of the light, and ``gamma`` is the fitted exponent.
+    ``vignetting_sd`` is the standard deviation of the possible loss of light in the camera's corners.
+    ``blur_um`` is the standard deviation (radius) of the fitted blur that is added to the expected image. The
+    counts are proportional to a power of the light, and ``gamma`` is the fitted exponent.
     """
 
     name: str
@@ -120,14 +123,14 @@ class Photograph:
 
     Attributes:
         counts: counts of the cleaned, upright photograph minus the dark level, shape (ny, nx).
-        window_to_photo: projective map (3, 3) from window pixels to photograph pixels.
+        window_to_photo: projective map from window pixels to photograph pixels, a matrix of shape (3, 3).
         side_px: side of the window, in window pixels.
         pitch_um: side length of a window pixel.
-        finest_per_um: the highest spatial frequency that the light can have.
-        record: source and processing.
+        finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
+        record: source and processing of the photograph.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
-        other_warps: pairs of maps like ``window_to_photo`` that are as plausible, given how well the
-            photograph determines it.
+        other_warps: pairs of maps that are as plausible as ``window_to_photo``, given the accuracy with which
+            the photograph determines this map.
     """
 
     counts: np.ndarray
@@ -146,15 +149,17 @@ class Photograph:
         return self._warped(self.counts, self.window_to_photo)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
-        """Express ``image`` as shares of the light on the element. ``power_counts`` is the sum of the counts
-        that this light gives.
+        """Convert the counts in ``image`` to shares of the light that is incident on the element.
+        ``power_counts`` is the sum of the counts that all of this light would give.
         """
         # The factor is the number of photograph pixels per window pixel, in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def with_more_noise(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images with the noise of the photograph added once more, with opposite signs."""
+        """Yield pairs of images to which random noise as strong as that of the photograph is added. The noise
+        in the second image of a pair is that in the first with the opposite sign.
+        """
         generator = np.random.default_rng(0)
         record, light = self.record, self.counts.clip(0)
         sd = np.sqrt(record.noise_counts**2 + (record.noise_share * light) ** 2)
@@ -200,7 +205,7 @@ def photographed_image(
     may be shifted, rotated and, if needed, tilted, and its gain and background are free. The scale is free
     only if the pitch has an uncertainty. If the scale were always free, a print that makes the image too
     large would be mistaken for a camera with a different scale. All eight orientations are tried. A
-    photograph that fits another orientation better than ``orientation`` is refused.
+    photograph that fits another orientation better than ``orientation`` is rejected.
 
     Args:
         wanted: expected image in any unit, shape (m, m).
@@ -244,7 +249,8 @@ def photographed_image(
         got = f"{100 * coverage:.0f} % of the image"
         wanted_share = f"at least {100 * _SMALLEST_COVERAGE:.0f} %"
         raise InputError(f"photograph {photo_file}", got=got, wanted=wanted_share)
-    # A print unlike the expected one is bright and dark in other places, which can look like a gamma too.
+    # If the print differs from the expected one, its image is bright and dark in other places. The fit can
+    # mistake this difference for a gamma other than 1.
     open_gamma = _LARGEST_GAMMA_OFF + 2 * (1 - fit.correlation)
     if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
         raise InputError(
@@ -389,8 +395,8 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fitted camera: the map (3, 3) from window to photograph pixels, pairs of maps that are as plausible,
-    and its other parameters with their standard deviations.
+    """A fitted camera: the map from window pixels to photograph pixels (a matrix of shape (3, 3)), pairs of
+    other maps that are as plausible, and the other parameters of the camera with their standard deviations.
     """
 
     window_to_photo: np.ndarray
@@ -427,7 +433,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     free = [0, 1, 2] + ([3] if pitch_sd else [])
     # A unit of angle (sine), log scale or tilt moves the edge as much as a shift of half a window.
     unit = np.array([1, 1, *[2 / side] * 4])
-    # Residuals of neighbouring pixels are not independent, so this many pixels count as one.
+    # Residuals of neighbouring pixels are not independent, so this number of pixels counts as one independent
+    # pixel.
     alike = 4 * math.pi * blur_px**2
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
@@ -533,8 +540,8 @@ def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, fl
 
 
 def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
-    """Return the map (3, 3) from window to photograph pixels for a camera pose, which is a shift (px), a
-    rotation, the logarithm of the scale and two tilts.
+    """Return the map from window pixels to photograph pixels, a matrix of shape (3, 3), for a camera pose.
+    The pose consists of a shift (px), a rotation, the logarithm of the scale and two tilts.
     """
     turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
     centre = (np.array(shape[1::-1]) - 1) / 2
@@ -546,7 +553,7 @@ def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -
 
 
 def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
-    """Return a mask of the window pixels (side, side) that lie on the photograph."""
+    """Return a boolean mask, shape (side, side), of the window pixels that lie on the photograph."""
     import cv2
 
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP

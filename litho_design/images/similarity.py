@@ -23,8 +23,8 @@ def si_psnr_db(image: Tensor, target: Tensor) -> float:
 
 
 def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
-    """Return the RMSE between I / I_avg and T, where I_avg = sum(I T) / sum(T) is the mean of I over the
-    target's light.
+    """Return the RMSE between I / I_avg and T, where I_avg = sum(I T) / sum(T) is the mean of I, weighted
+    with the target T.
     """
     average = (image * target).sum() / target.sum()
     return (image / average - target).square().mean().sqrt()
@@ -59,8 +59,8 @@ def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
-    """Return the SI-PSNR and the SSIM of an image relative to its target, and relative to the target at the
-    resolution of the element. All images have shape (m, m).
+    """Return the SI-PSNR and the SSIM of an image. The image is compared with its target, and also with the
+    target blurred to the resolution of the element. All images have shape (m, m).
     """
     figures = {}
     for name, wanted in (("", target), ("_resolved", resolved)):
@@ -86,8 +86,9 @@ def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
 
 
 def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
-    """Return the shares of the light in an image of shape (m, m), and the uniformity of the image on the
-    signal, which is the pixels whose target exceeds 0.5.
+    """Return the shares of the incident power in the whole image and on its signal, and measures of
+    uniformity and contrast. The signal consists of the pixels whose target exceeds 0.5. Both arguments have
+    shape (m, m).
     """
     lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))

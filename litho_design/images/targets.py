@@ -92,8 +92,9 @@ def stroke_width_px(pixels: np.ndarray) -> float:
     """
     import cv2
 
-    # At twice the size, strokes of even width have a middle pixel too, whose distance to the dark is the
-    # width.
+    # The target is enlarged to twice its size, so that strokes whose width is an even number of pixels also
+    # have a pixel on their centre line. The distance of this pixel to the dark is the width of the original
+    # stroke.
     bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
     distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
     middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))

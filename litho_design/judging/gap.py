@@ -1,4 +1,6 @@
-"""Records of the design-to-manufacturing gap: the designs of every arm and seed, printed by every judge."""
+"""Records of the design-to-manufacturing gap: the designs of every arm (model to design with) and seed, with
+their prints as predicted by every judge (model that predicts the prints of finished designs).
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from litho_design.tasks.design import DESIGNS
 
 
 class GapEntry(Record):
-    """The design of one arm and seed, printed by one judge. ``designed`` contains the figures that the arm
-    itself expects.
+    """The design of one arm and seed, printed by one judge. ``designed`` contains the scores that the arm's
+    own model predicts.
     """
 
     arm: str
@@ -35,7 +37,9 @@ class GapEntry(Record):
 
 
 class GapSummary(Record):
-    """One figure of one arm under one judge: its mean over seeds with a 95 % confidence interval."""
+    """One score of the designs of one arm, as one judge predicts their prints: its mean over seeds with a 95
+    % confidence interval.
+    """
 
     arm: str
     judge: str
@@ -48,7 +52,9 @@ class GapSummary(Record):
 
 
 class PairedDifference(Record):
-    """The difference of one figure between two arms under the same judge, paired by seed."""
+    """The difference of one score between the designs of two arms, printed by the same judge and paired by
+    seed.
+    """
 
     judge: str
     figure: str
@@ -65,8 +71,8 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     task: str
-    # The types are ordered by their number of fields, because your own task has only the fields common to all
-    # designs.
+    # The types are ordered by their number of fields, because the settings of a user-defined task have only
+    # the fields common to all designs.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
@@ -105,7 +111,7 @@ def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
 
 
 def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
-    """Return how the given figures differ between every pair of arms, under each judge."""
+    """Return the differences of the given scores between every pair of arms, for each judge."""
     groups = _grouped(entries)
     arms = list(dict.fromkeys(entry.arm for entry in entries))
     judges = list(dict.fromkeys(entry.judge for entry in entries))

@@ -151,6 +151,6 @@ def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> Lo
     """Return the finished design in ``folder``, ready to be printed and scored on ``device``.
 
     Raises:
-        InputError: ``LoadedDesign`` refuses the folder or the device.
+        InputError: ``LoadedDesign`` rejects the folder or the device.
     """
     return LoadedDesign(folder, device=device)

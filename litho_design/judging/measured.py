@@ -21,17 +21,20 @@ from litho_design.images.measurements import Levelling, MeasuredSource
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
-# With fewer measured pixels, the score would mainly describe the filled-in part, not the print.
+# Smallest share of the element that must be measured. With fewer measured pixels, the score would mainly
+# describe the filled-in part, not the print.
 _SMALLEST_COVERAGE = 0.8
-# Levelled prints of the measured layouts have a correlation of 0.9 or more with a model's expectation.
+# Smallest correlation between a scan and the expected print at which the scan is accepted. After levelling,
+# the prints of the measured layouts have a correlation of 0.9 or more with the print that a model predicts.
 _SMALLEST_NCC = 0.6
 _SMALLEST_FOR_TIP = 64
 # Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
 # step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# This share of the change that the tip causes remains uncertain.
+# Standard deviation of the change of the heights that the AFM tip causes, as a share of this change.
 _TIP_SD = 0.3
-# Orders of the terms from which the print's own tilt and bow are extrapolated.
+# Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
+# extrapolated.
 _ORDERS = (3, 4, 5, 6)
 
 
@@ -206,8 +209,8 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
 
 class _Placed(NamedTuple):
-    """A scan resampled on the pixels of the layout: heights and mask of measured pixels, both of shape
-    (ny, nx), orientation, warning and position uncertainty.
+    """A scan resampled on the pixels of the layout. It contains the heights and the mask of measured pixels,
+    both of shape (ny, nx), the orientation, a warning, and the uncertainty of the position.
     """
 
     height_um: np.ndarray
@@ -283,8 +286,8 @@ def fitted_background(
 
 
 def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, with the noise of the scan added once more, with
-    opposite signs.
+    """Yield pairs of prints of shape (ny, nx), in µm, to which random noise as strong as that of the scan is
+    added. The noise in the second print of a pair is that in the first with the opposite sign.
     """
     generator = np.random.default_rng(0)
     for _ in range(DRAWS):
@@ -294,8 +297,9 @@ def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tenso
 
 
 def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one, with another
-    position, height scale and tip, and with tilt and bow of their own, which the levelling would remove.
+    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one. They have
+    another position, height scale and tip, and they have a tilt and a bow that the levelling would have
+    removed.
     """
     from scipy.ndimage import shift
 
@@ -324,8 +328,8 @@ def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) 
 
 
 def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
-    """Return the products of Legendre polynomials of the given total orders, of shape (ny, nx, number of
-    products), each with an rms of 1.
+    """Return the products of Legendre polynomials in x and y that have the given total orders. Each product
+    has an rms of 1. The result has shape (ny, nx, number of products).
     """
     y, x = (np.linspace(-1, 1, size) for size in shape)
     pairs = [(i, order - i) for order in orders for i in range(order + 1)]
@@ -335,10 +339,11 @@ def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
 
 
 def _removed_sd_um(off_um: np.ndarray) -> float:
-    """Return the standard deviation, in µm, of each term of tilt and bow that a print may have.
+    """Return the standard deviation, in µm, of the tilt and bow that the print itself may have, for each
+    polynomial term of order 1 or 2.
 
-    It is extrapolated from the next orders of the deviation from the expected print, ``off_um`` of shape (ny,
-    nx), whose power is taken to fall with the square of the order.
+    The value is extrapolated from the higher orders (3 to 6) of ``off_um``, the deviation from the expected
+    print, shape (ny, nx). The power of an order is assumed to fall with the square of the order.
     """
     power = []
     for order in _ORDERS:

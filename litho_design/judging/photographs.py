@@ -27,7 +27,7 @@ from litho_design.optics.imaging import Blur, richardson_lucy
 
 # A score with a larger standard deviation (dB) cannot decide between designs.
 _LARGEST_SD_DB = 0.5
-# This share of the change that a blur of the camera causes remains uncertain.
+# Standard deviation of the change of a score that a blur of the camera causes, as a share of this change.
 _BLUR_SD = 0.3
 
 
@@ -66,7 +66,7 @@ class LensPhotoScore(Record):
 
 @dataclass(frozen=True)
 class PhotoVerdict:
-    """The figures of a photograph and their uncertainties, the record of the photograph, and a dict of images
+    """The scores of a photograph and their uncertainties, the record of the photograph, and its images, keyed
     by title.
     """
 
@@ -80,7 +80,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     """Score a photograph of a printed hologram's image.
 
     Raises:
-        InputError: ``photographed_image`` refuses the photograph, the incident power is not positive, an
+        InputError: ``photographed_image`` rejects the photograph, the incident power is not positive, an
             object is given for a hologram, or noise makes the score too uncertain.
     """
     assert loaded.target is not None
@@ -107,8 +107,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     freed, uncertainty = estimated(
         figures, figures(image), photo.with_more_noise(), photo.with_other_cameras()
     )
-    # A blur beyond the expected image may come from the camera or the print, so part of its effect stays
-    # uncertain.
+    # If the photograph is blurrier than the expected image, the camera or the print may be the cause. Part of
+    # the effect of this blur on the score therefore remains uncertain.
     sharp, soft = (
         photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
         for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
@@ -134,8 +134,8 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
-    """Compare a registered photograph with its target and with the target at the resolution of the element,
-    and return the figures. All three images have shape (m, m).
+    """Compare a registered photograph with its target and with the target blurred to the resolution of the
+    element, and return the scores. All three images have shape (m, m).
     """
     share = torch.from_numpy(image).double()
     found = likeness(share, target, resolved) | light_figures(share, target)
@@ -163,7 +163,7 @@ def score_lens_photo(
 
     Raises:
         InputError: there is no object, the object is unknown, two objects share its name, or
-            ``photographed_image`` refuses the photograph.
+            ``photographed_image`` rejects the photograph.
     """
     assert isinstance(loaded.task, LensTask)
     wanted, which = _object(loaded.task, source.imaged)

@@ -1,5 +1,5 @@
 """Score a design by the print that models predict, by a measured print, or by a photograph. The score is
-always that of the printable layout.
+always that of the layout with integer levels, which can be printed.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from litho_design.tasks.design import Design
 
 
 class JudgedScore(Record):
-    """The figures of one judge: a model, a measured print, or a photographed image.
+    """The scores of a design from one judge, which is a model, a measured print or a photographed image.
 
-    ``uncertainty`` holds the standard deviation of each measured figure; it is None for models.
+    ``uncertainty`` contains the standard deviation of each measured score. It is None if the judge is a
+    model.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"stitching"})
@@ -69,7 +70,7 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
-    # Gain of the design over the best uncorrected layout, if they were compared.
+    # Gain in score of the design over the best uncorrected layout. It is None if the two were not compared.
     gain: float | None = None
 
     @classmethod

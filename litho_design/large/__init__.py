@@ -1,1 +1,3 @@
-"""Design elements that are too large for one process, in bands of rows that several processes share."""
+"""Design elements that are too large for one process. The element is divided into bands of rows, which are
+distributed among several processes.
+"""

@@ -16,14 +16,15 @@ from litho_design.optimisation.ranks import ALONE, Ranks
 from litho_design.printers.printer import Printer
 
 # Default for the largest number of rows in a band. The memory that a print needs grows with the square of
-# this number, and no more processes can share an element than it has bands. If a band is narrower than about
-# four times the model's reach, most of the time is spent on rows that are printed twice.
+# this number, and no more processes can share an element than it has bands. If a band has fewer rows than
+# about four times the model's reach (the distance up to which a level affects the print), most of the time is
+# spent on rows whose print is computed twice.
 BAND_PX = 512
 
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a square element, and those of them that this process holds.
+    """The division of a square element into bands, and the bands that this process holds.
 
     Args:
         size_px: side of the element.
@@ -114,7 +115,8 @@ def require_reach(printer: Printer) -> None:
     """Check that a printer can print an element in parts.
 
     Raises:
-        InputError: the print at one place depends on the whole layout or on the position in the write field.
+        InputError: according to the printer model, the print at one place depends on the whole layout or on
+            the position in the write field.
     """
     whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
     if whole or printer.depends_on_position:

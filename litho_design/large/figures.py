@@ -1,7 +1,8 @@
 """Score an image of any size, in memory or on disk, one band of rows at a time.
 
-The figures have the names and meanings of ``HologramScore``. Figures that need the whole image at once are
-omitted: those of the camera and of the resolved target, and the uniformity.
+The scores have the same names and meanings as in ``HologramScore``. Scores that need the whole image at once
+are omitted: those of the camera image, those relative to the target blurred to the resolution of the element,
+and the uniformity.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from litho_design.large.bands import Bands
 
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
-    """Compare an image with its target, and return a dict of the figures. Both have shape (size, size). The
-    image is in shares of the incident power, and the target is in [0, 1].
+    """Compare an image with its target, and return the scores, keyed by name. Image and target have shape
+    (size, size). The image gives the share of the incident power on each pixel, and the target has values in
+    [0, 1].
     """
     sums = np.sum([_sums(*_read(image, target, band)) for band in bands.own()], axis=0)
     lit, signal, lit_square, dark, paper, power, square, both, wanted, wanted_square = sums.tolist()
@@ -41,7 +43,7 @@ def _read(image: np.ndarray, target: np.ndarray, rows: slice) -> tuple[np.ndarra
 
 
 def _sums(share: np.ndarray, aim: np.ndarray) -> list[float]:
-    """Return sums over a band of rows, from which the figures of the whole image are computed."""
+    """Return sums over a band of rows, from which the scores of the whole image are computed."""
     bright = aim > 0.5
     lit = share[bright]
     maps = lit, lit**2, share[~bright], share[aim > 0], share, share**2, share * aim, aim, aim**2

@@ -1,5 +1,5 @@
-"""The task of designing a hologram in bands. Each process holds only its own rows, in contrast to the task of
-a hologram in one piece.
+"""The task of designing a hologram in bands. In contrast to ``HologramTask``, each process holds only its own
+rows of the hologram.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class BandedHologram(HologramTask):
     folder. The resulting layout does not depend on the number of processes.
 
     Args:
-        settings: settings of the hologram; ``only`` checks the settings of the search.
+        settings: settings of the hologram. This class does not check the settings of the search; use ``only``
+            for this.
         printer: frozen model with a finite reach, or nominal heights.
         bands: bands of the element.
         inputs: contains ``target``, the target image with values in [0, 1], shape (size, size), in memory or
@@ -126,13 +127,14 @@ class BandedHologram(HologramTask):
         the rows of this process, shape (1, 1, rows, size).
         """
         loss, parts = super().objective(level)
-        # Every process returns the loss of the whole element, but the gradient must count this loss once.
+        # Every process returns the loss of the whole element, but in the gradient, which is summed over the
+        # processes, this loss must count only once.
         return (loss - loss.detach()) / self.ranks.count + loss.detach(), parts
 
     @torch.no_grad()
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Any:
-        """Return the figures of a print in µm, shape (size, size). This works only if one process holds the
-        whole element.
+        """Return the scores of a print, given as heights in µm of shape (size, size). This works only if one
+        process holds the whole element.
         """
         figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
         wave = element_field(height_um, self.bench.grid, self.settings.optics)
@@ -147,7 +149,7 @@ class BandedHologram(HologramTask):
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Compute the figures of the whole element from the arrays on disk."""
+        """Compute the scores of the whole element from the arrays on disk."""
         levels, seen, aim = (
             np.load(folder / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )

@@ -44,8 +44,8 @@ class RadiusMap(CellMap):
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean over each ring of real or complex pixels along the radius, weighted with the area
-        of the circle that each pixel stands for.
+        """Return the mean of real or complex pixel values over each ring. The pixels lie along one radius,
+        and each is weighted with the area of the circular ring of pixels that it represents.
         """
         area = self.area.to(pixels)
         sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
@@ -53,7 +53,8 @@ class RadiusMap(CellMap):
 
 
 class RingLens(DirectLensTask):
-    """A lens in rings that focuses light. It is printed only along a radius, in tiles.
+    """The task of designing a focusing lens that consists of rings. Its print is computed only along one
+    radius, in tiles.
 
     Args:
         settings: settings of the lens. They must state rings, a circular aperture and a thin element.
@@ -87,7 +88,7 @@ class RingLens(DirectLensTask):
         return RadiusMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:
-        """Return the bench, which computes along the radius."""
+        """Return the bench, which computes the PSF from the heights along the radius."""
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_bench(self, optics: Optics) -> Any:
@@ -97,7 +98,7 @@ class RingLens(DirectLensTask):
         return self.bench
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose print is nearest to a perfect lens."""
+        """Return the levels whose print comes closest to the heights of a perfect lens."""
         ideal = self.bench.ideal_height_um().double() * (2 * math.pi / self.settings.optics.wave_height_um)
         wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
         return focusing_levels(wave.angle().float().cpu(), level_phase.cpu())
@@ -116,5 +117,5 @@ class RingLens(DirectLensTask):
         return {RINGS_FILE: levels, RING_HEIGHT_FILE: height_um.cpu().numpy()}
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Return the figures of the lens and its baselines, computed along the radius."""
+        """Return the scores of the lens and of its baselines, computed along the radius."""
         return Findings(predicted=self.score(height_um).model_dump(), baselines=self.baselines())

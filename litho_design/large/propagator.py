@@ -30,7 +30,7 @@ class BandedPropagator:
     are divided among several processes.
 
     The field and the result contain only the rows of this process, as complex64 of shape (rows, size). The
-    kernel is even along both axes, so only half of each column of its transform is kept.
+    kernel is even along both axes, so only half of each column of its Fourier transform is stored.
 
     Args:
         pitch_um: side of a pixel, µm.
@@ -143,9 +143,9 @@ class BandedPropagator:
             self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
 
     def _spectrum_transfer(self, optics: Optics) -> None:
-        """Compute the transfer function of free space. For a small element, the period that keeps steep rays
-        from wrapping around is longer than the transform of this propagator. ``ASMPropagator`` then computes
-        the kernel.
+        """Compute the transfer function of free space. For a small element, the period that is needed to keep
+        steep rays from wrapping around is longer than the Fourier transform of this propagator. In this case,
+        the kernel of ``ASMPropagator`` is used.
         """
         given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
         first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]
