@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=DesignSettings)
 
-# If the changes contain a variant or a task, it overrides the one given here.
+# These functions make the default settings. If the changes passed to them contain a variant or a task, it
+# overrides the one given here.
 _hologram = partial(hologram_settings, "default")
 _lens = partial(lens_settings, "direct", "default")
 

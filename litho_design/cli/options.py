@@ -1,4 +1,6 @@
-"""Make command-line options from the fields of the settings, so that every setting is stated in one place."""
+"""Make command-line options from the fields of the settings classes, so that every setting is defined in only
+one place.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +92,8 @@ class Given:
         return flattened(preset, content, f"setting of {self.config}") | flattened(preset, self.options)
 
 
-# A command's help shows the options of these settings; --help-all shows the others too.
+# The help of a command shows only the options of these settings; --help-all also shows those of all other
+# settings.
 _FIRST = {
     *("variant", "task", "layout.size_px", "layout.cell_um", "optics.wavelength_um", "optics.distance_um"),
     *("search.iterations", "search.seed", "height_um"),
@@ -217,7 +220,7 @@ def as_toml(settings: BaseModel) -> str:
 
 
 def _parameter(name: str, same: Sequence[Leaf]) -> inspect.Parameter:
-    """Make one option for a setting that occurs in one or more presets."""
+    """Make the parameter that declares one option, for a setting that occurs in one or more presets."""
     leaf, kind = same[0], same[0].kind
     if get_origin(kind) is UnionType:
         kind = get_args(kind)[0]
@@ -243,7 +246,9 @@ def _listed(leaf: Leaf, value: Any) -> Any:
 
 
 def _described(leaf: Leaf) -> str:
-    """Return the help text of an option. It begins with a lower-case letter, except in an abbreviation."""
+    """Return the help text of an option. It begins with a lower-case letter, unless it begins with an
+    abbreviation.
+    """
     told = _told(leaf)
     return told if told[1:2].isupper() else told[:1].lower() + told[1:]
 

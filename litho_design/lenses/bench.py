@@ -26,8 +26,8 @@ CENTRE_UM = 1.0
 
 
 class LensOptics(nn.Module):
-    """Base class of the two benches of a lens, for a plane and for rings. It has what they share: the
-    numerical aperture, the focal window and the perfect lens.
+    """Base class of ``LensBench``, which computes on a plane, and ``RadialLensBench``, which computes on
+    rings. It provides the numerical aperture, the focal window and the heights of a perfect lens to both.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
@@ -51,8 +51,8 @@ class LensOptics(nn.Module):
         return centre_to_background(psf, centre_px, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of a PSF, -log(centre-to-background ratio), and a dict of its parts. The PSF has
-        shape (window, window).
+        """Return the loss of a PSF, which is -log(centre-to-background ratio), and a dict of named values for
+        the history of the search. The PSF has shape (window, window).
         """
         ratio = self.ratio(psf)
         return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
@@ -62,10 +62,11 @@ class LensOptics(nn.Module):
         raise NotImplementedError
 
     def ideal_height_um(self) -> Tensor:
-        """Return the heights of a perfect lens, µm, wrapped to the height of one wave."""
+        """Return the heights of a perfect lens, µm, wrapped at the height that gives a phase delay of 2π."""
         focal_um = self.optics.distance_um
         path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt()
-        # This height delays the wave by the path difference; wrapping does not change the wave.
+        # This height delays the wave by the difference in path length; wrapping the height does not change
+        # the wave.
         height = path * self.optics.wave_height_um / self.optics.wavelength_um
         return torch.remainder(height, self.optics.wave_height_um).float()
 
@@ -83,8 +84,8 @@ class LensBench(LensOptics):
         self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
 
     def forward(self, height_um: Tensor) -> Tensor:
-        """Return the PSF of a height map in µm, shape (size, size). Each pixel of the PSF is the share of the
-        incident power on this pixel of the window.
+        """Return the PSF behind a height map in µm of shape (size, size). Each value of the PSF is the share
+        of the incident power on one pixel of the focal window.
         """
         field = element_field(height_um, self.grid, self.optics, self.aperture)
         return intensity_share(self.propagator(field), self.window)
@@ -120,8 +121,8 @@ class RadialLensBench(LensOptics):
         """
         phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
-        # The wave is interpolated instead of the intensity, because only the wave is smooth on the scale of a
-        # pixel.
+        # The complex wave is interpolated along the radius, and not its intensity, because only the wave is
+        # smooth on the scale of a pixel.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
         return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
 
@@ -132,12 +133,13 @@ class RadialLensBench(LensOptics):
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
-    """Return the mean intensity in the central box of a PSF, divided by the mean intensity in the rest of an
-    image plane that is as large as the element.
+    """Return the mean intensity in the central box of a PSF, divided by the mean intensity on the background,
+    i.e. on the rest of an image plane that is as large as the element.
 
-    All light outside the box counts as background, even if it misses this image plane. The share of this
-    light (1 minus that in the box) is therefore divided by the area of the element outside the box. A ratio
-    computed only within the PSF window would reward light sent outside the window.
+    All light outside the box counts as background, even if it misses this image plane. For the mean
+    background, the share of this light (1 minus the share in the box) is therefore divided by the area of the
+    element outside the box. A ratio computed only within the PSF window would reward light sent outside the
+    window.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()

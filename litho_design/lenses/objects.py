@@ -1,4 +1,4 @@
-"""The objects that a lens images: drawings, or your own pictures."""
+"""The objects that a lens images: built-in drawings, or pictures of the user."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from litho_design.lenses.settings import LensSettings
 _BORDER_SHARE = 8
 _HELD_OUT_SHARE = 4
 _FEWEST_HELD_OUT = 2
-# Name of an array among the inputs of a lens. The array has shape (pictures, size, size) and contains first
-# the pictures used in the search, then the held-out ones.
+# Key of the array of pictures in the inputs of a lens task. The array has shape (pictures, size, size). It
+# contains first the pictures used in the search, and then the held-out pictures, which are used only for
+# scores.
 PICTURES = "object_pictures"
 
 
@@ -54,13 +55,13 @@ def object_stack(
 def with_objects(
     settings: LensSettings, objects: Sequence[str | Path], held_out: Sequence[str | Path]
 ) -> tuple[LensSettings, dict[str, np.ndarray]]:
-    """Return the settings of a computational lens that has your own pictures as objects, and the pixels of
-    these pictures.
+    """Return the settings of a computational lens that images the given pictures, and the pixels of these
+    pictures.
 
     Each path is that of a picture, or of a folder that contains only pictures and hidden files. If
-    ``held_out`` is empty, the pictures are sorted by name, and the last quarter of them, but at least two,
-    are not used in the search and serve only for scores. If ``objects`` is empty, the search uses the
-    built-in drawings.
+    ``held_out`` is empty, the pictures are sorted by name, and the last quarter of them (at least two
+    pictures) is not used in the search and serves only for scores. If ``objects`` is empty, the search uses
+    the built-in drawings.
 
     Returns:
         The settings and the inputs of the task. The settings contain the name, the SHA-256 and the

@@ -37,9 +37,9 @@ class ImagingScore(Record):
     """The score of the images of a lens: means and standard deviations over test objects and noise seeds that
     the search never used.
 
-    Each name says which image a figure belongs to. ``design`` is the sensor image deconvolved with the PSF
-    that the design expected, and ``calibrated`` is the sensor image deconvolved with the PSF of the print
-    itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
+    The name of each score states the image to which it belongs. ``design`` is the sensor image deconvolved
+    with the PSF that the design expected, and ``calibrated`` is the sensor image deconvolved with the PSF of
+    the print itself. ``direct`` is the sensor image without deconvolution, scaled to minimise its error.
     """
 
     mae_direct: float = Field(description="MAE of the sensor image of test objects, at the best scale")
@@ -97,7 +97,8 @@ def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
     pad = (fine - 1) * psf.shape[-1] // 2
     image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
-    # Padding cannot make a spectrum with an odd side exactly four times as long.
+    # A spectrum with an odd side cannot be padded to exactly four times its length, so the sample spacing is
+    # computed from the actual lengths.
     sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
     area = float((image > image.max() / 2).sum()) * sample_um**2
     return 2 * math.sqrt(area / math.pi)
@@ -133,7 +134,7 @@ def imaging_score(
     Args:
         psf: PSF of the print, which is the share of the incident power on each pixel of the window, shape
             (window, window).
-        design_psf: PSF that the design expected, in the same form.
+        design_psf: PSF that the design expected, in the same form as ``psf``.
     """
     real, expected = (sensor_psf(one, settings.pixel_px).float() for one in (psf, design_psf))
     draws = []
@@ -155,7 +156,9 @@ def black_images(objects: Tensor) -> dict[str, float]:
 
 
 def _similarities(draws: Iterable[Mapping[str, Tensor]], objects: Tensor) -> dict[str, list[float]]:
-    """Return a dict from the name of each figure to its values for all draws and objects."""
+    """Return the values of each score for all draws of the noise and all objects, keyed by the name of the
+    score.
+    """
     rows: dict[str, list[float]] = {}
     for name, images in (one for draw in draws for one in draw.items()):
         for image, wanted in zip(images, objects, strict=True):

@@ -22,7 +22,8 @@ from litho_design.optimisation.settings import (
 )
 from litho_design.printers.layout import LayoutSettings
 
-# The smooth L1 loss is quadratic below this difference in grey (white is 1), as in the published code.
+# The smooth L1 loss is quadratic for differences in grey below this value (white is 1), as in the published
+# code.
 SMOOTH_BELOW = 0.1
 
 LensTaskName = Literal["direct", "computational"]
@@ -108,8 +109,8 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", iterations=200, learning_rate=0.3), "Search"
     )
-    # There are few draws for the yield, because each draw computes a whole plane, which takes as long as ten
-    # steps of the search along a radius.
+    # The yield is measured with few draws, because for each draw the light on the whole plane is computed.
+    # This takes as long as ten steps of the search along a radius.
     window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
@@ -123,10 +124,11 @@ def lens_settings(
     All presets have layouts of rings, a width of 120 µm and a focal length of 400 µm.
 
     ``paper`` has 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at a learning rate of 3,
-    and a square aperture. The rings come from the published code, as the text does not mention them. The
-    display of the paper is 36 mm wide at a distance of 140 mm, so its image on the sensor is 102.9 µm wide:
-    103 pixels of 1 µm. The PSF window has the same width. We chose pixels of 1 µm, because they sample the
-    cut-off frequency at NA 0.15 (a period of 2.1 µm) without aliasing.
+    and a square aperture. That the layout consists of rings is taken from the published code, because the
+    text of the paper does not mention it. The display of the paper is 36 mm wide at a distance of 140 mm, so
+    its image on the sensor is 102.9 µm wide: 103 pixels of 1 µm. The PSF window has the same width. We chose
+    pixels of 1 µm, because they sample the cut-off frequency at NA 0.15 (a period of 2.1 µm) without
+    aliasing.
 
     ``authors`` has the settings of the published code: 12 levels, rings as wide as the diagonal of a pixel,
     temperature 1 and smooth L1. The 2000 iterations begin with a learning rate of 1, which is halved every 25

@@ -36,7 +36,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
-# Figures that are defined even if the lens does not focus.
+# Names of the scores that are defined even if the lens does not focus.
 _OF_POWER = {"focusing_efficiency", "strehl", "cbr", "eff_window"}
 # The sensor noise is the same in every iteration, so that the search compares layouts and not noise. Scores
 # use other seeds.
@@ -59,7 +59,7 @@ class LensTask(Task):
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: printer of a frozen model or of nominal heights.
-        ensemble: further models in the loss, as for ``Task``.
+        ensemble: further models that contribute to the loss, as for ``Task``.
         inputs: pixels of those objects that are pictures, as returned by ``with_objects``.
 
     Raises:
@@ -135,7 +135,7 @@ class LensTask(Task):
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
     def start_levels(self, level_phase: Tensor) -> Tensor:
-        """Return the levels whose print is nearest to a perfect lens.
+        """Return the levels whose printed phase comes closest to that of a perfect lens.
 
         The levels are computed on the CPU, so that sums over rings are reproducible.
         """
@@ -144,7 +144,9 @@ class LensTask(Task):
         return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
-        """Return the figures of the PSF of a print, given as heights in µm of shape (size, size)."""
+        """Return the scores of the PSF behind a print, which is given as heights in µm of shape (size,
+        size).
+        """
         return lens_score(self.bench, height_um)
 
     def baselines(self) -> dict[str, dict[str, float]]:
@@ -162,8 +164,8 @@ class LensTask(Task):
         return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: Printer) -> Tensor:
-        """Print a strip along a radius, and return the heights of the rings inside the aperture, shape
-        (rings,), µm.
+        """Predict the print of a strip along one radius, and return the heights, µm, of the rings inside the
+        aperture. The result has shape (rings,).
 
         Beyond the aperture, the strip has the levels that the layout has in its corners.
         """
@@ -185,21 +187,24 @@ class DirectLensTask(LensTask):
     score_type = LensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of a PSF, -log(centre-to-background ratio), and a dict of its parts."""
+        """Return the loss of a PSF, which is -log(centre-to-background ratio), and a dict of named values for
+        the history of the search.
+        """
         return self.bench.focusing_loss(seen)
 
 
 @register_task
 class ComputationalLensTask(LensTask):
-    """The task of a lens whose image is deconvolved."""
+    """The task of a lens whose images are deconvolved to reconstruct the objects."""
 
     name = "lens-computational"
     headline = ("mae_design", "mae_calibrated", "ssim_calibrated", "strehl", "cbr")
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the error of the objects' images after Richardson-Lucy deconvolution, and a dict of further
-        figures.
+        """Return the error of the objects that Richardson-Lucy deconvolution reconstructs from the sensor
+        images. Also return a dict with the centre-to-background ratio and the share of the power in the PSF
+        window.
         """
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
@@ -212,7 +217,7 @@ class ComputationalLensTask(LensTask):
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> ImagingLensScore:
-        """Return the figures of the PSF and of the images of test objects.
+        """Return the scores of the PSF and of the images of the held-out objects.
 
         ``expected_um`` is the print that the design expected; by default, it is the scored print.
         """
@@ -222,12 +227,14 @@ class ComputationalLensTask(LensTask):
         return ImagingLensScore(**super().score(height_um).model_dump(), **tested)
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the baselines that every lens has, and the imaging scores of black images."""
+        """Return the scores of the baselines that every lens task has, and those of black images."""
         return super().baselines() | {"black image": black_images(self.tested)}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
-    """Return a note if the PSF window is narrower than the focusing circle."""
+    """Return a list with one note if the PSF window is narrower than the circle in which the focusing
+    efficiency is measured. Otherwise, return an empty list.
+    """
     # The Airy disc has a full width at half maximum of 0.514 wavelength / NA; the radius of the circle is
     # three times this width.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture

@@ -21,6 +21,6 @@ if TYPE_CHECKING:
     from litho_design.optics.thin_element import element_field as element_field
     from litho_design.optics.thin_element import intensity_share as intensity_share
 else:
-    # Names are loaded when they are used, because the command line reads the settings in `Optics` without
-    # torch.
+    # The names of this package are imported only when they are used, because the command line reads the
+    # settings in `Optics` and must not import torch for this.
     __all__, __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -1,5 +1,5 @@
-"""Propagate with the band-limited angular spectrum method, for distances that are too short for the sampled
-Rayleigh-Sommerfeld kernel.
+"""Propagate waves with the band-limited angular spectrum method. It is used at distances that are too short
+for the sampled Rayleigh-Sommerfeld kernel.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import KernelPropagator, wrapped_order
 from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
 
-# Longest period along each axis, in pixels. Computing a kernel of this size takes half a gibibyte of memory.
+# Longest period, in pixels, with which the propagated field may repeat along each axis. Computing a kernel of
+# this size takes half a gibibyte of memory.
 _LONGEST_PERIOD = 4096
 
 
@@ -23,12 +24,12 @@ class ASMPropagator(KernelPropagator):
     """Propagate a complex field to a parallel plane by means of the transfer function of free space.
 
     The transfer function is H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)). The root is complex, so
-    evanescent waves decay instead of becoming NaN. Because H is sampled, the field repeats with a period. The
-    period is made long enough to keep the steepest rays from wrapping around, but at most 4096 pixels long.
-    Frequencies whose rays are too steep for the period are removed (after Matsushima and Shimobaba 2009,
-    doi:10.1364/OE.17.019662). The kernel is stored only at the separations that occur between the two grids,
-    so a longer period costs nothing after construction. A negative distance propagates waves backwards and
-    drops the evanescent waves.
+    evanescent waves decay instead of becoming NaN. Because H is sampled, the propagated field is periodic.
+    The period is made long enough to keep the steepest rays from wrapping around, but at most 4096 pixels
+    long. Frequencies whose rays are too steep for the period are removed (after Matsushima and Shimobaba
+    2009, doi:10.1364/OE.17.019662). The kernel is stored only at the separations that occur between the two
+    grids, so a longer period costs nothing after construction. A negative distance propagates waves backwards
+    and drops the evanescent waves.
 
     Pixels larger than half a wavelength can represent only rays up to a certain angle, and the result is
     exact for waves that contain only such rays. Smaller pixels admit rays up to grazing incidence. In this
@@ -36,8 +37,8 @@ class ASMPropagator(KernelPropagator):
     better choice.
 
     Args:
-        source, target: grids of the two planes. Their pitches must be equal; their shapes and origins are
-            free.
+        source, target: grids of the two planes. Their pitches must be equal, but their shapes and origins may
+            differ.
         distance_um: separation of the planes, µm; may be zero or negative.
         wavelength_um: wavelength in the medium, µm.
         dtype: torch.complex64 or torch.complex128.
@@ -121,7 +122,8 @@ def _axis_band(
     middle = start + (there - here) * pitch / 2
     cosine = (1 - (wavelength_um * frequency) ** 2).clamp(min=0).sqrt()
     ray_shift = distance_um * wavelength_um * frequency
-    # A ray wraps around if it travels one period beyond the far edge of the target.
+    # A ray wraps around if it reaches a periodic copy of the target. Rays that are shifted sideways by no
+    # more than this distance, relative to the middle of the target, reach no copy.
     furthest_um = (length - (here + there) / 2) * pitch
     inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
     # At zero distance, all frequencies are kept, because propagation changes nothing.

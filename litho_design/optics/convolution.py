@@ -1,5 +1,5 @@
-"""Convolve by FFT. The convolution and its gradient compute only those samples of the result that are
-kept.
+"""Convolve by FFT. In the convolution and in its gradient, only those samples are computed that the result
+contains.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ class KernelPropagator(nn.Module):
     The grid of the kernel may be finer than the grids of the source and the target, by integer factors.
 
     Args:
-        kernel: complex128 array of shape (ky, kx), at the separations that ``wrapped_order`` returns.
-        finer: two pairs: the numbers (y, x) of kernel pixels per source pixel, and per target pixel.
+        kernel: values of the kernel at the separations that ``wrapped_order`` returns, a complex128 array of
+            shape (ky, kx).
+        finer: two pairs (along y, along x): the numbers of kernel pixels per source pixel, and the numbers of
+            kernel pixels per target pixel.
         dtype: torch.complex64 or torch.complex128.
     """
 
@@ -36,7 +38,7 @@ class KernelPropagator(nn.Module):
     ):
         super().__init__()
         self.source, self.target, self._finer = source, target, finer
-        # The buffer is not persistent, because it follows from the arguments and checkpoints need not contain
+        # The buffer is not persistent: it can be computed from the arguments, so checkpoints need not contain
         # it.
         self.register_buffer("transfer", torch.fft.fft2(kernel).to(dtype), persistent=False)
 
@@ -115,7 +117,7 @@ class _Convolution(torch.autograd.Function):
 
 
 def _spread(field: Tensor, finer: tuple[int, int]) -> Tensor:
-    """Place a field on finer pixels, with zeros between its own pixels."""
+    """Place the samples of a field on a finer grid, with zeros between them."""
     if finer == (1, 1):
         return field
     fine = field.new_zeros(*field.shape[:-2], *fine_shape(field.shape[-2:], finer))

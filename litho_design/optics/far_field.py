@@ -21,12 +21,12 @@ class FarFieldPropagator(nn.Module):
     squares, not as points (Goodman, Fourier Optics, ch. 5).
 
     Args:
-        source, target: grids of the two planes, µm. Their shapes and pitches are free.
+        source, target: grids of the two planes, µm. Their shapes and pitches may differ.
         distance_um: focal length f.
 
     Raises:
-        InputError: the image is wider than λ f / pitch. Beyond this width, the computed light of a sampled
-            element repeats.
+        InputError: the image is wider than λ f / pitch. Because the element is sampled, the computed image
+            repeats beyond this width.
     """
 
     along_y: Tensor

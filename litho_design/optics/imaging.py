@@ -9,21 +9,23 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# The backward pass recomputes the steps in blocks of this many steps. If all steps together fit into the
-# memory stated below (about twenty values per pixel and step), they are kept and not recomputed.
+# In the backward pass, the Richardson-Lucy steps are recomputed in blocks of this many steps. If the values
+# of all steps (about twenty per pixel and step) fit into the memory stated below, they are kept and not
+# recomputed.
 _STEPS_PER_CHECKPOINT = 10
 _KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
-    """Convolve an object with a PSF. The object and its image have the same frame of pixels.
+    """The convolution of an object with a PSF. The object and its image lie on the same frame of pixels.
 
     The object is dark outside the frame. The operation is linear and does not wrap around.
 
-    The PSF has odd sides, and its middle sample is the origin, so images do not shift.
+    The sides of the PSF are odd, and its middle sample is the origin, so an image is not shifted relative to
+    its object.
 
     Args:
-        psf: real PSF of shape (k, k) with any sum; gradients flow to it.
+        psf: real PSF of shape (k, k). Its sum need not be 1. Gradients flow to it.
         frame: shape (ny, nx) of the object and of the recorded image.
     """
 

@@ -18,10 +18,10 @@ _CHUNK_ENTRIES = 1 << 23
 class RadialPropagator(nn.Module):
     """Propagate a field of concentric rings to points at given radii of a parallel plane.
 
-    U(p) is the sum over all rings of u times the integral of h over the ring, where u is the field on the
-    ring and h is the kernel in ``RSPropagator``. Each ring is integrated with two Gauss-Legendre nodes across
-    it and the midpoint rule around it. For a periodic integrand, the error of the midpoint rule falls
-    exponentially once the phase is resolved.
+    The propagated field U(p) is a sum over all rings. Each ring contributes its field u times the integral of
+    h over the ring, where h is the kernel in ``RSPropagator``. The integral over a ring uses two
+    Gauss-Legendre nodes across the ring and the midpoint rule around it. For a periodic integrand, the error
+    of the midpoint rule falls exponentially once the phase is resolved.
 
     Args:
         rings: number of rings; ring i covers the radii from i to i + 1 times ``ring_width_um``.

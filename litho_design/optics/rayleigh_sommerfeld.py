@@ -69,8 +69,8 @@ class RSPropagator(KernelPropagator):
 
 
 def _ratio(pitches: float) -> tuple[int, int] | None:
-    """Return into how many equal parts each of two pitches must be divided so that the parts are equally
-    long. ``pitches`` is the ratio of the second pitch to the first.
+    """Return the two numbers of equal parts into which the first and the second pitch must be divided, so
+    that all parts have the same length. ``pitches`` is the ratio of the second pitch to the first.
 
     Return None if too many parts are needed.
     """

@@ -8,8 +8,8 @@ from dataclasses import replace
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 
-# Sampling repeats the spectrum at the frequency 1/pitch. After this many decay lengths, 4e-6 of the
-# evanescent wave at this frequency remains.
+# Sampling creates a copy of the spectrum around the frequency 1/pitch. The evanescent wave at this frequency
+# must decay over this number of decay lengths, after which 4e-6 of it remains.
 _DECAY_LENGTHS = 2.0
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_design.optics.thin_element import Optics
 
-# Number of directions per area (wavelength / side)^2, where the source is an area in the plane of sines. The
-# directions lie closer together than an element resolves.
+# Number of directions per area (wavelength / side of the element)^2 in the plane of direction sines, where
+# the source covers a disc. The directions lie closer together than an element can resolve.
 _POINTS_PER_AREA = 3
 _FEWEST = 8
 _MOST = 128
@@ -18,13 +18,13 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
-    """Return monochromatic plane waves whose images add up to that of the source.
+    """Return monochromatic plane waves whose images add up to the image of the source.
 
-    For each wave, the result contains its share of the light and its optics. The wavelengths are the nodes of
-    a Gauss-Hermite quadrature over a Gaussian spectrum. Directions are spread evenly over a disc of sines
-    around the direction of ``optics``. The images of neighbouring waves lie closer together than lambda z /
-    D, the finest detail of an element of side D. For a monochromatic point source, there is only one wave,
-    with the given ``optics``.
+    For each wave, the result contains a pair: its share of the light, and the optics with its wavelength and
+    direction. The wavelengths are the nodes of a Gauss-Hermite quadrature over a Gaussian spectrum.
+    Directions are spread evenly over a disc of sines around the direction of ``optics``. The images of
+    neighbouring waves lie closer together than lambda z / D, the finest detail of an element of side D. For a
+    monochromatic point source, there is only one wave, with the given ``optics``.
 
     Args:
         size_um: side of the element.
@@ -43,7 +43,8 @@ def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]
 def _colours(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
     if not optics.bandwidth_um:
         return [(1.0, optics)]
-    # If the wavelength changes, a detail at the edge of the image moves by D / 2 times the relative change.
+    # If the wavelength changes, a detail at the edge of the image moves by half the side of the element times
+    # the relative change of the wavelength.
     widths = optics.bandwidth_um * size_um**2 / (2 * optics.wavelength_um**2 * optics.distance_um)
     nodes, weights = np.polynomial.hermite_e.hermegauss(_checked(3 + 2 * math.ceil(2 * widths), "bandwidth"))
     return [

@@ -1,5 +1,5 @@
-"""The stroke of a print, and the share of the light that a staircase grating with this stroke sends into a
-diffraction order.
+"""The stroke of a print (the height range of its levels), and the share of the light that a staircase grating
+with this stroke sends into a diffraction order.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """Printed heights of the levels, and the figures of a blazed grating whose periods consist of these
+    """Printed heights of the levels, and the efficiencies of a blazed grating whose periods consist of these
     levels.
 
-    ``print_gain`` is the printed height range divided by the nominal one. The figures for one wave are None
-    if this gain is not positive.
+    ``print_gain`` is the printed height range divided by the nominal one. The number of levels and the height
+    that would make the stroke one wave are None if this gain is not positive.
     """
 
     printed_height_um: list[float]
@@ -29,8 +29,8 @@ class Stroke(Record):
 
 
 def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
-    """Return the scalar efficiency of a blazed grating with ``steps`` equal steps whose stroke is ``gain``
-    waves.
+    """Return the efficiency, according to scalar theory, of a blazed grating whose periods consist of
+    ``steps`` equal steps and whose stroke is ``gain`` waves.
 
     eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2, where m is the order, N is the number
     of steps and g is the stroke in waves.
@@ -55,13 +55,13 @@ def measure_stroke(
 
     Returns:
         The stroke, and the efficiency of a blazed grating with this stroke in the first and the zero order.
-        The record also states how many levels of the same height, or which height of the same number of
-        levels, would make the stroke one wave.
+        The record also states two ways to make the stroke one wave: the number of levels if their height is
+        kept, and the height of a level if the number of levels is kept.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]
     gain = stroke_um / ((count - 1) * level_height_um) if count > 1 else 0.0
-    # A period of N equal steps corresponds to N/(N-1) times the height of its highest step.
+    # A staircase of N equal steps approximates a ramp that is N/(N-1) times as high as the highest step.
     period_waves = stroke_um / wave_height_um * count / max(count - 1, 1)
     return Stroke(
         printed_height_um=list(printed_height_um),

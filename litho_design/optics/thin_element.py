@@ -11,10 +11,10 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
-# A wavelength outside this range was probably given in metres or nanometres.
+# Range of valid wavelengths. A value outside this range was probably given in metres or nanometres.
 SHORTEST_UM, LONGEST_UM = 0.05, 100.0
-# Width of the dark border that is added around a thick element, µm. Within the height of a relief, light
-# spreads no farther than this.
+# Width, µm, of the dark border that is added around a thick element. While light passes through a relief, it
+# spreads sideways by no more than this.
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:

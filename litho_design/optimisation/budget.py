@@ -18,15 +18,17 @@ _KIB_PER_GIB = 1 << 20
 
 
 class Budget(Record):
-    """Time and memory of one iteration of the search, measured on a trial iteration that changes nothing."""
+    """Time and memory of one iteration of the search, measured on a trial iteration that leaves the
+    parameters unchanged.
+    """
 
     seconds_per_iteration: float
     seconds_per_evaluation: float
     peak_memory_gib: float
 
     def sentence(self, search: SearchSettings, done: int = 0, seconds_after: float = 0.0) -> str:
-        """Return one line that estimates the time and memory of the rest of a run: the iterations after the
-        first ``done``, the scores and the report.
+        """Return one line that estimates the time and memory of the rest of a run, which consists of the
+        iterations after the first ``done``, the scores and the report.
         """
         left = search.iterations - done
         searched = (left + search.polish_rounds) * self.seconds_per_iteration

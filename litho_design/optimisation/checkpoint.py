@@ -1,4 +1,4 @@
-"""The checkpoint that an interrupted search leaves in its folder, and from which it resumes."""
+"""The checkpoint that an interrupted search leaves in its folder, and from which the search resumes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_design.optimisation.ranks import Ranks
 
-# The exception that torch raises for a damaged file depends on the position of the damage.
+# Exceptions that torch may raise for a damaged file; which of them depends on the position of the damage.
 _DAMAGED = (
     RuntimeError,
     pickle.UnpicklingError,
@@ -31,7 +31,9 @@ _DAMAGED = (
 
 @dataclass
 class SearchState:
-    """The state of a search. A search resumes from this state, its settings and the states of its parts."""
+    """The state of a search. A search resumes from this state, its settings, and the states of its parts,
+    such as the optimiser.
+    """
 
     iteration: int = 0
     best_loss: float = math.inf
@@ -59,8 +61,8 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Any], device: torch.device
 ) -> SearchState:
-    """Load a checkpoint. The parts of the search are changed in place, and the state of the search is
-    returned, with its tensors on ``device``.
+    """Load a checkpoint. The saved states are loaded into the objects in ``stateful``, such as the optimiser,
+    which are changed in place. The state of the search is returned, with its tensors on ``device``.
 
     Raises:
         InputError: the checkpoint belongs to another task, or the file is damaged.

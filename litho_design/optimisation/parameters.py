@@ -13,19 +13,20 @@ from litho_design.optimisation.process_window import blurred
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
-# With 13 levels, a learning rate of 1 moves the level of a cell by one. With more or fewer levels, it moves
-# the level by the same share of the range.
+# With 13 levels (12 steps between them), a learning rate of 1 moves the level of a cell by about one level
+# per iteration. With another number of levels, it moves the level by the same share of the range.
 _RATE_STEPS = 12
-# Width of the distributions at the start, in levels. It lets the first step reach the neighbours of the
-# starting level.
+# Width of the distributions at the start, in levels. With this width, the first step of the search can reach
+# the levels next to the starting level.
 _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
     """Spread one value per free cell over the pixels of the layout, and average pixels back to cells.
 
-    With ``rows``, the map covers only these rows of pixels, and ``own`` selects their cells from the cells of
-    the whole layout. In the docstrings below, *cells stands for the shape of one value per cell.
+    If ``rows`` is given, the map covers only these rows of pixels, and the method ``own`` selects the cells
+    in these rows from the cells of the whole layout. In the docstrings below, *cells stands for the shape of
+    an array with one value per cell.
     """
 
     ring: Tensor
@@ -48,8 +49,8 @@ class CellMap(nn.Module):
             self.cells = (len(rows) // self.cell_px, self.cells[-1])
 
     def own(self, values: Tensor) -> Tensor:
-        """Select, from one value per cell of the whole layout, the values of those cells that the map
-        covers.
+        """Select the values of the cells that this map covers. ``values`` contains one value per cell of the
+        whole layout.
         """
         return values[self._own]
 
@@ -60,8 +61,8 @@ class CellMap(nn.Module):
         return values.repeat_interleave(self.cell_px, -1).repeat_interleave(self.cell_px, -2)
 
     def average(self, pixels: Tensor) -> Tensor:
-        """Return the mean over each cell of real or complex pixels, shape (size, size). The mean of a ring
-        without pixels is 0.
+        """Return the mean of real or complex pixel values over each cell. ``pixels`` has shape (size, size).
+        The mean of a ring without pixels is 0.
         """
         if not self.radial:
             blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
@@ -79,7 +80,8 @@ class GumbelLevels(nn.Module):
     arXiv:1611.01144).
     """
 
-    # The learning rate is multiplied by this factor. It is 1, because logits have no range.
+    # The learning rate is multiplied by this factor. It is 1, because logits, unlike levels, have no range to
+    # which the rate could be scaled.
     rate_unit = 1.0
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
@@ -125,7 +127,8 @@ class GumbelLevels(nn.Module):
 class DirectLevels(nn.Module):
     """One real level per cell. The levels are filtered if the layout has a cell filter.
 
-    A sample with ``hard=True`` has rounded levels, and the gradient passes straight through the rounding.
+    A sample with ``hard=True`` has rounded levels. Its gradient is computed as if the levels had not been
+    rounded (straight-through estimator).
     """
 
     def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):

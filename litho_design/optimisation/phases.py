@@ -16,10 +16,10 @@ from litho_design.optimisation.parameters import CellMap
 
 # Below this amplitude, relative to that behind the element, a wave is treated as having no phase.
 _DARK = 1e-12
-# Half of the range, in radians, from which the starting phases are drawn. If phases were drawn from the whole
-# circle, one in six pairs of neighbouring cells would end more than half a wave apart. Printing rounds off
-# such a step, and the search does not repair it. This narrower range leads to a third fewer of these steps,
-# and different seeds still give different results.
+# The starting phases are drawn from a range of plus or minus this value, in radians. If phases were drawn
+# from the whole circle, one in six pairs of neighbouring cells would end more than half a wave apart.
+# Printing rounds off such a step, and the search does not repair it. This narrower range leads to a third
+# fewer of these steps, and different seeds still give different results.
 _START_PHASE_RAD = 1.0
 
 
@@ -38,12 +38,13 @@ def gerchberg_saxton(
     """Find one phase per cell, such that the propagated amplitude approaches sqrt(target).
 
     Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
-    wave outside it. The adjoint sends this correction back, and the result is projected on the phases that
-    the element can have: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P
-    the propagator, a the target amplitude and Pi the projection. The norm of P is at most one, so this step
-    majorises the squared amplitude error, which therefore never rises (Gerchberg and Saxton 1972). The
-    weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude where light
-    is missing. This form improves uniformity but loses the guarantee that the error never rises. The initial
+    wave outside the window unchanged. The adjoint of the propagator carries this correction back to the
+    element, and the corrected wave is projected onto the waves that phases of the cells can produce: u' =
+    Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P the propagator, a the
+    target amplitude and Pi the projection. The norm of P is at most one, so each step minimises an upper
+    bound of the squared amplitude error, and the error never rises (Gerchberg and Saxton 1972). The weighted
+    form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude where light is
+    missing. This form improves uniformity but loses the guarantee that the error never rises. The initial
     phases are drawn at random within one radian of pi. The phase pi is the middle of the range if the levels
     span a full wave.
 
@@ -53,12 +54,12 @@ def gerchberg_saxton(
         target: target intensity in [0, 1], shape (size, size).
         cells: map between the free cells of the element and its pixels.
         counted: boolean mask, shape (size, size), of the pixels whose amplitude is prescribed. On other
-            pixels, the wave is kept as it is. The target amplitude is then scaled to the light on the pixels
-            of the mask.
+            pixels, the wave is kept as it is. If a mask is given, the target amplitude is scaled to the light
+            on the pixels of the mask.
         level_phase: printed phase of each level, in radians, shape (levels,). If given, the second half of
             the iterations projects on these phases instead of on the whole circle.
         total: function that sums values over the pixels of the whole element. It is needed only if ``cells``
-            and ``target`` cover a part of the element.
+            and ``target`` cover just a part of the element.
 
     Returns:
         The phase of each cell, in radians, and a list of the amplitude errors sqrt(sum (|P u| - a)^2) before
@@ -107,13 +108,14 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
     y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
     radius = (x**2 + y**2 + optics.distance_um**2).sqrt()
     phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius)
-    # Cells average the wave, not the phase, because the mean of a wrapped phase means nothing.
+    # For each cell, the mean of the complex wave is computed instead of the mean of the phase, because the
+    # mean of wrapped phases is meaningless.
     return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Return the levels nearest to the phase of a lens. The constant phase that loses the least light is
-    added first.
+    """Return the levels whose printed phases are nearest to the phase of a lens. Before the levels are
+    chosen, the constant phase that loses the least light is added to the phase of the lens.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
     phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, which

@@ -22,11 +22,12 @@ def polish_levels(
 ) -> tuple[Tensor, list[float]]:
     """Improve an integer layout by moving cells up or down by one level. The loss never rises.
 
-    The gradient at the integer layout ranks the moves. In each round, a share of the cells makes the best
-    moves at once. This share is halved whenever the true loss of the changed layout does not fall.
+    The gradient at the integer layout ranks the moves. In each round, the levels of a share of the cells,
+    those with the best moves, are changed at once. If the true loss of the changed layout is not lower, the
+    changes are discarded and this share is halved.
 
     Args:
-        levels: level of each cell, int64, in the shape of the cells.
+        levels: level of each cell, an int64 tensor with one value per cell.
         level_count: number of printable levels.
         rounds: number of rounds. Each round evaluates the loss and its gradient once.
 
@@ -58,7 +59,8 @@ def _rank_moves(
 ) -> tuple[Tensor, Tensor, float]:
     """Estimate, to first order, by how much the best move by one level of each cell lowers the loss.
 
-    Return this gain and the move (-1 or +1) of each cell, and the loss of the unchanged layout.
+    Return three items: for each cell, this decrease of the loss and the move (-1 or +1), and the loss of the
+    unchanged layout.
     """
     values = levels.float().requires_grad_()
     loss, _ = objective(cells(values)[None, None])

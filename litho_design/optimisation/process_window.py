@@ -1,5 +1,5 @@
-"""The process window: random prints and optics that deviate from those of the model, and the disagreement of
-several models.
+"""The process window, i.e. random deviations of the print and of the optics from those that the model
+predicts, and the disagreement of several models.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-# A print passes if each figure in dB is at most the first value below that of the print as modelled, every
-# other figure is at least the second value times the modelled one, and no error exceeds the modelled one
-# divided by the second value.
+# The scores of a print are compared with those of the print as modelled. The print passes if each score in dB
+# is lower by at most the first value, if every other score is at least the second value times the modelled
+# score, and if no error exceeds the modelled error divided by the second value.
 PASS_DROP_DB, PASS_SHARE = 1.0, 0.9
 _UNSEEN_STREAM = 1
 # This is (1e-6 µm)^2. It is far below the variance of any height, and it keeps the square root differentiable
@@ -33,13 +33,14 @@ _SPREADS = ("gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelengt
 
 
 class ProcessWindow(Record):
-    """The spread of prints and optics, and the way in which a search uses it.
+    """The spread (standard deviations) of prints and optics, and the way in which a search uses it.
 
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
-    iteration. It minimises the mean loss of the worst draws; ``tail`` is the share of these among all draws.
-    The defaults are guesses; replace them with the spreads of your printer. In one measured data set, the
-    gain varies by 13 % between fields; this value includes the changing scale of the microscope.
+    iteration. The search minimises the mean loss over the worst draws; ``tail`` is the share of all draws
+    that count as the worst. The defaults are guesses; replace them with the spreads of your printer. In one
+    measured data set, the gain varies by 13 % between fields; this value includes the changing scale of the
+    microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -110,8 +111,8 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    # Each draw uses five random numbers. A further spread needs its own stream; otherwise, all existing draws
-    # would change.
+    # Each draw uses five random numbers. If another spread is added in future, it needs its own random
+    # stream; otherwise, all existing draws would change.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -142,7 +143,8 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    # The angular spectrum has no sampling limit, but the image plane must stay behind the element.
+    # The angular spectrum has no sampling limit, but the distance must stay positive, so that the image plane
+    # lies behind the element.
     limit_um = min(lengths_um)
     if optics.propagation == "rayleigh-sommerfeld":
         limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
@@ -161,7 +163,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 class Yield(Record):
     """The share of random prints that pass, its 95 % confidence interval (by Wilson's method), and the names
-    of the figures that decide whether a print passes.
+    of the scores that decide whether a print passes.
     """
 
     draws: int
@@ -178,12 +180,13 @@ def measure_yield(
 ) -> Yield:
     """Measure the share of drawn prints that pass.
 
-    A print passes if its figures are close enough to those of the print as modelled.
+    A print passes if its scores are close enough to those of the print as modelled (see ``PASS_DROP_DB`` and
+    ``PASS_SHARE``).
 
     Args:
-        drawn: for each drawn print, a mapping from the name of a figure to its value.
-        modelled: the same figures for the print as modelled.
-        errors: names of the figures that are better when lower.
+        drawn: scores of each drawn print, keyed by name.
+        modelled: the same scores for the print as modelled.
+        errors: names of the scores that are better when lower.
     """
     from scipy.stats import binomtest
 
@@ -211,7 +214,8 @@ def risk(losses: Tensor, tail: float) -> Tensor:
 
 
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
-    """Return the standard deviation, µm, between the prints that several models predict, as its rms over the
+    """Return the disagreement, µm, of several models about a print. At each point, the standard deviation
+    between the heights that the models predict is computed; the result is the rms of this value over the
     area.
 
     The result is differentiable. The mean of every print is subtracted first, because a constant height
@@ -240,7 +244,7 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
         store: a ``litho_data`` store with at least three scans outside its lock box.
 
     Raises:
-        InputError: there are too few scans whose layouts have structure.
+        InputError: there are too few scans of layouts that have more than one level.
     """
     locked = store.locked_ids
     fits = []

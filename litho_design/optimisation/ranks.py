@@ -13,8 +13,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Ranks:
-    """The rank of this process among all processes. The methods sum and exchange values among the processes;
-    gradients flow through both.
+    """The rank of this process among all processes. The methods sum values over the processes and exchange
+    values between them; gradients flow through both operations.
     """
 
     rank: int = 0
@@ -36,8 +36,8 @@ class Ranks:
 
     @property
     def part(self) -> str:
-        """Return the text that names this process in files that each process writes. It is empty if there is
-        only one process.
+        """Return the text that identifies this process in the names of files of which every process writes
+        its own. It is empty if there is only one process.
         """
         return f"-{self.rank + 1}-of-{self.count}" if self.count > 1 else ""
 
@@ -46,7 +46,9 @@ class Ranks:
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
 
     def share(self, count: int, rank: int | None = None) -> range:
-        """Return which of ``count`` items belong to a process, by default to this process, as a range."""
+        """Divide ``count`` items among the processes, and return the range of those that belong to the
+        process ``rank``, by default to this process.
+        """
         place = self.rank if rank is None else rank
         return range(count * place // self.count, count * (place + 1) // self.count)
 
@@ -92,5 +94,5 @@ class Ranks:
             dist.barrier()
 
 
-# The case in which this process alone holds the element.
+# The ranks to use if this process alone holds the element.
 ALONE = Ranks()

@@ -1,5 +1,5 @@
-"""The search loop of every task. It optimises free parameters, keeps the printable levels, and resumes from
-checkpoints.
+"""The search loop of every task. It optimises free parameters, keeps the best printable levels, and resumes
+from checkpoints.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def search_layout(
     what: str = "designing",
     part: str = "",
 ) -> SearchState:
-    """Minimise ``objective`` over layouts. Only printable (argmax) layouts are compared and kept.
+    """Minimise ``objective`` over layouts. Only printable layouts, in which each cell has its most probable
+    level (argmax), are compared and kept.
 
     Args:
         parameters: free parameters with their starting values; they are changed in place.
@@ -51,8 +52,8 @@ def search_layout(
 
     Returns:
         The final state. It contains the levels that were kept (``best_levels``, one per cell) and the
-        history. The history has one record per evaluated iteration, with the loss of the sample and of the
-        argmax layout.
+        history. The history has one record per evaluated iteration, with the loss of the sampled layout and
+        that of the printable (argmax) layout.
 
     Raises:
         InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.

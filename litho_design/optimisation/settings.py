@@ -68,7 +68,9 @@ class SearchSettings(Record):
     seed: int = setting(0, "Seed of start and sampling", option="--seed")
 
     def temperature(self, iteration: int) -> float:
-        """Return the Gumbel temperature, which follows half a cosine from start to end."""
+        """Return the Gumbel temperature at an iteration. It changes from its start value to its end value
+        along half a period of a cosine.
+        """
         share = iteration / max(self.iterations - 1, 1)
         weight = (1 + math.cos(math.pi * share)) / 2
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
@@ -90,8 +92,8 @@ PAPER_SEARCH = SearchSettings(
 class EnsemblePenalty(Record):
     """The penalty on the disagreement of several models.
 
-    The loss of a search is the worst loss over all models plus ``weight`` times the disagreement of the
-    models, in waves.
+    The loss of a search is the largest of the losses according to all models, plus ``weight`` times the
+    disagreement of the models, expressed in waves.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"risk"})
@@ -136,7 +138,8 @@ class DesignSettings(Record):
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
-    """Return the settings for your own task, changed by ``changes``, such as ``{"layout.size_px": 256}``.
+    """Return the settings for a user-defined task, changed by ``changes``, such as ``{"layout.size_px":
+    256}``.
 
     Raises:
         InputError: a change names an unknown setting, or gives a setting a value that it does not accept.

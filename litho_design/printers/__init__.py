@@ -1,1 +1,1 @@
-"""Layouts and the printers that print them: frozen models, nominal heights, and the virtual fab."""
+"""Layouts and the printers that predict their prints: frozen models, nominal heights, and the virtual fab."""

@@ -1,8 +1,8 @@
-"""The virtual fab as a judge. It can print finished layouts, but it has no gradients, so no layout can be
-designed through it.
+"""The virtual fab (a simulated printer) as a judge of designs. It can print finished layouts, but it provides
+no gradients, so no layout can be designed through it.
 
-The fab shares no code with the models. It includes the hidden effects with which their training prints were
-simulated, so it prints what the simulated machine would have printed.
+The fab shares no code with the models. It includes the hidden effects with which the training prints of the
+models were simulated, so its print of a layout is the one that the simulated machine would produce.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# Number of a separate random stream for the roughness, so that it differs from the roughness of every scan
-# that was simulated with the truth file.
+# Number of the random stream for the surface roughness. The stream is separate, so that the roughness differs
+# from that of every scan that was simulated with the truth file.
 _ROUGHNESS_STREAM = 2
 
 
@@ -31,7 +31,7 @@ class ElementJob(Job):
     """A print job for a layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
-        """Place the layout in a frame of level 0, in the middle of a write field as large as the frame."""
+        """Surround the layout with a frame of level 0. The write field is as large as the framed layout."""
         framed = np.pad(self.level, GUARD_PX)
         return Canvas(framed, pitch_um, self.field_um, max(self.level.shape) * pitch_um)
 
@@ -40,12 +40,12 @@ class FabSimulator(nn.Module):
     """Print like the virtual fab described by a ``truth.json``, with surface roughness but without scan
     effects.
 
-    The fab is called like a frozen model but has no gradients. The roughness is the same for every layout of
-    one size, so the prints differ only because the layouts do.
+    The fab is called like a frozen model but provides no gradients. The roughness is the same for all layouts
+    of the same size, so differences between their prints come only from the layouts.
     """
 
     name = "fab"
-    # The reach is 0, because the print job itself adds the frame of level 0.
+    # The reach is 0, so that the printer adds no guard ring; the print job itself adds a frame of level 0.
     reach_um = 0.0
 
     def __init__(self, truth: Truth):

@@ -11,7 +11,7 @@ from litho_data.foundation.results import Record
 
 
 class LayoutSettings(Record):
-    """Geometry of a layout: pixels, free cells and levels.
+    """Geometry of a layout: its pixels, its free cells (the areas whose level is chosen) and its levels.
 
     ``cell_um`` is the side of one free cell, or the width of one ring with ``symmetry="radial"``.
     """

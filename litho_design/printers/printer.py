@@ -24,10 +24,11 @@ Precision = Literal["float32", "bfloat16"]
 
 
 class TilingCheck(Record):
-    """Difference between a print that is predicted as a whole and the same print predicted in tiles.
+    """Difference between the print of a layout that is predicted as a whole and the print that is predicted
+    in tiles.
 
-    For models with a finite reach, the difference is only rounding. For others, such as a Fourier operator,
-    the difference is an error of the model.
+    For models with a finite reach, the difference is only a rounding error. For other models, such as a
+    Fourier neural operator, the difference is an error of the model.
     """
 
     tile_px: int
@@ -37,8 +38,8 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """The printer of a design or a score; ``dataset_sha256`` identifies the dataset on which its model was
-    trained.
+    """The record of the printer that was used for a design or a score; ``dataset_sha256`` identifies the
+    dataset on which its model was trained.
     """
 
     name: str
@@ -87,12 +88,16 @@ class Printer(nn.Module):
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """Return the card of the model, or an empty mapping if the heights are nominal."""
+        """Return the model card, which describes the model and its training data, or an empty mapping if the
+        heights are nominal.
+        """
         return getattr(self.simulator, "card", {})
 
     @property
     def only_judges(self) -> bool:
-        """Return True if the printer has no gradients, so that no layout can be searched through it."""
+        """Return True if the printer provides no gradients. Such a printer can judge layouts, but a search
+        cannot use it.
+        """
         return isinstance(self.simulator, FabSimulator)
 
     @property
@@ -104,7 +109,9 @@ class Printer(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Return the device of the model. If the heights are nominal, this is the device of the waves."""
+        """Return the device of the model. If the heights are nominal, this is the device on which the waves
+        are computed.
+        """
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:
@@ -116,8 +123,8 @@ class Printer(nn.Module):
         """Return the printed height, µm, of a patch cut out of a layout, without the outer ``halo_px`` pixels
         of the patch. The levels of the patch have shape (b, 1, y, x).
 
-        By default, ``halo_px`` is the halo of the printer. The narrower ``strip_halo_px`` is enough if the
-        inner part of the patch is only two rows high.
+        By default, ``halo_px`` is the halo of the printer. If only two rows remain inside the halo, the
+        narrower ``strip_halo_px`` is enough.
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
@@ -149,7 +156,8 @@ class Printer(nn.Module):
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
-        """Compare the print of the whole element with separately printed tiles, each with a halo.
+        """Compare the print that is predicted for the whole element with prints that are predicted for single
+        tiles, each with a halo.
 
         Args:
             level: levels of the layout, shape (1, 1, size, size).
@@ -165,8 +173,8 @@ class Printer(nn.Module):
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
         count = min(4, size // tile_px)
-        # Tiles start at odd pixels, because a tile that coincides with a tile of the model would be compared
-        # with itself.
+        # Tiles start at odd pixels, so that none coincides with a tile into which the model itself divides
+        # the layout. Otherwise, that tile would be compared with itself.
         starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
         off = []
         for start in (min(start, size - tile_px) for start in starts):
@@ -245,8 +253,9 @@ def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
     """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
     strip.
 
-    A model that runs on tiles needs a whole tile around a patch. The two rows of a strip lie where two rows
-    of tiles are blended, and the mean of two tiles has a smaller error there than a single tile.
+    A model that itself runs on tiles needs the width of a whole tile around a patch. A strip can have a
+    narrower halo: its two rows lie where the model blends two rows of tiles, and the mean of two tiles has a
+    smaller error there than a single tile.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

@@ -14,8 +14,8 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
-# The models of the zoo that judge designs, one of each kind of model. Ridge regressions are left out, because
-# they extrapolate badly from smooth layouts.
+# The models of the zoo (the models shipped with the package) that judge designs, one of each kind. Ridge
+# regressions are left out, because they were trained on smooth layouts and extrapolate badly to others.
 JUDGES = ("physics", "pbl", "fno")
 
 
@@ -35,8 +35,9 @@ def load_printer(
     printer is returned unchanged.
 
     Raises:
-        InputError: ``source`` is no frozen model, the pitch of the model differs from that of the layout, the
-            model was not calibrated for the heights of the levels, or this machine does not have the device.
+        InputError: ``source`` does not name a frozen model, the pitch of the model differs from that of the
+            layout, the model was not calibrated for the heights of the levels, or this machine does not have
+            the device.
     """
     if isinstance(source, Printer):
         return source
@@ -67,7 +68,8 @@ def load_printers(
     loaded printers.
 
     Raises:
-        InputError: a printer has no name, two have the same name, or ``load_printer`` refuses one.
+        InputError: a printer has no name, two printers have the same name, or ``load_printer`` rejects a
+            printer.
     """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     if isinstance(sources, Mapping):

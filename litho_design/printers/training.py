@@ -1,5 +1,5 @@
-"""Compare a layout with the training layouts of a model: their distance, a penalty on it for the search, and
-the expected error of the model.
+"""Compare a layout with the training layouts of a model: compute the distance between them, a penalty on this
+distance for the search, and the expected error of the model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 # If half of the pixels have levels that are rare in the training layouts, most of the print is extrapolated.
 _FLAG_DISTANCE = 0.5
-# This limit is a tenth of all pairs of neighbours, because a few edges do not make a layout unusual.
+# A layout is flagged if the histograms of steps differ for more than a tenth of all pairs of neighbouring
+# pixels. A few edges do not make a layout unusual.
 _FLAG_STEPS = 0.1
 # A level or step is unusual if its share exceeds its share in the training layouts both by this factor and by
 # this difference.
@@ -36,7 +37,8 @@ class OutOfDistribution(Record):
     histogram of steps.
     """
 
-    # Older records also contain scores of a layout that is closer to the training layouts.
+    # Records of earlier versions contain further fields: the scores of a layout that is closer to the
+    # training layouts.
     model_config = ConfigDict(extra="ignore")
 
     level_distance: float
@@ -78,8 +80,8 @@ def out_of_distribution(
 
 
 def outside(level: Tensor, levels: int, card: Mapping[str, Any]) -> Tensor:
-    """Return by how much the tails of a layout's histograms of levels and steps exceed twice those of the
-    training layouts. The result is in levels.
+    """Return the penalty on a layout that is unlike the training layouts: the amount, in levels, by which the
+    tails of its histograms of levels and steps exceed twice those of the training layouts.
 
     For every k, three shares are compared: pixels at level k or lower, pixels at level k or higher, and
     neighbours with steps of k or more. A share may be up to twice the corresponding share of the training
@@ -119,9 +121,9 @@ def own_error_um(card: Mapping[str, Any], relief_um: float) -> float:
     """Return the rms error, µm, that a model is expected to make on the print of a relief. ``relief_um`` is
     the standard deviation of the heights of this relief, µm.
 
-    The result is the root of the sum of two squares: the error on the prints in the model's card, and the
-    scatter of the gains of these prints times ``relief_um``. If the relief is higher than these prints, the
-    error on them is scaled up. Errors are assumed to be normal, so the mean absolute error is sqrt(2 / pi) of
+    Two errors are added in quadrature: the error on the prints in the model's card, and the scatter of the
+    gains of these prints times ``relief_um``. If the relief is higher than these prints, the first error is
+    scaled up. Errors are assumed to be normally distributed, so the mean absolute error is sqrt(2 / pi) times
     the rms error. If the card has no prints, the result is 0.
     """
     prints = card.get("baseline") or []
@@ -140,8 +142,8 @@ def _distance(share: np.ndarray, trained: np.ndarray) -> float:
 
 
 def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
-    """Describe the values that are much more frequent in ``share`` than in ``trained``; return an empty list
-    if there are none.
+    """Return descriptions of the values that are much more frequent in the histogram ``share`` than in the
+    histogram ``trained``. The list is empty if there are none.
     """
     many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
     if many.size == 0:

@@ -52,7 +52,7 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
 
     The deviation is a float32 array of shape (size, size), in µm.
 
-    The roughness of a second print differs from that of the first, so the blur removes the roughness.
+    The blur removes the roughness, which differs from print to print and therefore cannot be corrected.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -25,15 +25,16 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-# Affine layouts (level = gain * height + zero) that are tried first: their gains relative to the inverse of
-# the printer's gain, and their positions between the lowest and the highest level.
+# The first affine layouts (level = gain * height + zero) that are tried. The first tuple contains their
+# gains, relative to the inverse of the printer's gain. The second contains their positions between the lowest
+# level (0) and the highest level (1).
 _AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
 _AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
-    """Errors of the heights of a print. The mean error is removed, because the zero of a print depends on its
-    base.
+    """Errors of the heights of a print. The mean error is subtracted, because the zero of the heights depends
+    on the base under the print.
     """
 
     rms_nm: float = Field(description="rms error of the print without its mean error, nm")
@@ -59,8 +60,8 @@ class ReliefTask(Task):
     and its record.
 
     The input ``off_um`` is the deviation of a first print from the expected print, without its mean. The
-    search expects the same deviation in the next print. Figures compare the predicted print with the target
-    itself, as a measurement would.
+    search expects the same deviation in the next print. The scores compare the predicted print with the
+    target itself, as a measurement would.
 
     Raises:
         InputError: the start in the settings works only for holograms or lenses, or the spreads of the
@@ -87,7 +88,8 @@ class ReliefTask(Task):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
         off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # The height map that the model has to print. The real print is then expected to match the target.
+        # The height map that the model's print should match. The real print is then expected to match the
+        # target, because it deviates from the model's print by ``off_um``.
         self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
@@ -108,19 +110,21 @@ class ReliefTask(Task):
         return (seen - self.asked).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the expected rms error, µm, which combines the error of the print that the model predicts
-        with the model's own error.
+        """Return the expected rms error of a real print, µm. It combines the error of the print that the
+        model predicts with the expected error of the model's prediction.
         """
         rms_um = self.loss(seen)
         own_um = own_error_um(printer.card, float(self.asked.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Return the expected rms error, µm, if all models are equally likely to be right."""
+        """Return the expected rms error, µm, under the assumption that all models are equally likely to be
+        right.
+        """
         return losses.square().mean().sqrt()
 
     def figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors of a print in nm, compared with the target."""
+        """Return the errors, in nm, of a print relative to the target."""
         error = 1000 * (seen - self.target).double()
         free = (error - error.mean()).abs()
         return {
@@ -131,8 +135,8 @@ class ReliefTask(Task):
         }
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
-        """Return the errors of a print without the offset. The zero of a print is free, so it must not decide
-        whether the print passes.
+        """Return the errors of a print, leaving out its offset. The zero of the heights is arbitrary, so the
+        offset must not decide whether the print passes.
         """
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
@@ -140,7 +144,8 @@ class ReliefTask(Task):
         """Return the level of each cell for the start of the search, namely the candidate with the lowest
         expected loss.
 
-        The candidates are levels whose uniform fields print the target heights, and the best affine levels.
+        There are two candidates: for each cell, the level whose wide uniform field would have the target
+        height; and the best affine layout.
         """
         heights = self.printer.level_heights_um()
         starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
@@ -153,8 +158,8 @@ class ReliefTask(Task):
         return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return the errors of the two uncorrected layouts, and those of the best levels that are not
-        rounded.
+        """Return the errors of the two uncorrected layouts, and those of the best levels when they are not
+        rounded to integers.
         """
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
@@ -209,8 +214,8 @@ class ReliefTask(Task):
         return
 
     def arrays(self, level: Tensor, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Return the arrays that every task saves, and the error that remains even with unrounded levels. No
-        layout can remove this error.
+        """Return the arrays that every task saves, and a map of the height error that remains even with the
+        best unrounded levels. No layout can remove this error.
         """
         left = self.asked - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
@@ -235,8 +240,8 @@ class ReliefTask(Task):
         """Return one real level per cell, such that the heights of a relief are printed if level k has the
         height ``level_heights_um[k]``.
 
-        ``zero`` moves the relief within the range of the levels: at 0, the relief begins at the lowest level;
-        at 1, it ends at the highest.
+        ``zero`` is the position of the relief within the printable heights. At 0, the lowest point of the
+        relief is printed with the lowest level; at 1, the highest point is printed with the highest level.
         """
         heights, target = np.asarray(level_heights_um), relief_um.cpu().numpy()
         room_um = (heights[-1] - heights[0]) - np.ptp(target)

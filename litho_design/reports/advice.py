@@ -1,4 +1,4 @@
-"""Advice about a layout before it is printed, for commands and reports."""
+"""Sentences, for commands and reports, that advise the user on a layout before it is printed."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 from litho_data.reports.page import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
-# Readable names of those figures whose keys are unclear. The field descriptions of the scores explain the
-# figures.
+# Readable names of those scores whose keys are unclear. The field descriptions of the score classes explain
+# all scores.
 WORDS: Words = {
     key: (name, "")
     for key, name in {
@@ -26,7 +26,8 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures that summarise a score if it contains them: the key, the text, the number of decimals and a factor.
+# The values that a summary states if a score contains them. Each entry consists of the key, the text, the
+# number of decimals and, where needed, a factor.
 _HEADLINE: tuple[tuple[Any, ...], ...] = (
     ("focusing_efficiency", "{} % in the focus", 1, 100),
     ("strehl", "Strehl {}", 3),
@@ -43,7 +44,8 @@ _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # A warning is given if the thick element loses more than this share of the efficiency. Reflection alone
 # causes a loss of 4.6 %.
 _THICK_SHARE = 0.1
-# Below this share of the training pixels, a model has hardly been trained on the lowest and highest level.
+# If the lowest or the highest level has less than this share of the training pixels, the model has hardly
+# been trained on it.
 _SEEN_SHARE = 0.02
 
 
@@ -83,7 +85,7 @@ def distribution_warning(design: Design) -> str:
 
 
 def width_sentence(design: Design) -> str:
-    """Return sentences about the predictions of all available models of the printer.
+    """Return sentences about how much the predictions of all available models of the printer differ.
 
     The text is empty if there is only the design's own model.
     """
@@ -109,10 +111,10 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
     """Return a sentence about one figure: its value according to the first model, its median over all models,
     and its worst value.
 
-    The sentence also states whether the models differ too much.
+    The sentence also states whether the difference between the models is too large to rely on the value.
 
     Args:
-        less: True if the figure is better when lower.
+        less: True if lower values are better.
         gain: gain of the design over the best uncorrected layout, or None if it is unknown.
     """
     name, unit = _parted(figure)

@@ -172,7 +172,7 @@ def _add_scores(page: Page, design: Design, task: Task) -> None:
 
 
 def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
-    """Add the yield, which is the share of random prints that pass, and the figures of these prints."""
+    """Add the yield, which is the share of random prints that pass, and the scores of these prints."""
     window, errors = task.settings.window, task.errors
     draws = task.window_scores(print_um, window.yield_draws)
     passed = measure_yield(draws, design.predicted, errors)

@@ -94,12 +94,12 @@ def write_gap_report(folder: Path, result: GapResult, pictures: Sequence[Sequenc
 
 
 def _means(result: GapResult, figure: str, judge: str) -> dict[str, GapSummary]:
-    """Return a dict from each arm to the mean and the confidence interval of a figure under one judge."""
+    """Return the mean and the confidence interval of one score according to one judge, keyed by arm."""
     return {one.arm: one for one in result.summary if (one.judge, one.figure) == (judge, figure)}
 
 
 def _verdict(result: GapResult, figure: str) -> str:
-    """Return sentences that name the best arm under each judge.
+    """Return sentences that name the best arm (model to design with) according to each judge.
 
     Judges that are also arms are skipped, unless there are no others.
     """
@@ -140,8 +140,8 @@ def _caption(task: str, figure: str) -> str:
 
 
 def _label(figure: str) -> str:
-    """Return the meaning of a figure. For a figure of your own task, whose meaning is unknown, return its
-    name.
+    """Return the meaning of a score. The meaning of a score of a user-defined task is unknown, so its name is
+    returned.
     """
     return _LABELS.get(figure) or named(figure)
 

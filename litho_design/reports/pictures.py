@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
     from litho_design.lenses.bench import LensBench
 
-# Brightest intensity shown, relative to the target's white; brighter speckle is clipped.
+# Highest intensity that the colour scale shows, relative to the white of the target; brighter speckle is
+# clipped.
 BRIGHTEST = 1.5
 _GREY, _BLUE, _GREEN = "#9aa7b5", "#2f7fd0", "#3a9142"
 # Side, in inches, of a map with axes and a colour bar, and of a map without them.
@@ -55,7 +56,7 @@ def panels_figure(rows: Sequence[Sequence[Panel]]) -> Figure:
 
 
 def progress_figure(history: Sequence[Mapping[str, float]], design: Design) -> Figure:
-    """Draw the loss of the sampled and of the printable layout over the iterations of the search."""
+    """Draw the losses of the sampled layout and of the printable layout over the iterations of the search."""
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     for name, label, colour in (
@@ -108,12 +109,14 @@ def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Fig
 def yield_figure(
     draws: Sequence[Mapping[str, float]], figures: Mapping[str, tuple[float, str]], falling: Sequence[str]
 ) -> Figure:
-    """Draw the share of drawn prints that are at least as good as the value on the axis.
+    """For each score, draw a curve of the share of randomly drawn prints that are at least as good as the
+    value on the horizontal axis.
 
     Args:
-        draws: for each print, a mapping from the name of a figure to its value.
-        figures: for each figure to draw, its value for the print as modelled and its label.
-        falling: names of the figures that are better when lower.
+        draws: scores of each print, keyed by name.
+        figures: mapping from the name of each score to draw to a pair: its value for the print as modelled,
+            and its label.
+        falling: names of the scores that are better when lower.
     """
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)

@@ -87,8 +87,8 @@ def _verdict(result: ScoreResult) -> str:
 
 
 def _spread(result: ScoreResult) -> str:
-    """Return a sentence that compares the figure expected by the design with the values of the judging
-    models.
+    """Return a sentence that compares the value of the main score that the design expected with its values
+    according to the judging models.
 
     The sentence is empty if fewer than two models judge.
     """

@@ -1,4 +1,4 @@
-"""Tables of figures, levels and distances, shared by several reports."""
+"""Tables of scores, levels and distances that several reports use."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from litho_design.tasks.design import Design
 
 
 def meanings(score: type[Record]) -> dict[str, str]:
-    """Return a dict from the name of each figure of a score to its meaning."""
+    """Return the meanings of the fields of a score class, keyed by field name."""
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
 def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Return one row per figure of a score, with the meaning of the figure and its value for each print and
-    baseline.
+    """Return a table with one row per score. Each row contains the meaning of the score, and its value for
+    each print and baseline.
     """
-    # Your own task need not describe its figures.
+    # A user-defined task need not describe its scores.
     names = dict.fromkeys(
         name for figures in columns.values() for name in figures if name in labels or not labels
     )

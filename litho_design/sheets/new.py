@@ -1,4 +1,6 @@
-"""Make a sheet that a lab prints and scans: layouts, witness patterns, and two versions of a hologram."""
+"""Make a sheet that a lab prints and scans. It contains random layouts, witness (test) patterns, and two
+versions of a hologram.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,11 @@ from litho_design.workflows.compare import compare
 from litho_design.workflows.first import small_hologram
 
 TO_PRINTER, PAGE = "to-printer", "sheet.md"
-# Cut-off frequencies of the random layouts, in cycles per µm, used in turn. The layouts of the measured
-# prints have the same cut-off frequencies.
+# Cut-off frequencies of the random layouts, in cycles per µm; successive layouts use them in turn. The
+# layouts of the published measured prints have the same cut-off frequencies.
 _CUTOFFS_PER_UM = (0.25, 0.5)
-# The staircase has few, wide steps, because it covers three fifths of a side and the printer rounds the edges
-# of the steps.
+# Number of steps of the staircase pattern. The pattern covers only three fifths of a side, and the printer
+# rounds the edges of the steps, so few, wide steps are used.
 _TREADS = 10
 _WITNESSES = {
     "substrate": "bare substrate without a print, which shows the zero, tilt and bow of the microscope",
@@ -61,16 +63,17 @@ def new_sheet(
         out: folder of the sheet; an interrupted run in it resumes.
         model: model through which one version of the hologram is designed; the other is designed without a
             model.
-        format: format of the printer's files, as for ``export``.
+        format: format of the files for the printer, as for ``export``.
         target: target image of the hologram.
         settings: settings of both versions of the hologram, by default those of ``small_hologram``. All
-            fields have the size, pitch and levels of the hologram.
+            fields of the sheet have the size, pitch and number of levels of the hologram.
         layouts: number of random layouts from which the printer model is learned.
         seed: seed of these random layouts.
         device, announce: as for ``design_hologram``.
 
     Raises:
-        InputError: ``compare`` or ``export`` refuses an argument, or the fields are too small for the stair.
+        InputError: ``compare`` or ``export`` rejects an argument, or the fields are too small for the
+            staircase.
     """
     made = settings or small_hologram()
     asked = {"model": str(model), "format": format, "layouts": layouts, "seed": seed}
@@ -124,8 +127,8 @@ def new_sheet(
 
 
 def _layouts(geometry: LayoutSettings, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Return the levels of the fields from which a model of the printer is learned, as a dict from field id
-    to levels: first the witness patterns, then the random layouts.
+    """Return the levels of the fields from which a model of the printer is learned, keyed by field id. The
+    witness patterns come first, followed by the random layouts.
     """
     shape = geometry.size_px, geometry.size_px
 

@@ -22,7 +22,8 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Arm, 
 from litho_design.workflows.score import score
 from litho_models import close_loop, evaluate, freeze
 
-# The loop fits this base model. A sheet has too few scans for a model with more parameters.
+# The base model that the correction loop fits to the scans and extends. A sheet has too few scans for a model
+# with more parameters.
 _BASE = "physics"
 
 

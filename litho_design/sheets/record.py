@@ -9,7 +9,8 @@ from litho_data.foundation.run_facts import RunFacts
 from litho_data.store.schema import DatasetId
 
 Arm = Literal["without", "with"]
-# The two designs of the hologram: without a model (for a perfect printer) and with the model.
+# Names of the two designs of the hologram: the one without a model (for a perfect printer), and the one with
+# the model.
 ARMS: tuple[Arm, ...] = ("without", "with")
 HOLOGRAM, SCANS_OF_HOLOGRAMS = "hologram", "hologram-scans"
 
@@ -45,8 +46,10 @@ class ReadSheet(RunFacts, Result):
 
     Attributes:
         model_nm: mean absolute error, on the new prints, of the model used for the design.
-        own_nm: cross-validated mean absolute error of the base model that the loop fitted to the new prints.
-        corrected_nm: the same error of the base model together with the effects that the loop found.
+        own_nm: cross-validated mean absolute error of the base model that the correction loop fitted to the
+            new prints.
+        corrected_nm: cross-validated mean absolute error of the base model together with the effects that the
+            loop found.
         found: names of the effects that the loop added.
         verdict: verdict of the loop.
         measured_db: SI-PSNR of the image of each hologram, computed from its measured print.

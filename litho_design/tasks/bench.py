@@ -1,5 +1,5 @@
-"""Propagate light through a printed element onto a window of the same size in the image plane, for one or
-several sets of optics.
+"""Propagate light through a printed element onto a window in the image plane that has the size of the
+element. This can be done for one or for several sets of optics.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class ElementBench(nn.Module):
-    """Propagate the light of a source through a printed element onto a window of the same size in the image
-    plane.
+    """Propagate the light of a source through a printed element onto a window in the image plane that has the
+    size of the element.
 
     ``propagator`` is the propagator for the middle wavelength of the source.
     """

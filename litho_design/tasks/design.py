@@ -27,8 +27,8 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
-# A lens in rings has one level and one height per pixel along a radius, instead of levels and heights on a
-# plane.
+# File of the levels of a lens that consists of rings. It contains one level per pixel along one radius,
+# instead of the levels on a plane.
 RINGS_FILE = "ring_level.npy"
 RING_HEIGHT_FILE = "ring_height_um.npy"
 # Name of the folder that holds the designs, if a result contains several designs.
@@ -60,9 +60,9 @@ class RunRecord(RunFacts):
 
 
 class Findings(Record):
-    """What a task reports about the levels that it found and their predicted print.
+    """The findings that a task reports about the levels that it found and their predicted print.
 
-    ``thick`` contains the figures of the print computed as a thick element.
+    ``thick`` contains the scores of the print when it is computed as a thick element.
     """
 
     tiling: TilingCheck | None = None

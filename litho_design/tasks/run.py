@@ -24,8 +24,9 @@ from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
 
-# For the estimate of time: the number of layouts whose prints every model predicts (the searched and the
-# uncorrected layout), and the seconds that writing a report takes.
+# Two values for the estimate of the run time: the number of layouts whose prints every model predicts after
+# the search (the layout found by the search and an uncorrected one), and the time in seconds that writing a
+# report takes.
 _CANDIDATES, _PAGE_S = 2, 7.0
 # A function that writes the report into the folder of a design. It takes the folder, the record, the task and
 # the history of the search.
@@ -36,8 +37,8 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
     """Optimise, polish and score the layout of one task, and write the result into the folder ``out``.
 
     If the folder holds an interrupted run of the same task, the run resumes, and its result equals that of an
-    uninterrupted run. A finished design of the same task is returned. The weights of every model in the
-    search are hashed before and after the run. If they changed, no design is written.
+    uninterrupted run. A finished design of the same task is returned. The weights of every model that the
+    search uses are hashed before and after the run. If they changed, no design is written.
 
     Args:
         report: function that writes the report. It is called when the arrays are in the folder, before the
@@ -45,8 +46,8 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, a printer of the search has no gradients (it can
-            only judge), or the weights of a model changed during the run.
+        InputError: ``out`` holds another design or result, a printer of the search provides no gradients
+            (such a printer can only judge), or the weights of a model changed during the run.
     """
     settings, folder = task.settings, Path(out)
     for printer in task.printers:
@@ -77,8 +78,8 @@ def _make(
     report: Report,
     announce: bool,
 ) -> None:
-    """Search for a layout, choose between it and the uncorrected ones, predict its print, score it and write
-    the result.
+    """Search for a layout, choose between this layout and the uncorrected layouts, predict the print of the
+    chosen layout, score it and write the result.
     """
     settings = task.settings
     layout, wave_um = settings.layout, settings.optics.wave_height_um
@@ -138,8 +139,9 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         searched: levels that the search found, on the pixels of the layout, shape (size, size).
 
     Returns:
-        The levels of the chosen layout, and the width of the design. The width is None if there is only one
-        model and only one layout to choose from.
+        The levels of the chosen layout, and the width of the design. The width states how much the
+        predictions of the models differ. It is None if there is only one model and only one layout to choose
+        from.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
     models = {printer.name: printer for printer in (*task.printers, *task.judges)}
@@ -171,8 +173,8 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
 
 
 class _Searched(NamedTuple):
-    """The result of search and polish: the level of each cell, the loss, the state of the search, and its
-    duration.
+    """The result of the search and of the polish that follows it: the level of each cell, the loss, the state
+    of the search, and its duration.
     """
 
     levels: Tensor
@@ -212,8 +214,8 @@ def _searched(task: Task, folder: Path, fingerprint: str, announce: bool) -> _Se
 
 @torch.no_grad()
 def _seconds_after(task: Task, level: Tensor) -> float:
-    """Estimate the seconds that the run takes after the search, to choose a layout and compute scores and
-    yield.
+    """Estimate the time, in seconds, that the run takes after the search. In this time, the layout is chosen,
+    and the scores and the yield are computed.
 
     The estimate is based on one print by each model and one draw of the process window, which are timed.
     """

@@ -36,7 +36,7 @@ from litho_design.tasks.design import (
 
 
 class Figures(Record):
-    """The scores of your own task; each field is one figure."""
+    """The scores of a user-defined task; each field is one score."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -52,17 +52,19 @@ class Task:
         name: unique name of the task in results.
         starts: names of the starts from which the search can begin.
         start_jitter_levels: standard deviation, in levels, of the noise added to a start that is not random.
-        headline: names of the figures that reports and commands show first; all figures if empty.
-        errors: names of the figures that are better when lower.
-        loss_unit: see ``Width``.
-        in_one_piece: True if the element is designed as a whole, not in parts. Single-level changes (the
-            polish) then follow the search, and the run writes a report.
+        headline: names of the scores that reports and commands show first. If it is empty, all scores are
+            shown.
+        errors: names of the scores that are better when lower.
+        loss_unit: factor that converts the loss to the unit of the first headline score, or None (see
+            ``Width``).
+        in_one_piece: True if the element is designed as a whole, not in parts. In this case, the search is
+            followed by the polish, which changes levels by one, and the run writes a report.
         ranks: the processes that share the task.
-        score_type: class of the record of scores. The descriptions of its fields explain the figures in
-            reports.
+        score_type: class of the record of scores. Reports use the descriptions of its fields to explain the
+            scores.
         settings, printer, inputs: the arguments of these names.
         printers: the printer, followed by the models of ``ensemble``.
-        notes: sentences for the record and the report.
+        notes: sentences about the design that are written into the record and the report.
         bench: module that turns a height map into ``seen``, which is the input of ``loss`` and ``figures``.
 
     Args:
@@ -119,7 +121,7 @@ class Task:
     # Methods that your own task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
-        """Return the optics of every image that the task needs.
+        """Return one set of optics for each image that the task needs.
 
         They may differ in wavelength (``optics.at_wavelength``), image plane or angle of incidence.
         """
@@ -173,8 +175,8 @@ class Task:
         return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def over_models(self, losses: Tensor) -> Tensor:
-        """Combine the losses of several models, shape (models,), into one loss. By default, return the
-        maximum.
+        """Combine the losses according to several models into one loss. ``losses`` has shape (models,). By
+        default, return the maximum.
         """
         return losses.max()
 
@@ -226,7 +228,7 @@ class Task:
         return type(self)(settings, nominal, inputs=self.inputs).score(height_um)
 
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
-        """Return the figures of ``seen`` for one draw of the process window."""
+        """Return the scores of ``seen``, the light behind a print, for one draw of the process window."""
         return self.figures(seen)
 
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
@@ -234,7 +236,9 @@ class Task:
         return write_arrays(folder, self.arrays(level, height_um))
 
     def findings(self, folder: Path, level: Tensor, height_um: Tensor) -> Findings:
-        """Return what the record states about the levels and their print; ``folder`` contains the arrays."""
+        """Return the findings about the levels and their print that the record contains. The arrays are
+        already in ``folder``.
+        """
         layout, levels = self.settings.layout, level.cpu().numpy().astype(np.uint8)
         thick = self.thick_score(height_um)
         return Findings(
@@ -264,8 +268,8 @@ class Task:
         return None
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Return a dict from the name of each baseline to its scores on the same grid. By default, the only
-        baseline is a flat plate.
+        """Return the scores of the baselines on the grid of the element, keyed by the name of the baseline.
+        By default, the only baseline is a flat plate.
         """
         flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
         return {"no element": self.score(flat).model_dump()}
@@ -289,8 +293,8 @@ class Task:
     def scenes(self) -> list[tuple[Draw | None, Any]]:
         """Return one pair for each draw of the process window that enters the loss: the draw and its bench.
 
-        If there are no such draws, the only pair has None instead of a draw, which stands for the print as
-        modelled.
+        If the loss uses no draws, the list has one pair, which contains None instead of a draw and stands for
+        the print as modelled.
         """
         window, optics = self.settings.window, self.settings.optics
         drawn = draws(window, optics, window.samples)
@@ -341,15 +345,15 @@ class Task:
 
     @torch.no_grad()
     def printed_um(self, level: Tensor, printer: Printer | None = None) -> Tensor:
-        """Return the printed height, µm, of integer levels of shape (size, size), by default from the first
-        printer.
+        """Return the printed height, µm, of integer levels of shape (size, size). By default, the first
+        printer predicts the print.
         """
         return self.printed(level[None, None].float(), printer or self.printer)
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Score a print of shape (size, size) in ``count`` draws of the process window that no search has
-        used.
+        """Score a print of shape (size, size) after each of ``count`` random changes (draws of the process
+        window) that no search has used.
         """
         settings, scores = self.settings, []
         for draw in draws(settings.window, settings.optics, count, unseen=True):
@@ -371,8 +375,8 @@ class Task:
         return digest.hexdigest()
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss of ``seen``, which is the light behind the print of ``printer``, and the parts of
-        this loss.
+        """Return the loss of ``seen``, which is the light behind the print that ``printer`` predicts, and a
+        dict of the named parts of this loss.
 
         By default, the result is that of ``loss`` and does not depend on ``printer``.
         """
@@ -384,7 +388,7 @@ _TASKS: dict[str, type[Task]] = {}
 
 
 def register_task(task: type[Task]) -> type[Task]:
-    """Register your own task, so that its designs can be opened. The function can also be used as a
+    """Register a user-defined task, so that its designs can be opened. The function can also be used as a
     decorator.
 
     Raises:

@@ -1,5 +1,5 @@
-"""The width of a design: how much the predictions of all models differ, for its layout and for uncorrected
-layouts.
+"""The width of a design, i.e. the difference between the predictions of all models for its layout and for
+uncorrected layouts.
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ _SURE = 2.0
 
 
 class Width(Record):
-    """Figures of a design according to each model. The models of the search come first, followed by the
+    """Scores of a design according to each model. The models that the search used come first, followed by the
     judges, which the search did not use.
 
     Attributes:
         searched_with: number of models that the search used.
-        figures: for each candidate and each model, a dict from the name of a figure to its value; one of the
-            figures is ``loss``. The candidates are the layout found by the search and the uncorrected
-            layouts.
+        figures: for each candidate and each model, the scores, keyed by name; one of these is ``loss``. The
+            candidates are the layout found by the search and the uncorrected layouts.
         returned: name of the candidate with the smallest loss over all models (``Task.over_models``).
-        figure: name of the first headline figure of the task.
-        less: True if this figure is better when lower.
-        loss_unit: factor that converts the loss to the unit of the figure. It is None, unless the loss is an
-            error that includes the model's own error.
+        figure: name of the main score, which is the first headline score of the task.
+        less: True if this score is better when lower.
+        loss_unit: factor that converts the loss to the unit of the main score. It is given only if the loss
+            is an error that includes the expected error of the model's prediction; otherwise, it is None.
         level_heights_um: for each model, the printed height of a wide uniform field of each level.
     """
 
@@ -39,14 +38,17 @@ class Width(Record):
     level_heights_um: dict[str, list[float]]
 
     def values(self, candidate: str | None = None) -> np.ndarray:
-        """Return the figure of a candidate, by default of the returned one, according to every model."""
+        """Return the main score of a candidate according to every model, by default that of the returned
+        candidate.
+        """
         by_model = self.figures[candidate or self.returned].values()
         return np.array([figures[self.figure] for figures in by_model])
 
     @property
     def between(self) -> tuple[float, float]:
-        """Return the range in which the figure of a real print is expected: the range over the models,
-        widened by twice each model's own error (added in quadrature) if that error is known.
+        """Return the range in which the main score of a real print is expected. It is the range over the
+        models. If the expected error of each model's prediction is known, the range is widened by twice these
+        errors, added in quadrature.
         """
         values = self.values()
         if self.loss_unit is None:
@@ -58,8 +60,9 @@ class Width(Record):
 
     @property
     def gain(self) -> float | None:
-        """Return by how much the design's figure is better than that of the best uncorrected layout, as the
-        median over the models. Return None if no uncorrected layout was compared.
+        """Return the gain of the design, i.e. the difference by which its main score is better than that of
+        the best uncorrected layout. The result is the median over the models. Return None if no uncorrected
+        layout was compared.
         """
         sign = -1 if self.less else 1
         idle = [sign * self.values(name) for name in self.figures if name != SEARCHED]
@@ -67,13 +70,15 @@ class Width(Record):
 
     @property
     def disagreement(self) -> float:
-        """Return the difference between the largest and the smallest value of the figure over the models."""
+        """Return the difference between the largest and the smallest value of the main score over the
+        models.
+        """
         return float(np.ptp(self.values()))
 
     @property
     def open_level(self) -> tuple[int, float, float]:
-        """Return the level on whose height the models disagree most, and its lowest and highest predicted
-        height, µm.
+        """Return the level whose printed height the models disagree about most, and the lowest and the
+        highest height that they predict for it, µm.
         """
         heights = np.array(list(self.level_heights_um.values()))
         heights = heights - heights[:, :1]

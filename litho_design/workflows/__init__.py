@@ -1,1 +1,3 @@
-"""Design, score and compare: each function writes one folder with a record and a report."""
+"""Functions that design, score and compare elements. Each of them writes one folder with a record and a
+report.
+"""

@@ -1,5 +1,5 @@
-"""Measure the design-to-manufacturing gap: make a design with every arm, and predict its print with every
-judge.
+"""Measure the design-to-manufacturing gap: make a design with every arm (printer model, or none), and predict
+its print with every judge (model).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def compare(
         out: folder of the comparison.
         judges: further printers, which only judge; given like ``arms``.
         target: target image, for holograms.
-        task, inputs: a task of your own and the arrays that it needs, as for ``design``.
+        task, inputs: a user-defined task and the arrays that it needs, as for ``design``.
         objects, held_out_objects: as for ``design_lens``.
         seeds: seeds of the search. One design is made for each arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
@@ -90,8 +90,8 @@ def compare(
         The record written to ``out/gap.json``.
 
     Raises:
-        InputError: there is no arm or no seed, a judge has the name of an arm, ``out`` holds another kind
-            of result, or ``design_hologram`` or ``design_lens`` refuses an argument.
+        InputError: there is no arm or no seed, a judge has the name of an arm, ``out`` holds another kind of
+            result, or ``design_hologram`` or ``design_lens`` rejects an argument.
     """
     every_seed = list(seeds)
     fit: Any = {"device": device, "extrapolate": extrapolate}

@@ -41,9 +41,9 @@ class How(TypedDict, total=False):
     """Arguments that all design functions share.
 
     Attributes:
-        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of their
-            scores is the width of the design. By default, the judges are the zoo's models that were trained
-            on the same prints as the model of the design.
+        judges: models (MODEL or NAME=MODEL) that predict the print of the finished layout. The range of the
+            scores according to these models is the width of the design. By default, the judges are the zoo's
+            models that were trained on the same prints as the model of the design.
         robust: let the search also use those judges that have gradients. ``Task.over_models`` then combines
             the losses of all models, and a penalty on the disagreement of the models is added.
         device: torch device on which prints and waves are computed.
@@ -171,8 +171,8 @@ def correct(
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction that was printed and measured.
-        scan: measurement of this first print. The next print is expected to deviate from its prediction as
-            the first print did.
+        scan: measurement of this first print. The next print is expected to deviate from its prediction in
+            the same way as the first print did.
         how: see ``How``; ``robust`` is True by default.
 
     Returns:
@@ -227,7 +227,7 @@ def design(
     inputs: Mapping[str, np.ndarray] | None = None,
     **how: Unpack[How],
 ) -> Design:
-    """Optimise the layout for your own task (see ``Task``).
+    """Optimise the layout for a user-defined task (see ``Task``).
 
     Args:
         task: a class registered by ``register_task``.
@@ -268,7 +268,9 @@ def _designed(
     extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """Run the design of the task that ``make`` returns. The printers are checked before a target is read."""
+    """Run the design of the task that ``make`` returns. The printers are checked before ``make`` reads a
+    target.
+    """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, layout, **fit)
     if judges is None:
@@ -282,8 +284,8 @@ def _designed(
 
 
 def _alone(how: How, *objects: Any) -> How:
-    """Check that neither objects, judges nor a robust search are requested for a large element. Return the
-    arguments with an empty list of judges.
+    """Check that no objects, no judges and no robust search are requested for a large element, which supports
+    none of them. Return the arguments with an empty list of judges.
     """
     if how.get("robust") or objects or how.get("judges"):
         got = "objects, judges or a robust search"

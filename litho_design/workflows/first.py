@@ -1,5 +1,5 @@
-"""A first result: a small hologram is designed once without and once with a printer model, and this model
-predicts the prints of both designs.
+"""A first result for new users. A small hologram is designed once without and once with a printer model, and
+this model predicts the prints of both designs.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def first(
     device: Device = "cpu",
     announce: bool = True,
 ) -> GapResult:
-    """Design the same hologram for a perfect printer and through the model PBL, and predict both prints with
-    PBL.
+    """Design the same hologram twice, once for a perfect printer and once through the printer model PBL, and
+    predict both prints with PBL.
 
     Args:
         out: folder of the result. The page ``report.html`` in it shows the target and the images behind both
@@ -56,7 +56,7 @@ def first(
         design used, also judges both designs.
 
     Raises:
-        InputError: ``compare`` refuses an argument.
+        InputError: ``compare`` rejects an argument.
     """
     return compare(
         settings or small_hologram(),
