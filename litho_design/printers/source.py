@@ -15,7 +15,7 @@ from litho_design.printers.printer import Printer, PrinterRecord
 
 Device = str | torch.device
 # The models of the zoo (the models shipped with the package) that judge designs, one of each kind. Ridge
-# regressions are left out, because they were trained on smooth layouts and extrapolate badly to others.
+# regressions are left out, because they extrapolate badly from the smooth training layouts to other layouts.
 JUDGES = ("physics", "pbl", "fno")
 
 

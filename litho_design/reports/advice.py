@@ -108,10 +108,10 @@ def width_sentence(design: Design) -> str:
 
 
 def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain: float | None) -> str:
-    """Return a sentence about one figure: its value according to the first model, its median over all models,
+    """Return a sentence about one score: its value according to the first model, its median over all models,
     and its worst value.
 
-    The sentence also states whether the difference between the models is too large to rely on the value.
+    If the models disagree by more than ``gain``, a second sentence says so.
 
     Args:
         less: True if lower values are better.

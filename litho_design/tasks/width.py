@@ -46,9 +46,9 @@ class Width(Record):
 
     @property
     def between(self) -> tuple[float, float]:
-        """Return the range in which the main score of a real print is expected. It is the range over the
-        models. If the expected error of each model's prediction is known, the range is widened by twice these
-        errors, added in quadrature.
+        """Return the range in which the main score of a real print is expected. It is the range of the values
+        according to all models. If the expected errors of the models' predictions are known, each value is
+        first extended on both sides by twice the error of its model, in quadrature.
         """
         values = self.values()
         if self.loss_unit is None:
