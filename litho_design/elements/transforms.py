@@ -25,7 +25,8 @@ def printed_anyhow(run: Print, level: Tensor) -> Tensor:
     try:
         return run(level)
     except RuntimeError:
-        # The model defines its own gradient or reads the values of tensors; torch.func allows neither.
+        # The model defines a custom gradient in a form that torch.func cannot transform, or it reads the
+        # values of tensors, which torch.func does not allow.
         printed: Tensor = _Printed.apply(level, run)
         return printed
 

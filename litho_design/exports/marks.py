@@ -48,7 +48,7 @@ def with_marks(
     """Add an F and a square of the highest level to the right of a level map of shape (size, size).
 
     The F, the square and the element are separated by at least the reach of the printer, so none of them
-    changes the print of another. The element and both marks consist of whole cells.
+    changes the print of another. The element, the F and the square consist of whole cells.
 
     Args:
         guard_um: reach of the printer, µm, i.e. the distance up to which a level affects the print.

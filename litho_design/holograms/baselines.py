@@ -29,11 +29,12 @@ def hologram_baselines(
     """Return the scores of a black image and of ideal elements in the optics of ``bench``, keyed by the name
     of the baseline.
 
-    ``diffraction-limited`` is an element with free amplitude and phase whose image has a flat phase, found by
-    forty Gerchberg-Saxton steps. ``continuous phase`` has one arbitrary phase per cell and needs neither a
-    printer nor levels. The search for these phases starts from the result of the Gerchberg-Saxton algorithm
-    and takes a hundred descent steps on the loss of the design. The loss after these steps is one of the
-    scores. ``weighted GS`` also has one phase per cell, found by forty weighted Gerchberg-Saxton steps.
+    ``diffraction-limited`` is an element whose amplitude and phase may take any values on each pixel. It is
+    found by forty Gerchberg-Saxton steps, and its image has a flat phase. ``continuous phase`` has one
+    arbitrary phase per cell and needs neither a printer nor levels. The search for these phases starts from
+    the result of the Gerchberg-Saxton algorithm and takes a hundred descent steps on the loss of the design.
+    The loss after these steps is one of the scores. ``weighted GS`` also has one phase per cell, found by
+    forty weighted Gerchberg-Saxton steps.
     """
     wave_um = settings.optics.wave_height_um
     counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)

@@ -38,8 +38,8 @@ _NEEDED = 0.93
 # A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
 # probability of 0.1 % (two degrees of freedom).
 _TILT_SURE = 13.8 * HIDDEN**2
-# Images of prints by different models of the same printer differ in size by this standard deviation, so the
-# scale of a photograph cannot be determined more accurately from its image.
+# The images of the prints that different models of the same printer predict differ in size by this standard
+# deviation, so the scale of a photograph cannot be determined more accurately from its image.
 _PRINT_SCALE_SD = 0.01
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
@@ -201,10 +201,10 @@ def photographed_image(
     """Register a photograph to the image that the design expects.
 
     The dark level is subtracted, and single hot or dead pixels are replaced by the median of their
-    neighbours. Then a model of the camera is fitted to the expected image by least squares. The model camera
-    may be shifted, rotated and, if needed, tilted, and its gain and background are free. The scale is free
-    only if the pitch has an uncertainty. If the scale were always free, a print that makes the image too
-    large would be mistaken for a camera with a different scale. All eight orientations are tried. A
+    neighbours. Then a model of the camera is fitted to the expected image by least squares. The position,
+    rotation, gain and background of the model camera are fitted, and its tilt is fitted if needed. The scale
+    is fitted only if the pitch has an uncertainty. If the scale were always fitted, a print that makes the
+    image too large would be mistaken for a camera with a different scale. All eight orientations are tried. A
     photograph that fits another orientation better than ``orientation`` is rejected.
 
     Args:
@@ -387,7 +387,7 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
     median = cv2.medianBlur(lit.astype(np.float32), 3)
     difference = lit - median
     spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
-    # The median image is used, so that no hot pixel decides what is bright.
+    # The brightest value is taken from the median-filtered image, so that a hot pixel cannot determine it.
     bright = float(median.max())
     outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
     return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())

@@ -71,8 +71,8 @@ def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float
 
 
 def similarity(estimate: Tensor, wanted: Tensor, name: str) -> dict[str, float]:
-    """Compare an estimate with the true object, which has values in [0, 1] (both have shape (n, n)), and
-    return ``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME``.
+    """Compare an estimate with the true object ``wanted``, which has values in [0, 1], and return the scores
+    ``mae_NAME``, ``psnr_NAME_db`` and ``ssim_NAME``, where NAME is ``name``. Both images have shape (n, n).
 
     For PSNR and SSIM, the estimate is clipped to [0, 1].
     """

@@ -89,7 +89,7 @@ def design_folder(out: Path, arm: str, seed: int) -> Path:
 
 
 def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
-    """Return the mean, confidence interval and gap of every figure for every arm and judge."""
+    """Return the mean, the confidence interval and the gap of every score, for every arm and judge."""
     summary = []
     for (arm, judge), group in _grouped(entries).items():
         for figure in group[0].judged:

@@ -67,8 +67,8 @@ class MeasuredRecord(Record):
     tip_change_um: float
 
     def remarks(self) -> list[str]:
-        """Return remarks on what was removed from the scan and how it was rotated or flipped, one phrase
-        each.
+        """Return remarks on the tilt and other effects that were removed from the scan, and on its
+        orientation, one phrase each.
         """
         found = [] if not self.warning else [self.warning]
         found += ["the scan was used without registration"] if self.aligned else []

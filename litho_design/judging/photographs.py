@@ -32,7 +32,7 @@ _BLUR_SD = 0.3
 
 
 class PhotoScore(Record):
-    """The figures of a photographed image. Efficiencies are included only if the incident power is known."""
+    """The scores of a photographed image. Efficiencies are included only if the incident power is known."""
 
     si_psnr_db: float
     ssim: float

@@ -1,6 +1,7 @@
 """Design a lens of any size ring by ring: only a strip along one radius is printed and propagated.
 
-The plane is never computed, because an element of 10 mm has 10¹⁰ pixels but only 50,000 rings of 0.1 µm.
+Light and print are never computed on the whole plane, because an element that is 10 mm wide has 10¹⁰ pixels
+but only 50,000 rings of 0.1 µm.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from litho_design.tasks.task import Task
 
 
 class RadiusMap(CellMap):
-    """Spread one value per free ring, shape (..., rings), over the pixels along one radius, shape
-    (..., pixels). ``CellMap`` does the same for a plane.
+    """Spread the values of the rings, one per ring, over the pixels along one radius. The values have shape
+    (..., rings), and the result has shape (..., pixels). ``CellMap`` does the same for cells on a plane.
     """
 
     area: Tensor

@@ -1,3 +1,3 @@
-"""Search for a layout: free parameters, starting layouts, polish, and losses over a process window or over
-several models.
+"""Parts of the search for a layout: the free parameters, the starting layouts, the search loop, the polish,
+and losses over a process window or over several models.
 """

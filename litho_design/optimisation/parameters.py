@@ -1,5 +1,5 @@
-"""The free parameters of a layout of cells or rings: Gumbel-Softmax distributions over levels, or one real
-level per cell, which is rounded.
+"""The free parameters of a layout of cells or rings. They are either Gumbel-Softmax distributions over
+levels, or one real-valued level per cell, which is rounded for the print.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
-    """Spread one value per free cell over the pixels of the layout, and average pixels back to cells.
+    """Spread one value per cell over the pixels of the layout, and average pixel values over cells.
 
     If ``rows`` is given, the map covers only these rows of pixels, and the method ``own`` selects the cells
     in these rows from the cells of the whole layout. In the docstrings below, *cells stands for the shape of

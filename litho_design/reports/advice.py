@@ -44,13 +44,13 @@ _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # A warning is given if the thick element loses more than this share of the efficiency. Reflection alone
 # causes a loss of 4.6 %.
 _THICK_SHARE = 0.1
-# If the lowest or the highest level has less than this share of the training pixels, the model has hardly
-# been trained on it.
+# If the lowest and the highest level together make up less than this share of the training pixels, the model
+# has hardly been trained on them.
 _SEEN_SHARE = 0.02
 
 
 def named(figure: str) -> str:
-    """Return the readable name of a figure of a score."""
+    """Return the readable name of a score, given its key."""
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
@@ -87,7 +87,7 @@ def distribution_warning(design: Design) -> str:
 def width_sentence(design: Design) -> str:
     """Return sentences about how much the predictions of all available models of the printer differ.
 
-    The text is empty if there is only the design's own model.
+    The text is empty if the model of the design is the only available model.
     """
     width = design.width
     if width is None or len(width.level_heights_um) == 1:
@@ -132,16 +132,16 @@ def spread_sentence(figure: str, by_model: Mapping[str, float], less: bool, gain
 
 
 def _parted(figure: str) -> tuple[str, str]:
-    """Return the name of a figure, and its unit with a leading space; the unit is empty if the figure has
-    none.
+    """Return the readable name of a score, and its unit with a leading space. The unit is empty if the score
+    has none.
     """
     name, _, unit = named(figure).partition(" (")
     return name, f" {unit.rstrip(')')}" if unit else ""
 
 
 def thickness_warning(design: Design) -> str:
-    """Return a warning if the print performs clearly worse as a thick element; otherwise, return an empty
-    text.
+    """Return a warning if the computed efficiency of the print is clearly lower when it is treated as a thick
+    element; otherwise, return an empty text.
     """
     name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
     if design.thick is None or name is None:
@@ -157,8 +157,8 @@ def thickness_warning(design: Design) -> str:
 
 
 def stroke_advice(design: Design) -> str:
-    """Return sentences about the stroke of the printed levels, and about the levels or heights that a full
-    wave needs.
+    """Return sentences about the stroke (height range) of the printed levels, and about the number of levels
+    or the level height at which the stroke becomes one wave.
     """
     stroke, gauge = design.stroke, design.out_of_distribution
     text = (
@@ -197,5 +197,5 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
 
 
 def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
-    """Return one line with the headline figures of the baselines."""
+    """Return one line with the main scores of the baselines."""
     return f"for comparison: {'; '.join(f'{name} {headline(one)}' for name, one in baselines.items())}"

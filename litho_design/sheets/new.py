@@ -56,8 +56,8 @@ def new_sheet(
     device: Device = "cpu",
     announce: bool = True,
 ) -> Sheet:
-    """Write a sheet into ``out``: files for the printer, a dataset card, and a page that tells the lab what
-    to do.
+    """Write a sheet into ``out``: files for the printer, a dataset card, and a page of instructions for the
+    lab.
 
     Args:
         out: folder of the sheet; an interrupted run in it resumes.

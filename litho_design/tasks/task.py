@@ -1,4 +1,4 @@
-"""The interface of a task. A task states what the light behind a printed element should do."""
+"""The interface of a task. A task defines the goal for the light behind a printed element."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Figures(Record):
 class Task:
     """A goal for the light behind a printed element. Layouts can be optimised for it and scored against it.
 
-    For your own task, define ``name``, ``loss``, ``figures`` and, if one image is not enough, ``views``. Then
-    pass the class to ``register_task``. Search, checkpoints, polish, process window, comparison, report and
-    export work without changes.
+    To define a task of your own, write a subclass that defines ``name``, ``loss``, ``figures`` and, if one
+    image is not enough, ``views``. Then pass the class to ``register_task``. Search, checkpoints, polish,
+    process window, comparison, report and export work without changes.
 
     Attributes:
         name: unique name of the task in results.
@@ -118,7 +118,7 @@ class Task:
         for optics in self.views(settings.optics):
             check_draws(settings.window, optics, self.bench.grid, self.bench.window)
 
-    # Methods that your own task defines.
+    # Methods that a user-defined task defines.
 
     def views(self, optics: Optics) -> Sequence[Optics]:
         """Return one set of optics for each image that the task needs.
@@ -145,7 +145,7 @@ class Task:
     # Methods that holograms and lenses override.
 
     def make_cells(self) -> CellMap:
-        """Return the map that spreads one value per free cell over the pixels on which the search works."""
+        """Return the map that spreads one value per cell over the pixels on which the search works."""
         return CellMap(self.settings.layout)
 
     def make_bench(self, optics: Optics) -> Any:

@@ -14,8 +14,8 @@ from litho_design.judging.gap import GapResult
 from litho_design.printers.source import Device
 from litho_design.workflows.compare import compare
 
-# Names of three printers: nominal heights for the first design, the model of the second design, and a model
-# that only judges.
+# Names of three printers: nominal heights, for which the first design is made; the model for which the second
+# design is made; and a model that only predicts the prints of both designs.
 WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
 
 
@@ -52,8 +52,8 @@ def first(
         device, announce: as for ``design_hologram``.
 
     Returns:
-        The record written to ``out/gap.json``, as returned by ``compare``. The model Physics, which neither
-        design used, also judges both designs.
+        The record written to ``out/gap.json``, as returned by ``compare``. The model Physics, which was used
+        for neither design, also predicts the prints of both designs.
 
     Raises:
         InputError: ``compare`` rejects an argument.
