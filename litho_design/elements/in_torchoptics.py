@@ -27,7 +27,7 @@ class PrintedElement(PolychromaticModulationElement):
         self.element, self.unit_um = element, unit_um
 
     def modulation_profile(self, wavelength: Any = None) -> Tensor:
-        """Return the complex transmission, shape (size, size), at a wavelength that is given in the unit of
-        length used in torchoptics.
+        """Return the complex transmission of the element at a wavelength, which is given in the unit of
+        length used in torchoptics. The result has shape (size, size).
         """
         return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

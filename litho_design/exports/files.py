@@ -48,8 +48,8 @@ _SUFFIX: dict[str, str] = {
 }  # fmt: skip
 _GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
-# Largest number of pixels of a layout for the formats that are written in one piece, not band by band. For
-# more pixels, these formats would need about 3 GiB of memory (images) or more (solids).
+# Largest number of pixels of a layout for the formats that are written in one piece, not band by band. With
+# more pixels, writing an image would need more than about 3 GiB of memory, and writing a solid even more.
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
@@ -102,9 +102,9 @@ def export(
         Path of the exported file.
 
     Raises:
-        InputError: the design is incomplete, the format cannot represent it or would need too much memory, or
-            the settings of the print job do not suit the layout. The error is also raised if the element is
-            too small for marks, or ``out`` contains other files.
+        InputError: the design is incomplete, the format cannot represent the layout or would need too much
+            memory, or the settings of the print job do not suit the layout. The error is also raised if the
+            element is too small for marks, or ``out`` contains other files.
     """
     require_known("format", format, _SUFFIX)
     made = changed(PrintJob(), job)

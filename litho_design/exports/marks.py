@@ -27,8 +27,8 @@ class Marks(Record):
     """Positions of the element, the orientation mark and the witness area in an exported map. Each position
     is a box in pixels (first row, end row, first column, end column), where the ends are exclusive.
 
-    ``witness_height_um`` is the height above the ground that the design's model predicts for the middle of
-    the witness area.
+    ``witness_height_um`` is the height above its surroundings that the model of the design predicts for the
+    middle of the witness area.
     """
 
     element_px: Box

@@ -51,11 +51,12 @@ class RingRows:
 
 
 def layout_rows(folder: str | Path) -> LevelRows:
-    """Open the layout of a design folder and check it against the hash in its record; the array stays on
-    disk.
+    """Open the levels in a design folder without loading them into memory, and check their file against the
+    hash in the record of the design.
 
     Raises:
-        InputError: there is no design, or its levels changed after it was written.
+        InputError: the folder contains no design, or the file of the levels changed after the design was
+            written.
     """
     if Design.read(folder).in_rings:
         return RingRows(read_array(folder, RINGS_FILE))

@@ -121,7 +121,8 @@ def _walls(cells: np.ndarray, around: np.ndarray, aside: np.ndarray) -> np.ndarr
     south, north = cells[row, column + 1], cells[row + 1, column + 1]
     low, high = np.minimum(south, north), np.maximum(south, north)
     ends = []
-    # These are the directions of the higher cell, seen from the western and the eastern end of a wall.
+    # For each end of a wall (west, east), ``place`` is the direction in which the higher of the two cells
+    # lies.
     for point, place in (
         (np.stack([row, column], 1), np.where(north > south, 3, 1)),
         (np.stack([row, column + 1], 1), np.where(north > south, 2, 0)),

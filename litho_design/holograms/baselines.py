@@ -84,8 +84,8 @@ def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) 
 
 @torch.no_grad()
 def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
-    """Return the wave of unit power, shape (size, size), whose image comes closest to the amplitude
-    sqrt(target) with a flat phase.
+    """Return the wave of unit power whose image comes closest to an image with the amplitude sqrt(target) and
+    a flat phase. The wave has shape (size, size).
     """
     wanted = target.sqrt()
     area = math.prod(bench.grid.pitch_um)
@@ -101,8 +101,8 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
-    """Search for the phases of the cells that have the lowest loss. Return these phases, in radians, and the
-    loss.
+    """Search for the phases of the cells for which the loss of the design is lowest. Return these phases, in
+    radians, and their loss.
     """
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,

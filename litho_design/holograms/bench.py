@@ -124,15 +124,15 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
         aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
-        # Row i of a matrix contains the weights with which all pixels enter pixel i, so two matrix products
-        # replace long convolutions.
+        # Each blur is a matrix whose row i contains the weights of all pixels in the blurred pixel i. Two
+        # matrix products, one per axis, replace long convolutions.
         blurs.append((focus / focus.sum()).unfold(0, count, 1).flip(1))
     return blurs[0] @ target @ blurs[1].T
 
 
 def zero_order_share(element: Tensor) -> float:
-    """Return the share of the power behind the element that is in the undiffracted plane wave. The amplitude
-    of this wave is the mean of the field.
+    """Return the share of the power behind the element that the undiffracted plane wave carries. The
+    amplitude of this plane wave is the mean of the field behind the element.
     """
     power = element.abs().square().double().mean()
     return float(element.to(torch.complex128).mean().abs().square() / power)

@@ -55,12 +55,13 @@ def hologram_settings(
     """Return a preset for a hologram, changed by ``changes``, such as ``{"layout.size_px": 256}``.
 
     ``paper`` has the settings that the paper states: 13 levels, Gumbel-Softmax at temperature 0.5, a random
-    start, 1000 Adam iterations at a rate of 0.1, and expected levels. ``authors`` has the settings of the
-    published code: 12 levels, temperature 1, wavelength 0.633 and index step 0.545. After more than ten
-    iterations without progress, the rate is reduced to a tenth. The efficiency term in the code is constant,
-    so it is omitted here. docs/from_the_authors_code.md lists the parts of that code that are not reproduced.
-    ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes the
-    printable layout.
+    start, 1000 Adam iterations at a learning rate of 0.1, and samples that are the mean level of each cell,
+    weighted with the sampled probabilities. ``authors`` has the settings of the published code: 12 levels,
+    temperature 1, a wavelength of 0.633 µm and a refractive index step of 0.545. After more than ten
+    iterations without progress, the learning rate is reduced to a tenth. The efficiency term in the code is
+    constant, so it is omitted here. docs/from_the_authors_code.md lists the parts of that code that are not
+    reproduced. ``default`` searches for one height per cell from a Gerchberg-Saxton start, and then polishes
+    the printable layout.
 
     Args:
         variant: name of the preset. A ``variant`` among the changes overrides it.

@@ -119,8 +119,8 @@ class HologramTask(Task):
         return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
-        """Return the signal efficiency of the continuous phase that puts the most power on the signal. The
-        search for this phase starts from the print.
+        """Return the signal efficiency of an ideal element, whose continuous phase sends the most power to
+        the signal. The search for this phase starts from the print.
         """
         return best_signal_efficiency(self.bench, height_um, self.target)
 

@@ -152,7 +152,8 @@ class Photograph:
         """Convert the counts in ``image`` to shares of the light that is incident on the element.
         ``power_counts`` is the sum of the counts that all of this light would give.
         """
-        # The factor is the number of photograph pixels per window pixel, in the middle of the window.
+        # The counts per camera pixel are multiplied by the number of camera pixels per window pixel, computed
+        # in the middle of the window.
         warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
@@ -336,10 +337,11 @@ def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float
 def _check_orientation(
     photo: np.ndarray, wanted: np.ndarray, scale: float, pitch_sd: float, asked: str, photo_file: str | Path
 ) -> list[str]:
-    """Return the other orientations that fit as well as the requested one.
+    """Return the names of the other orientations in which the photograph fits the expected image as well as
+    in the requested orientation.
 
     Raises:
-        InputError: another orientation fits better, or none fits.
+        InputError: the photograph fits better in another orientation, or it fits in no orientation.
     """
     import cv2
 

@@ -16,8 +16,8 @@ from litho_data.foundation.results import Record
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
-# Number of rows drawn at a time, because a large picture in double precision needs more memory than its
-# design.
+# Number of rows that are drawn at a time. A large picture that is drawn at once in double precision would
+# need more memory than the search for its design.
 _ROWS = 256
 
 
@@ -147,7 +147,7 @@ def _ring(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Draw bars of four widths, along and across, and a spoke target."""
+    """Draw bars of four widths in two directions, and a spoke target."""
     picture = np.zeros_like(x)
     for index, width in enumerate((0.032, 0.024, 0.016, 0.01)):
         top = -0.36 + 0.19 * index

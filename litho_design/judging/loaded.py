@@ -82,7 +82,9 @@ class LoadedDesign:
         self.target: Tensor | None = getattr(self.task, "target", None) if whole else None
 
     def _task(self, band_px: int | None) -> Task:
-        """Return the task of the design. The task only scores, so it needs a device but no model."""
+        """Return the task of the design. The task is used only to compute scores, so it needs a device but no
+        printer model.
+        """
         record, kind = self.record, registered_task(self.record.task)
         nominal = Printer(None, record.layout, source="none").to(self.device)
         made: Any = kind.settings_type.model_validate(record.settings)
@@ -125,8 +127,8 @@ class LoadedDesign:
         return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """Return an image scaled to match its target, for reports. A PSF is shown as the square root of PSF /
-        peak.
+        """Return an image scaled to match its target, for reports. A PSF is divided by its peak, and the
+        square root is shown.
         """
         return self.task.display(image)
 

@@ -172,8 +172,8 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
 
 
 def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
-    """Remove from a scan the widening that the tip caused. Return the scan, the radius of the tip, µm, and
-    the rms change of the heights, µm.
+    """Remove from a scan the widening of structures that the AFM tip caused. Return the corrected scan, the
+    radius of the tip, µm, and the rms change of the heights, µm.
     """
     from litho_data.tip import estimate_tip, paraboloid_erosion
 
@@ -198,7 +198,8 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
 
     from litho_data.level.scars import mark_scars
 
-    # A step displaced by a pixel deviates up on one side and down on the other, so a blur removes it.
+    # If a step of the print is displaced by a pixel, the deviation is positive in one place and negative next
+    # to it, so a blur removes it.
     smooth = gaussian_filter(off_um, _DUST_BLUR_PX)
     middle = np.median(smooth)
     spread = 1.4826 * float(np.median(np.abs(smooth - middle)))

@@ -25,7 +25,8 @@ from litho_design.lenses.objects import read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur, richardson_lucy
 
-# A score with a larger standard deviation (dB) cannot decide between designs.
+# Largest accepted standard deviation of the SI-PSNR, in dB. A score that is less certain cannot decide
+# between designs.
 _LARGEST_SD_DB = 0.5
 # Standard deviation of the change of a score that a blur of the camera causes, as a share of this change.
 _BLUR_SD = 0.3
@@ -128,7 +129,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
 def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
-    # Rays from two opposite sides of the element form the finest fringes.
+    # The finest fringes in the image are formed by rays from two opposite sides of the element.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
     return photographed_image(wanted, pitch_um, source, finest_per_um)
 

@@ -36,7 +36,8 @@ _LEFT_OUT = (
     "that need the whole image at once"
 )
 _PREVIEW_PX = 1024
-# Settings of the light, the search and the hologram, each with the only value that a large element supports.
+# Settings of the light, of the search and of the hologram that are restricted for a large element. Each is
+# mapped to the only value that is supported.
 LIGHT: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
@@ -142,8 +143,8 @@ class BandedHologram(HologramTask):
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
-        """Write the arrays, to which all processes contribute. Only the first process returns the hashes; the
-        others return an empty dict.
+        """Write the arrays of the design, to which all processes contribute their rows. The first process
+        returns the SHA-256 hashes, keyed by file name; the others return an empty dict.
         """
         arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: self.bench(height_um)}
         return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)

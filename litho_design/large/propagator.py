@@ -126,8 +126,8 @@ class BandedPropagator:
         """
         pitch, size = self.source.pitch_um[0], self.bands.size_px
         check_distance(optics.distance_um, self.source, self.target, optics.wavelength_um)
-        # Distances between source and target in pixels, in the order that an FFT needs. Unused entries repeat
-        # the largest distance.
+        # Separations between source and target pixels, in pixels, in the order that an FFT needs. Unused
+        # entries repeat the largest separation.
         index = torch.arange(self.length)
         wrapped = torch.minimum(index, self.length - index).clamp(max=size - 1)
         away_um, below_um = wrapped.double() * pitch, torch.arange(size).double() * pitch

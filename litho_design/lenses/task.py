@@ -167,7 +167,7 @@ class LensTask(Task):
         """Predict the print of a strip along one radius, and return the heights, µm, of the rings inside the
         aperture. The result has shape (rings,).
 
-        Beyond the aperture, the strip has the levels that the layout has in its corners.
+        Beyond the aperture, the levels of the strip are those that the layout has in its corners.
         """
         rings, halo = self.cells.average(level[0, 0]), printer.strip_halo_px
         strip = rings[strip_rings(self.settings.layout, halo, len(rings))][None, None]

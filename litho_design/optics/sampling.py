@@ -1,4 +1,6 @@
-"""Make centred grids, and find the distances at which a sampled propagation kernel is valid."""
+"""Make grids centred on a given position, and find the distances at which a sampled propagation kernel is
+valid.
+"""
 
 from __future__ import annotations
 

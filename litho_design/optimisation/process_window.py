@@ -38,9 +38,9 @@ class ProcessWindow(Record):
     ``gain_sd`` is relative to the printed height, and ``blur_sd_um`` is the scale of a half-normal extra
     blur. If ``samples`` is above 0, a search uses this number of draws, which are the same in every
     iteration. The search minimises the mean loss over the worst draws; ``tail`` is the share of all draws
-    that count as the worst. The defaults are guesses; replace them with the spreads of your printer. In one
-    measured data set, the gain varies by 13 % between fields; this value includes the changing scale of the
-    microscope.
+    that count as the worst. The default spreads are guesses; replace them with those of your printer. In one
+    measured data set, the gain varies by 13 % between write fields, but part of this variation comes from the
+    changing scale of the microscope.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset(
@@ -73,7 +73,9 @@ class ProcessWindow(Record):
 
 
 def spreads(window: ProcessWindow) -> list[str]:
-    """Return every spread of a window with its value and unit, for reports."""
+    """Return a list of texts for reports, each of which states one spread of the window with its value and
+    unit.
+    """
     return [
         f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip()
         for leaf in leaves(window)
@@ -94,8 +96,9 @@ class Draw:
         """Return the height, µm, of a print that is changed by this draw. The print is a map of shape
         (size, size), or rings of shape (n,) that begin at the centre.
 
-        A uniform offset changes the scores of heights, but no image. Rings are blurred only along the radius.
-        This is accurate for rings that are far from the centre or much wider than the blur.
+        A uniform offset of the height changes scores that compare heights, but it changes no image. Rings are
+        blurred only along the radius. This is accurate for rings that are far from the centre or much wider
+        than the blur.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um

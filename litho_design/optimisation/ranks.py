@@ -85,7 +85,9 @@ class Ranks:
         return total
 
     def any(self, value: bool) -> bool:
-        """Wait for all processes, and return True if ``value`` is true in any of them."""
+        """Wait until all processes have called this method, and return True if ``value`` is True in any of
+        them.
+        """
         return bool(self.total(torch.tensor([float(value)])) > 0)
 
     def wait(self) -> None:

@@ -76,8 +76,8 @@ class SearchSettings(Record):
         return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
 
 
-# The settings of the search in the paper, without the learning rate, which differs between holograms and
-# lenses.
+# The settings of the search that the paper uses for both holograms and lenses. The learning rate is missing,
+# because it differs between the two.
 PAPER_SEARCH = SearchSettings(
     parametrisation="gumbel",
     start="random",
@@ -120,7 +120,7 @@ class Fabrication(Record):
 
 
 class DesignSettings(Record):
-    """The settings that the designs of all tasks have."""
+    """The settings that are common to the designs of all tasks."""
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"camera"})
 

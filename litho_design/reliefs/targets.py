@@ -48,7 +48,7 @@ def load_relief(
 
 
 def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return the deviation of a print from the expected print, blurred and with its mean removed.
+    """Return the deviation of a print from the expected print, after blurring it and subtracting its mean.
 
     The deviation is a float32 array of shape (size, size), in µm.
 

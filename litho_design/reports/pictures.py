@@ -77,7 +77,9 @@ def decibels(psf: np.ndarray) -> np.ndarray:
 
 
 def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Figure:
-    """Draw the central row of the print, the PSF and the MTF, and the same curves of a perfect lens."""
+    """Draw the central rows of the print, of the PSF and of the MTF, and the same curves for a perfect
+    lens.
+    """
     import torch
 
     from litho_design.lenses.score import mtf

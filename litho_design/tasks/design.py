@@ -31,7 +31,7 @@ TARGET_FILE = "target.npy"
 # instead of the levels on a plane.
 RINGS_FILE = "ring_level.npy"
 RING_HEIGHT_FILE = "ring_height_um.npy"
-# Name of the folder that holds the designs, if a result contains several designs.
+# Name of the subfolder for the designs in the folder of a result that contains several designs.
 DESIGNS = "designs"
 
 
@@ -136,7 +136,7 @@ def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.nd
     With ``on_disk``, the file is memory-mapped instead of read completely.
 
     Raises:
-        InputError: there is no such file, or the file changed after the design.
+        InputError: there is no such file, or the file was changed after the design was written.
     """
     path = Path(folder) / name
     wanted = Design.read(folder).files.get(name)

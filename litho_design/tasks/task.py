@@ -109,7 +109,8 @@ class Task:
         self.inputs = dict(inputs or {})
         self.target_record = record
         self.notes: list[str] = []
-        # Further models of the printer, which judge the design but are not used by the search.
+        # Further models of the printer that predict the print of the finished design but are not used by the
+        # search.
         self.judges: Sequence[Printer] = ()
         for one in self.printers:
             self.check_printer(one)
@@ -319,8 +320,8 @@ class Task:
         loss.
 
         For each draw of the process window, ``over_models`` combines the losses of all models. ``risk`` then
-        combines the losses of all draws. Two penalties are added: on the disagreement of the models, and on
-        levels and steps that are rare in the training layouts.
+        combines the losses of all draws. Two penalties are added: one on the disagreement of the models, and
+        one on levels and steps that are rare in the training layouts.
         """
         settings, prints = self.settings, [self.search_print(level, one) for one in self.printers]
         losses: list[Tensor] = []
