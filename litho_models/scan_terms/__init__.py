@@ -1,5 +1,5 @@
-"""The terms that a scan adds to the height of the print, such as datum and tilt. They are fitted to pixels
-that are not scored, and are then subtracted from the pixels that are scored.
+"""The terms that a scan adds to the height of the print, such as datum and tilt. These terms are fitted to
+pixels that are not scored, and are then subtracted from the pixels that are scored.
 """
 
 from litho_models.scan_terms.blocks import Blocks

@@ -1,4 +1,4 @@
-"""The smooth background that all scans of one microscope share.
+"""The smooth background that appears in all scans of one microscope.
 
 For example, levelling with planes leaves a bow in every scan. The part of the bow that is the same in every
 scan is learned from the training scans and added to predictions of *measured* maps. This background is not
@@ -25,8 +25,8 @@ _SAME_SIZE = 0.01
 
 
 class Background(Record):
-    """The coefficients of a background with the terms x, y, x², xy and y², in nm, averaged over the training
-    scans. ``scans`` is the number of training scans.
+    """The coefficients, in nm, of a background with the terms x, y, x², xy and y². They are averaged over the
+    training scans, and ``scans`` is the number of these scans.
 
     x and y run from -1 to 1 over a field whose size (y, x) is ``field_um``. Each term has zero mean, so a
     background does not change the datum.
@@ -70,7 +70,8 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
 
     Args:
         scans: training scans, all of the same size.
-        predictions_um: height that the model predicts for each scan, as a map of shape (ny, nx).
+        predictions_um: height that the model predicts for each scan, µm, as a map of shape (ny, nx). The maps
+            are in the order of ``scans``.
     """
     coefficients = [
         fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]

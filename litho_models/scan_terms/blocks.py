@@ -1,9 +1,10 @@
 """Divide the pixels of a scan into pixels to which terms are fitted and pixels that are scored.
 
 Terms fitted to the scored pixels would make a model look better than it is. Smooth terms are therefore fitted
-to one half of a checkerboard and subtracted from the other half. The offset of a line is estimated from few
-pixels, and the roughness of neighbouring pixels is correlated. (Along x, the correlation is still 0.2 at a
-distance of 32 px.) Line offsets are therefore fitted on the other side of the scan, beyond a gap.
+to one half of a checkerboard and subtracted from the other half. The offset of a line needs more separation,
+because it is estimated from few pixels, and because the roughness of neighbouring pixels is correlated.
+(Along x, the correlation is still 0.2 at a distance of 32 px.) Line offsets are therefore fitted on the other
+side of the scan, beyond a gap.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ class Blocks(NamedTuple):
     records this geometry.
 
     Attributes:
-        block_px: side of a block of the checkerboard.
+        block_px: side length of a block of the checkerboard, in pixels.
         buffer_px: distance that separates fitted from scored pixels. Every fitted pixel is farther than this
-            from every scored pixel. The distance is about one correlation length of the residuals of measured
-            prints; at 5 px, the correlation of these residuals is 0.5.
+            from every scored pixel. The default is about one correlation length of the residuals of measured
+            prints. At a distance of 5 px, the correlation of these residuals is 0.5.
         line_gap_px: for line offsets, distance along the line between fitted and scored pixels.
         seed: seed of the random shift of the checkerboard's origin.
     """
@@ -42,8 +43,9 @@ class Blocks(NamedTuple):
 
 
 class Half(NamedTuple):
-    """One half of a scan, given by two bool maps of shape (ny, nx). Terms are fitted to the pixels of
-    ``calibrate`` and subtracted from the pixels of ``score``.
+    """One of the two halves into which the checkerboard divides a scan, given by two masks of shape (ny, nx).
+    Terms are fitted to the pixels of the mask ``calibrate`` and subtracted from the pixels of the mask
+    ``score``.
     """
 
     calibrate: BoolMap
@@ -53,8 +55,9 @@ class Half(NamedTuple):
 class Cell(NamedTuple):
     """A part of the scan that is scored, and the pixels to which the line offsets for this part are fitted.
 
-    ``score`` is the mask of the scored part. For lines along an axis, ``other_side[axis]`` is the mask of the
-    pixels on the other side of the scan. Both masks have shape (ny, nx).
+    ``score`` is the mask of the scored part. For lines that run along ``axis``, ``other_side[axis]`` is the
+    mask of the pixels on the other side of the scan, to which the offsets of these lines are fitted. All
+    masks have shape (ny, nx).
     """
 
     score: BoolMap
@@ -81,8 +84,8 @@ def checkerboard(shape: tuple[int, int], blocks: Blocks) -> tuple[Half, Half]:
 
 
 def line_cells(shape: tuple[int, int], axes: Iterable[int], gap_px: int) -> list[Cell]:
-    """Cut the scan across its lines. If the lines run along one axis, the scan is cut into halves; if there
-    are lines along both axes, it is cut into quadrants.
+    """Cut the scan into parts, across its lines. If all lines run along the same axis, the parts are two
+    halves. If there are lines along both axes, the parts are four quadrants.
 
     Args:
         shape: shape (ny, nx) of the scan.

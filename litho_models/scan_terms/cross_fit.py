@@ -1,8 +1,9 @@
 """Subtract from a scan the terms that it adds to the height, after fitting them to pixels that are not
 scored.
 
-For example, the datum and the bow of a scan contain no information about the printer, so errors may be stated
-without them. In this project, ``cross_fit`` computes all errors that are stated in this way.
+For example, the datum and the bow of a scan contain no information about the printer, so the error of a model
+may be stated after they have been subtracted. In this project, ``cross_fit`` computes all errors that are
+stated in this way.
 """
 
 from __future__ import annotations
@@ -48,15 +49,16 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Fit terms to pixels of a scan that are not scored, and return the residual of the scored pixels without
-    these terms. Fitted and scored pixels then change places, so that every valid pixel is scored.
+    """Fit terms to pixels of a scan that are not scored, and subtract the fitted terms from the residual of
+    the scored pixels. Fitted and scored pixels then change places, so that every valid pixel is scored.
 
     Args:
         height_um: measured height, µm, of shape (ny, nx). It may be NaN at pixels that are not valid.
         prediction_um: height that the model predicts, µm, of shape (ny, nx).
         valid: mask of the pixels to use, bool, of shape (ny, nx).
         terms: names of terms in the catalogue ``SCAN_TERMS``; see ``POLICIES`` for the usual sets.
-        blocks: division into fitted and scored pixels; by default the standard division.
+        blocks: division of the pixels into fitted and scored pixels. By default, the standard division is
+            used.
         scan_line: index of the scan line of each pixel, counted from 0, of shape (ny, nx). If it is None, the
             rows of the array are the scan lines.
 
@@ -105,11 +107,11 @@ def fitted_terms(
     used: BoolMap,
     terms: Terms,
 ) -> tuple[FloatMap, FloatMap]:
-    """Fit smooth terms to all used pixels. Return their coefficients, of shape (k,), and the sum of the
-    fitted terms as a map of shape (ny, nx), µm.
+    """Fit smooth terms to the difference between measured and predicted height at all used pixels. Return the
+    coefficients, of shape (k,), and the sum of the fitted terms as a map of shape (ny, nx), µm.
 
-    Use this map for training, for pictures and for finding defects. Reported errors use the terms that
-    ``cross_fit`` estimates.
+    Use this map for training, for pictures and for finding defects. For errors that are reported, use
+    ``cross_fit``, which fits the terms to pixels that are not scored.
     """
     basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
@@ -118,16 +120,17 @@ def fitted_terms(
 
 
 def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
-    """Return the measured minus the predicted height after the result of ``fitted_terms`` is subtracted, µm,
-    of shape (ny, nx). It is 0 at unused pixels.
+    """Return the measured minus the predicted height after the terms fitted by ``fitted_terms`` are
+    subtracted, µm. The result has shape (ny, nx) and is 0 at unused pixels.
     """
     _, own = fitted_terms(height_um, prediction_um, used, terms)
     return np.where(used, height_um - prediction_um - own, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
-    """Return the coefficients with which the rows of ``design`` fit ``target`` best in the sense of least
-    squares. ``design`` has shape (k, n), ``target`` (n, …), and the result (k, …).
+    """Return the coefficients for which the weighted sum of the rows of ``design`` fits ``target`` best in
+    the sense of least squares. ``design`` has shape (k, n), ``target`` has shape (n, …), and the result has
+    shape (k, …).
     """
     return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
 

@@ -1,9 +1,9 @@
-"""Ridge regression over scans. The columns (regressors) have strengths that are common to all scans or differ
-between groups of scans.
+"""Ridge regression over scans. The strength (coefficient) of each column (regressor) is either the same in
+all scans or differs between groups of scans.
 
-The regression needs only the inner products between the residual and the columns of each scan. From these
-products, it computes the strengths that fit any selection of scans best, and the squared error that these
-strengths leave in any other scans.
+The regression needs only the inner products of the residual and the columns of each scan. From these
+products, it can compute the best-fitting strengths for any selection of scans, and the squared error that
+these strengths leave in any other scans.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
-    """Return the label of a scan in a grouping (the name of its group). The label is empty if the scan
-    belongs to no group.
+    """Return the label of a scan in a grouping, i.e. the name of the group to which the scan belongs. The
+    label is empty if the scan belongs to no group of this grouping.
 
     Args:
         by: name of the grouping, as in the result of ``groupings``.
@@ -53,15 +53,16 @@ def label_of(scan: PrintedScan, by: str) -> str:
 
 
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
-    """Return all groupings of the scans by name, with ``all`` first. Each grouping is given as the labels of
-    the scans.
+    """Return all groupings of the scans, keyed by name, with ``all`` first. Each grouping is a tuple of
+    labels, one per scan, in the order of ``scans``.
 
-    Groupings are derived from the dataset card (print, tip, direction and rotation of a scan, and further
-    groups that the card states), and from every position in the scan ids at which the character varies. With
-    ``by_order``, groupings are also derived from the printing order. Such a grouping has two groups: the
-    scans before and the scans after a position at which something may have changed. Except for these, a
-    grouping needs at least two labels, and at least half of its labels must have two or more scans. If two
-    groupings are identical, only the first is used.
+    Groupings are derived from the dataset card, which states the print, tip, direction and rotation of each
+    scan and may state further groups. They are also derived from the scan ids: each position at which the
+    character varies gives a grouping by this character. With ``by_order``, groupings are also derived from
+    the printing order. Such a grouping has two groups: the scans before and the scans after a position at
+    which something may have changed. Every other grouping must have at least two labels, and at least half of
+    its labels must have two or more scans. If two groupings divide the scans in the same way, only the first
+    is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -88,16 +89,18 @@ def _is_grouped(labels: Labels) -> bool:
 
 
 def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
-    """Return whether a grouping is identical to one of those found so far, up to the names of its labels."""
+    """Return whether a grouping divides the scans in the same way as one of the groupings found so far. The
+    names of the labels do not matter.
+    """
     return any(
         len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found.values()
     )
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Return the positions in the printing order at which a change is possible. If the prints are known,
-    these are the positions between prints. Otherwise, they are all positions with at least two scans on each
-    side.
+    """Return the positions in the printing order at which something may have changed. If it is known which
+    scan belongs to which print, these are the positions between prints. Otherwise, they are all positions
+    with at least two scans before and two scans after them.
     """
     orders = sorted({scan.order for scan in scans})
     if prints is not None:
@@ -116,14 +119,14 @@ _ALIKE = 1e-7
 
 @dataclass(frozen=True)
 class Block:
-    """Columns with a common grouping and a common prior.
+    """Columns whose strengths differ by the same grouping and have the same prior.
 
     Attributes:
         columns: indices of the columns in the inner products, counted from 1, because index 0 is the
-        residual.
+            residual.
         by: name of the grouping. Each label of the grouping has separate strengths.
-        shrinking: weight of the prior that the strengths are zero, as a number of scans. If the weight is 0,
-            there is no prior.
+        shrinking: weight of the prior that the strengths are zero, stated as a number of scans. If the weight
+            is 0, there is no prior.
     """
 
     columns: tuple[int, ...]
@@ -136,9 +139,9 @@ class Products:
     """The inner products of the residual and the m columns in each scan, and the groups of the scans.
 
     Attributes:
-        grams: inner products divided by the number of pixels, of shape (scans, 1 + m, 1 + m). Index 0 is the
-            residual.
-        groups: label of each scan, for every grouping.
+        grams: inner products divided by the number of pixels, of shape (scans, 1 + m, 1 + m). Index 0 stands
+            for the residual, and the other indices for the columns.
+        groups: labels of all scans, keyed by the name of the grouping.
     """
 
     grams: np.ndarray
@@ -146,16 +149,17 @@ class Products:
 
     @classmethod
     def ungrouped(cls, grams: np.ndarray) -> Products:
-        """Return the products for scans without groups, in which every column has one strength for
-        all scans.
+        """Make products for scans that are not divided into groups, so that every column has a single
+        strength for all scans.
         """
         return cls(grams, {ALL: ("",) * len(grams)})
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Return the strengths that fit the scans with the given indices best. The result contains, for every
-        block, the strengths by label, of shape (columns,).
+        """Return the strengths that fit the scans with the given indices best. The result is a list with one
+        dictionary per block. It is keyed by label, and its values are arrays of strengths of shape
+        (columns,).
 
-        Labels that do not occur among these scans are absent.
+        Labels that do not occur among these scans are absent from the dictionaries.
         """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
@@ -164,10 +168,11 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Return the mean squared residual of each scan with the given indices, of shape (scans,). Before
-        squaring, the columns of the blocks are subtracted with the strengths of the groups of the scan.
+        """Return the mean squared residual of each scan with the given indices, after the columns of the
+        blocks have been subtracted. Each column is first multiplied by its strength in the group to which the
+        scan belongs. The result has shape (scans,).
 
-        A block is not subtracted from a scan whose label has no strengths.
+        If a block has no strengths for the label of a scan, the block is not subtracted from this scan.
         """
         left = np.empty(len(scans))
         for number, scan in enumerate(scans):
@@ -181,8 +186,8 @@ class Products:
         return left
 
     def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
-        """Return the mean squared residual of each scan, of shape (scans,), for strengths that are fitted to
-        the scans outside the fold of this scan.
+        """Return the cross-validated mean squared residual of each scan: the strengths are fitted to the
+        scans outside the fold of this scan. The result has shape (scans,).
 
         Args:
             fold_of: number of the fold of each scan, of shape (scans,).
@@ -196,10 +201,11 @@ class Products:
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
         """Fit the given blocks to all scans, and project them out of the residual and of the other columns.
+        Return the new products.
 
-        The columns of the blocks become zero. If a later fit of other columns uses common strengths, it gives
-        the same result as a joint fit with the blocks. For strengths that differ by group, this holds only if
-        the part that was projected out is the same in all groups.
+        The columns of the blocks become zero. A later fit of other columns gives the same result as a joint
+        fit with the blocks if its strengths are the same in all scans. If its strengths differ by group, this
+        holds only if the part that was projected out is the same in all groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -217,14 +223,14 @@ class Products:
 
 
 class _Expanded:
-    """The normal equations of a regression. They have one row for every combination of a strength and a
-    label.
+    """The normal equations of a regression in which strengths differ by group. There is one unknown, and
+    therefore one row, for every combination of a column and a label.
 
     Attributes:
         columns: indices of the columns of all blocks.
         rows: for each block and label, the row numbers of its strengths.
-        alike: sets of scans that belong to the same groups. Each set is given as the indices of its scans and
-            the row numbers of their strengths, in the order of ``columns``.
+        alike: sets of scans whose labels agree in all groupings. Each set is given as a pair: the indices of
+            its scans, and the row numbers of their strengths in the order of ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
@@ -246,8 +252,8 @@ class _Expanded:
             self.alike.append((members, np.concatenate([np.empty(0, int), *rows])))
 
     def solve(self, targets: Sequence[int] | np.ndarray) -> np.ndarray:
-        """Return the strengths that fit each target best in the sense of least squares, of shape (rows,
-        targets). A target is the index of a column, or 0 for the residual.
+        """Return the strengths that fit each target best in the sense of least squares. A target is the index
+        of a column, or 0 for the residual. The result has shape (rows, targets).
         """
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))

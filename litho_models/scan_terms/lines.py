@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 def scan_line_index(
     shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
 ) -> LineIndex:
-    """Return the index of the scan line to which each pixel of the layout belongs, counted from 0. A scan
-    line has constant y in the frame of the scan. The result has shape (ny, nx).
+    """Return, for each pixel of the layout, the index of the scan line to which it belongs, counted from 0. A
+    scan line is a line of constant y in the coordinates of the scan. The result has shape (ny, nx).
 
     Args:
         shape: shape (ny, nx) of the layout.
-        scan_to_layout: matrix of shape (3, 3) that maps (x_um, y_um, 1) from the frame of the scan to the
-            frame of the layout.
-        pitch_um: layout pitch, which is also taken as the distance between scan lines.
-        bend_um: bend of the scan, which ``scan_to_layout`` does not contain; None for a scan without a bend.
+        scan_to_layout: matrix of shape (3, 3) that maps homogeneous coordinates (x_um, y_um, 1) of the scan
+            to those of the layout.
+        pitch_um: size of a layout pixel. The distance between scan lines is assumed to be the same.
+        bend_um: bend of the scan. It is not contained in ``scan_to_layout``. None means that the scan is not
+            bent.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
@@ -39,8 +40,8 @@ def scan_line_index(
 
 
 def axis_along(line: LineIndex) -> int:
-    """Return the array axis along which the lines run: 1 for lines along x, and 0 for lines along y, as in a
-    scan that is rotated by 90 degrees.
+    """Return the array axis along which the lines run. It is 1 for lines along x. It is 0 for lines along y,
+    which occur in scans that are rotated by 90 degrees.
     """
     down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
     return 1 if down >= across else 0
@@ -49,23 +50,24 @@ def axis_along(line: LineIndex) -> int:
 def shrunk_line_offsets(
     residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
 ) -> tuple[FloatMap, FloatMap, float]:
-    """Estimate the offset s_i of each line. The offsets are treated as random with s_i ~ N(0, v), and the
-    result is their best linear prediction.
+    """Estimate the height offset s_i of each line. The offsets are treated as random effects with s_i ~ N(0,
+    v), and their best linear unbiased prediction (BLUP) is returned.
 
-    Each line is divided into blocks. The scatter of the block means within a line gives the noise of the mean
-    of this line, which includes correlation along the line. The variance of the line means minus the variance
-    of this noise is v. If all lines have the same number of blocks, this moment estimate equals the
-    restricted maximum likelihood estimate (REML). The offset of a line without used pixels is 0.
+    Each line is divided into blocks. The scatter of the block means within the lines gives the noise variance
+    of a line mean, and this estimate allows for correlation of the noise along the line. The estimate of v is
+    the variance of the line means minus this noise variance. If all lines have the same number of blocks,
+    this moment estimate equals the restricted maximum likelihood estimate (REML). The offset of a line
+    without used pixels is 0.
 
     Args:
         residual_um: residual, µm, of shape (ny, nx).
         used: mask of the pixels to use, of shape (ny, nx).
         line: index of the line of each pixel, of shape (ny, nx).
-        block_px: length of a block along the lines.
+        block_px: length of a block along the lines, in pixels.
 
     Returns:
-        The offsets in µm, of shape (lines,); their shrinkage weights from 0 to 1, of shape (lines,); and the
-        variance v in µm².
+        A tuple of three items: the offsets in µm, of shape (lines,); the shrinkage weight of each offset,
+        from 0 to 1, of shape (lines,); and the variance v in µm².
     """
     line_count = int(line.max()) + 1
     axis = axis_along(line)

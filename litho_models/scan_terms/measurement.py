@@ -1,4 +1,5 @@
-"""The measurement model: the changes by microscope, registration and levelling that several scans share.
+"""The measurement model: changes of the measured height map that microscope, registration and levelling cause
+and that several scans share.
 
 In a scan, the image of the print is displaced by the uneven motion of the scanner, multiplied by a gain,
 levelled, and added to a background. The changes that all scans share, or that all scans of a group share, are
@@ -28,8 +29,8 @@ from litho_models.scan_terms.term import FloatMap
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that may have been fitted to whole scan files and subtracted from them. Each surface is given by
-# the numbers of its terms in the list of polynomials x, y, x², xy, y², counted from 1.
+# Surfaces that the microscope software may have fitted to whole scan files and subtracted from them. Each
+# surface is given by the numbers of its terms in the list of polynomials x, y, x², xy, y², counted from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -39,7 +40,7 @@ LEVELLED: dict[Levelling, tuple[int, ...]] = {
 
 
 class SharedPart(Record):
-    """One part of the measurement model.
+    """One part of the measurement model: a background, a displacement or a gain that several scans share.
 
     Attributes:
         what: kind of the part. A background or a displacement is a sum of products of Legendre polynomials of
@@ -48,7 +49,8 @@ class SharedPart(Record):
         by: name of the grouping whose groups have separate coefficients.
         coefficients: coefficients for each label of the grouping, in µm; the coefficient of a gain is
             dimensionless. A part without coefficients changes nothing.
-        shrinking: weight, in the fit, of the prior that the coefficients are zero, as a number of scans.
+        shrinking: weight of the prior that the coefficients are zero, which was used in their fit. It is
+            stated as a number of scans.
     """
 
     what: Shared
@@ -69,21 +71,21 @@ class SharedPart(Record):
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
-        """Return the sum of polynomials on the field of the scan, µm, of shape (ny, nx). The sum of a
-        background has no constant term.
+        """Evaluate the polynomials of this part, a background or a displacement, on the field of the scan,
+        and return their sum, µm. A background has no constant term. The result has shape (ny, nx).
         """
         own = self.of(scan)
         return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
 
 
 class MeasurementModel(Record):
-    """The changes by the measurement that several scans share.
+    """The changes that the measurement makes to several scans in the same way.
 
     Attributes:
-        levelling: kind of surface that was fitted to whole scan files and subtracted from them. Predictions
-            are levelled in the same way.
-        parts: the other changes, in the order in which they were found.
-        field_um: size (y, x) of the fields of the training scans.
+        levelling: kind of surface that was fitted to whole scan files and subtracted from them. The same kind
+            of surface is subtracted from predictions.
+        parts: the changes other than the levelling, in the order in which they were found.
+        field_um: size (y, x) of the fields of the training scans, µm.
         scans: number of training scans.
     """
 
@@ -100,7 +102,7 @@ class MeasurementModel(Record):
         return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Return whether the scan's field has the size of the training fields."""
+        """Return whether the field of the scan has the same size as those of the training scans."""
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
@@ -124,8 +126,8 @@ class MeasurementModel(Record):
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))
 
     def between_groups(self) -> MeasurementModel:
-        """Return a model that contains only the differences between groups: from the coefficients of each
-        part, the mean over its labels is subtracted.
+        """Return a model that contains only the differences between groups. To obtain them, the mean over all
+        labels is subtracted from the coefficients of each part.
 
         Gains are left out, because a difference in gain between prints may come from the printer.
         """
@@ -149,8 +151,8 @@ class MeasurementModel(Record):
 
 
 def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    """Displace a predicted height by the displacements among the given parts. The height and the result have
-    shape (ny, nx) and are in µm.
+    """Apply the displacements among the given parts to a predicted height map; ignore parts of other kinds.
+    The height map and the result have shape (ny, nx) and are in µm.
     """
     prediction = np.asarray(prediction_um, np.float64)
     moves = [part for part in parts if part.what in ("shift-x", "shift-y")]
@@ -164,8 +166,8 @@ def displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[Shar
 
 
 def levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
-    """Subtract from a field the surface of the given kind that fits its usable pixels best. The mean of the
-    surface is kept.
+    """Subtract from a height map the surface of the given kind that fits its usable pixels best. The mean of
+    the surface is not subtracted.
     """
     if levelling == "none":
         return field

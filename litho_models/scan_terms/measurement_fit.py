@@ -1,6 +1,8 @@
-"""Learn the measurement model: choose the parts that scans share, and fit the coefficients of these parts.
+"""Learn the measurement model: choose which changes (parts) the scans share, and fit the coefficients of
+these parts.
 
-Parts are chosen by cross-validation within the given scans.
+A part is, for example, a background or a displacement that all scans of a group have in common. Parts are
+chosen by cross-validation within the given scans.
 """
 
 from __future__ import annotations
@@ -29,8 +31,9 @@ from litho_models.scan_terms.measurement import (
 from litho_models.scan_terms.term import FloatMap
 
 _HIGHEST, _LATERAL = 11, 3
-# The parts to try, starting with the most likely part: kind, degree, and whether the coefficients differ by
-# group. In a field of 54 µm, a background of degree 11 varies over lengths down to 9 µm.
+# The parts to try, starting with the most likely part. Each part is given by its kind, its polynomial degree,
+# and whether its coefficients differ by group. In a field of 54 µm, a background of degree 11 varies over
+# lengths down to 9 µm.
 _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("background", 2, False),
     ("background", 4, False),
@@ -43,11 +46,11 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
     ("shift-y", _LATERAL, True),
     ("gain", 0, True),
 )
-# Weights to try for the prior that groups do not differ, as numbers of scans. Such a weight is the variance
-# within groups divided by the variance between groups.
+# Weights to try for the prior that groups do not differ. A weight is stated as a number of scans. It is the
+# variance within groups divided by the variance between groups.
 _SHRINKING = (0.3, 1.0, 3.0)
-# A part is added only if the squared error on held-out scans falls by more than this many standard errors of
-# the decrease, and by more than this share.
+# A part is added only if the squared error on held-out scans falls by more than ``_LEAST_Z`` standard errors
+# of the decrease, and by more than the fraction ``_LEAST_SHARE`` of the squared error.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
 # Displacements are linearised in each round. The second round linearises them at the displaced print.
@@ -69,15 +72,15 @@ def learn_measurement(
     """Learn the measurement model of the given scans, relative to the predicted heights of their prints.
 
     Parts are added one at a time as long as they significantly lower the cross-validated error. If the fields
-    differ in size, only the scans with the most frequent size are used. For electron micrographs of films,
-    the model is empty.
+    of the scans differ in size, only the scans with the most frequent field size are used. For electron
+    micrographs of films, the returned model has no parts.
 
     Args:
         scans: the scans from which the model is learned.
         predictions_um: predicted height of the print of each scan, µm, of shape (ny, nx).
         seed: seed that assigns the scans to the folds of the cross-validation.
-        like: a model whose levelling and parts are used instead of choosing them. Only the coefficients are
-            fitted again.
+        like: an earlier measurement model. If it is given, its levelling and parts are used, and only the
+            coefficients of these parts are fitted again.
     """
     usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
     model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
@@ -98,8 +101,8 @@ def learn_measurement(
 
 
 def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
-    """Return the inner products of the columns of all parts that may be tried. The columns are linearised at
-    the current measurement model.
+    """Return, for each scan, the inner products between the residual and the columns (regressors) of all
+    parts that may be tried. The columns are linearised at the current measurement model.
     """
     grams = []
     for scan, prediction in pairs:
@@ -109,8 +112,8 @@ def _products(pairs: Sequence[_Pair], model: MeasurementModel) -> Products:
 
 
 def _chosen(products: Products, fold_of: np.ndarray) -> list[SharedPart]:
-    """Choose the parts to add. ``fold_of`` contains the number of the fold of each scan and has
-    shape (scans,).
+    """Choose the parts of the measurement model by cross-validation. ``fold_of`` contains the fold number of
+    each scan and has shape (scans,).
     """
     chosen: list[SharedPart] = []
     if len(fold_of) < 2:
@@ -149,11 +152,12 @@ def _fitted(products: Products, chosen: Sequence[SharedPart]) -> list[SharedPart
 
 
 def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-    """Return the residual and the m columns of all parts at a thinned set of n pixels. The mean of each row
-    is subtracted. The result has shape (1 + m, n).
+    """Return the residual of a scan (first row) and the m columns of all parts (further rows) at a thinned
+    set of n pixels. The mean of each row is subtracted. The result has shape (1 + m, n).
 
-    The contribution of the current parts is added back to the residual, to first order. Each round therefore
-    fits the full coefficients, and the prior shrinks them only once, regardless of the number of rounds.
+    The contribution of the parts that are already in ``model`` is added back to the residual, to first order.
+    Each round therefore fits the full coefficients and not corrections to them, so the prior shrinks the
+    coefficients only once, regardless of the number of rounds.
     """
     at = thinned(scan.usable, _SAMPLED_PX)
     seen = displaced(scan, prediction_um, [part for part in model.parts if part.of(scan)])
@@ -189,8 +193,8 @@ def _block(part: SharedPart) -> Block:
 
 
 def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
-    """Choose the levelling with which the predictions fit the scans best, after a shared bow and tilt are
-    removed.
+    """Choose the levelling for which the predictions fit the scans best, after the bow and tilt that all
+    scans share are removed.
     """
     rests: dict[Levelling, list[FloatMap]] = {levelling: [] for levelling in LEVELLED}
     for scan, prediction in pairs:
@@ -210,6 +214,6 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Return the number of the inner fold of each scan, which is assigned by a hash of the scan id."""
+    """Return the number of the inner fold of each scan. Scans are assigned to folds by a hash of the scan id."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])

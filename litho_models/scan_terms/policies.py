@@ -1,4 +1,6 @@
-"""The usual sets of scan terms for scoring and for training, and the record of how a score was computed."""
+"""The usual sets of scan terms (policies) for scoring and for training, and the record of how a score was
+computed.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ POLICIES: dict[Policy, Terms] = {
 
 
 def policy_terms(policy: str) -> Terms:
-    """Return the terms of a policy.
+    """Return the scan terms of a policy, i.e. of a named set of terms that are fitted to each scan.
 
     Raises:
         InputError: there is no policy with this name.
@@ -40,24 +42,29 @@ def policy_terms(policy: str) -> Terms:
 
 
 def usual_policy(film: bool) -> Policy:
-    """Return the default policy. It fits the datum of each scan, except for films, which have no datum."""
+    """Return the default policy. It is ``offset``, which fits the datum of each scan, or ``none`` for films,
+    which have no datum.
+    """
     return "none" if film else "offset"
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """Return the background that is added to predictions by default; for films, none is added."""
+    """Return which background is added to predictions by default: that of the training scans, or none for
+    films.
+    """
     return "none" if film else "training"
 
 
 class NuisanceProtocol(Record):
     """The terms that are subtracted from scans before scoring, and the pixels to which they are fitted.
 
-    ``k`` is the number of smooth terms per scan. It does not include the line offsets of ``full+rows``,
-    because their effective number depends on the prediction and is stated in ``PolicyError.k``.
-    ``background`` is ``training`` if predictions include the smooth background of the training scans,
-    ``shared`` if they include the whole measurement model, and ``none`` if they include neither. No part of
-    the background is fitted to the scored scan. ``border_px`` is the number of pixels that are left out at
-    the edge of a scan; it is always zero. The other fields are those of ``Blocks``.
+    ``k`` is the number of smooth terms per scan. It does not include the line offsets of policy
+    ``full+rows``. The effective number of line offsets depends on the prediction, so it is stated in
+    ``PolicyError.k``. ``background`` is ``training`` if the scored predictions include the smooth background
+    of the training scans, ``shared`` if they include the whole measurement model, and ``none`` if they
+    include neither. No part of the background is fitted to the scored scan. ``border_px`` is the number of
+    pixels that are left out at the edge of a scan; it is always zero. The other fields are those of
+    ``Blocks``.
     """
 
     policy: Policy = "offset"
@@ -81,8 +88,8 @@ class NuisanceProtocol(Record):
         return Blocks(self.block_px, self.buffer_px, self.line_gap_px, self.seed)
 
 
-# Terms whose mean over the scans belongs to the process, not to single scans. This mean is kept in the
-# process model.
+# Terms whose mean over all scans is attributed to the process and not to single scans. This mean therefore
+# stays in the process model and is not subtracted.
 PINNED: Terms = frozenset({"offset", "gain"})
 
 
@@ -110,7 +117,8 @@ def estimate_scan_terms(
     """Estimate the terms that each scan adds to the height predicted by a model, from all valid pixels of the
     scan. Return for each scan the sum of its terms, µm, as a float32 map of shape (ny, nx).
 
-    Use these maps only for training. Reported errors use the terms that ``cross_fit`` estimates.
+    Use these maps only for training. For errors that are reported, use ``cross_fit``, which fits the terms to
+    pixels that are not scored.
     """
     coefficients = np.array(
         [
@@ -118,7 +126,8 @@ def estimate_scan_terms(
             for scan, prediction in zip(scans, predictions_um, strict=True)
         ]
     )
-    # Offset and gain are the first terms of the catalogue and have one map each.
+    # Offset and gain are the first terms of the catalogue and have one map each, so their coefficients come
+    # first.
     pinned = len(PINNED & terms)
     coefficients[:, :pinned] -= coefficients[:, :pinned].mean(axis=0)
     maps = []

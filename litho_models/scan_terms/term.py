@@ -1,8 +1,8 @@
 """The catalogue of terms that a scan may add to the height of a print.
 
-A term is a set of smooth maps over the scan (datum, gain, bow, ...), or a set of offsets, one for every line.
-The benchmark, the training, the noise estimate and the loop all use this catalogue. ``register_scan_term``
-adds a term to it.
+A term is either a set of smooth maps over the scan (for example datum, gain or bow) or a set of height
+offsets, one for every line. The benchmark, the training, the noise estimate and the loop all use this
+catalogue. ``register_scan_term`` adds a term to the catalogue.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class TermPixels:
 
     @cached_property
     def slopes(self) -> tuple[FloatMap, FloatMap]:
-        """Return the change of the predicted height per pixel along y and along x, µm, as two arrays of shape
-        (n,).
+        """Return the change of the predicted height per pixel along y and along x, µm, at the n pixels. The
+        result is a pair of arrays of shape (n,).
         """
         slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
         return self._taken(slopes[0]), self._taken(slopes[1])
@@ -79,13 +79,14 @@ class ScanTerm:
         name: name of the term in sets of terms.
         effect: name of the effect that the term represents, or None for a term that serves only as a control.
             Several terms may represent the same effect.
-        unit: unit of the coefficients, which is ``µm`` for a height, ``px`` for a displacement, or ``1``.
-        labels: description of each of the k maps. A term of line offsets has a single description.
+        unit: unit of the coefficients: ``µm`` for a height, ``px`` for a displacement, or ``1`` for a
+            dimensionless number.
+        labels: descriptions of the k maps, one per map. A term of line offsets has a single description.
         maps: function that returns the smooth maps at given pixels, of shape (k, n). All maps except the
             datum have zero mean over the scan. None for line offsets.
         lines: for line offsets, function ``lines(shape, scan_line)`` that returns the line index of each
             pixel, given the shape of the scan and the index of the scan line of each pixel (or None).
-        frame: for line offsets, the lines that the offsets follow, in words.
+        frame: for line offsets, a description of the lines that the offsets follow, such as "the scan lines".
     """
 
     name: str
@@ -107,8 +108,8 @@ def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
 
 
 def parameter_names(terms: Iterable[str]) -> list[str]:
-    """Return the names of the coefficients that belong to the maps of ``term_maps``, with the units in which
-    they are reported.
+    """Return the names of the coefficients of the maps that ``term_maps`` returns, in the same order. Each
+    name includes the unit in which the coefficient is reported.
     """
     shown = {"µm": " (nm)", "px": " (px)", "1": ""}
     return [
@@ -137,7 +138,7 @@ def line_terms(names: Iterable[str]) -> list[ScanTerm]:
 
 
 def terms_of_effect(effect: str) -> Terms:
-    """Return the names of the terms that represent an effect. The set is empty if it is not a
+    """Return the names of the terms that represent an effect. The set is empty if the effect is not a
     per-scan effect.
     """
     return frozenset(term.name for term in SCAN_TERMS.values() if term.effect == effect)
@@ -196,8 +197,8 @@ def _distortion(pixels: TermPixels) -> FloatMap:
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
 
 
-# Decay times of the two parts of a creep, relative to the duration of a scan. Slower creep is part of the
-# bow.
+# Decay times of the two parts of a creep, relative to the duration of a scan. Creep that is slower than both
+# cannot be distinguished from the bow and is treated as part of it.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 # The terms are listed in the order in which the loop tests them.
