@@ -13,22 +13,23 @@ from litho_models.simulator import Simulator, Tile
 
 # The frame of an effect: whether the effect rotates with the print or with the scan.
 Frame = Literal["scan", "print"]
-# Key of a cached field: everything on which the field depends, which is the effects before it, their values,
-# and the base.
+# Key of a cached field. It contains everything on which the field depends: the names and parameter values of
+# the effects before it, and the base.
 Key = tuple[object, ...]
 Fields = MutableMapping[Key, Tensor]
 
 
 class EffectChain(nn.Module):
-    """Apply layout effects, then the base model, then height effects, in the order of the catalogue.
+    """Apply the effects that change the layout, then the base model, then the effects that change the height.
+    Within each of the two groups, the effects are applied in the order of the catalogue.
 
     Args:
         base: a simulator that maps a layout in µm to a height in µm. Both tensors have shape (b, 1, ny, nx).
-        effects: parameter values of each effect, by its name. A parameter that is not given has the value
-            that it has while its effect is off.
-        frames: for each effect that deviates from the default, whether it rotates with the print or with the
-            scan. By default, effects of stage ``measurement`` rotate with the scan, and all others rotate
-            with the print.
+        effects: parameter values of each effect, keyed by the name of the effect. A parameter that is not
+            given has the value that it has while its effect is off.
+        frames: whether an effect rotates with the print (``print``) or with the scan (``scan``), keyed by the
+            name of the effect. By default, effects of stage ``measurement`` rotate with the scan, and all
+            others rotate with the print.
     """
 
     def __init__(
@@ -46,7 +47,9 @@ class EffectChain(nn.Module):
 
     @property
     def tile(self) -> Tile | None:
-        """Return the tile with which the base model is applied. Effects act on the whole field."""
+        """Return the tile size with which the base model is applied. Effects, in contrast, are applied to the
+        whole field.
+        """
         return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(
@@ -56,13 +59,14 @@ class EffectChain(nn.Module):
         known: Fields | None = None,
         base_key: object = None,
     ) -> Tensor:
-        """Return the predicted height, µm, of shape (b, 1, ny, nx). Without a context, the layout is taken as
-        one whole write field.
+        """Return the predicted height, µm, of shape (b, 1, ny, nx). If no context is given, the layout is
+        assumed to fill the whole write field.
 
         Args:
-            known: cached fields after the base and after each effect that other chains have already computed
-                for the same scan. Newly computed fields are added to it.
-            base_key: value that identifies the base among the chains that share ``known``.
+            known: cache of intermediate fields that this chain or other chains have already computed for the
+                same scan: the output of the base and that of each effect. Newly computed fields are added to
+                this cache.
+            base_key: value that identifies the base if chains with different bases share the cache ``known``.
         """
         if context is None:
             assert isinstance(self.base, Simulator)

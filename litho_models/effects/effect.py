@@ -1,4 +1,6 @@
-"""Define an effect: a differentiable change of the layout or height, which vanishes at its null values."""
+"""Define an effect: a differentiable change of the layout or of the height. At the null values of its
+amplitudes, an effect changes nothing.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,14 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
-# What is known about an effect that was found: its physical cause, only its formula, or only the variable on
-# which it depends.
+# How much is known about an effect that was found: its physical cause (``cause``), only its formula
+# (``law``), or only the variable on which it depends (``description``).
 Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
-# Tolerance, as a share of the range, for values that lie on a bound. It is needed because storing a value in
-# float32 rounds it.
+# Tolerance for values that lie on a bound, as a fraction of the range. It is needed because a value is
+# rounded when it is stored in float32.
 _ROUNDING = 1e-6
 
 
@@ -34,13 +36,16 @@ class Parameter:
 
     Args:
         unit: unit of the value; ``1`` for a dimensionless parameter.
-        lower, upper: bounds of the physical range. A fitted value outside this range contradicts the effect.
+        lower, upper: bounds of the physical range. A best-fitting value outside this range is evidence
+            against the effect.
         typical: a usual value, used for screening and as the starting value of fits.
-        kind: kind of parameter. The effect is off if every ``amplitude`` equals its ``null``. A ``shape``
-            (such as a length or a position) has no meaning while the effect is off. A ``choice`` is a
-            shape with few possible values (such as a direction) and is never fitted.
+        kind: kind of parameter: ``amplitude``, ``shape`` or ``choice``. The effect is off if every amplitude
+            equals its ``null`` value. A shape (such as a length or a position) has no meaning while the
+            effect is off. A choice is a shape with few possible values (such as a direction) and is never
+            fitted.
         null: value of an amplitude at which the effect changes nothing.
-        tried: values that screening tries. If this tuple is empty, screening tries ``typical``.
+        tried: values that screening (the fast test of all effects) tries. If this tuple is empty, screening
+            tries ``typical``.
     """
 
     unit: str
@@ -65,8 +70,8 @@ class FieldContext:
         layout_um: exposure of the field, which is the nominal height times the relative dose, µm, as a tensor
             of shape (1, 1, ny, nx).
         pitch_um: lateral sampling, µm.
-        full_height_um: nominal height of the highest level, µm. Effects that act on each pixel separately use
-            it as their unit of height.
+        full_height_um: nominal height of the highest level, µm. Effects that change each pixel independently
+            of its neighbours use it as their unit of height.
         slice_um: height of one printed slice, which is the height of one level, µm.
         field_centre_um: position (y, x) of the centre of this field in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
@@ -77,9 +82,9 @@ class FieldContext:
         quarter_turns: number of quarter turns by which the print was rotated under the microscope, with the
             direction of rotation of ``torch.rot90``.
         backward: whether the scan consists of retrace lines.
-        new_tip: whether the scan was made with a new, sharp tip.
-        pixel_size: pixel size relative to that of the other scans. The length over which the probe lags is
-            proportional to it, because the time per pixel is the same.
+        new_tip: whether the scan was made with a new, sharp tip instead of the usual one.
+        pixel_size: pixel size relative to that of the other scans. The time per pixel is the same in all
+            scans, so the length over which the probe lags is proportional to the pixel size.
         dose: dose relative to the recipe. It is already contained in ``layout_um``.
     """
 
@@ -101,8 +106,8 @@ class FieldContext:
     _kept: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def kept(self, name: str, make: Callable[[FieldContext], Tensor]) -> Tensor:
-        """Return a quantity that depends only on this field. ``make`` computes it at the first call, and
-        later calls with the same ``name`` return the cached result.
+        """Return a quantity that depends only on this field and is cached under ``name``. The function
+        ``make`` computes it at the first call, and later calls with the same name return the cached result.
         """
         if name not in self._kept:
             self._kept[name] = make(self)
@@ -137,8 +142,8 @@ class FieldContext:
         return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
 
     def scan_position(self) -> tuple[Tensor, Tensor]:
-        """Return the y and x positions of the pixels in the whole scan, over which each coordinate runs from
-        -1 to 1. The two tensors have shapes (ny, 1) and (1, nx).
+        """Return the y and x positions of the pixels relative to the whole scan. Each coordinate runs from -1
+        to 1 over the whole scan. The two tensors have shapes (ny, 1) and (1, nx).
         """
         rows, columns = self._pixels()
         (ny, nx), (top, left) = self.whole_shape(), self.origin_px
@@ -151,8 +156,8 @@ class FieldContext:
         return y[:, None], x[None, :]
 
     def radius_um(self) -> float:
-        """Return half the width of the write field, µm. If the dataset card states no write field, return
-        half the longer side of this field.
+        """Return half the width of the write field, µm. If the dataset card (the TOML file that describes a
+        campaign) states no write field, return half the longer side of this field.
         """
         if self.field_radius_um is not None:
             return self.field_radius_um
@@ -163,7 +168,9 @@ Apply = Callable[[Tensor, Values, FieldContext], Tensor]
 
 
 def of_single_scans(array: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise InputError, because a per-scan effect has no formula: its terms are fitted to each scan."""
+    """Raise InputError. This function stands in for the formula of a per-scan effect, which has no formula
+    because its terms are fitted to each scan.
+    """
     raise InputError(
         "an effect in a model",
         got="a per-scan effect",
@@ -179,22 +186,23 @@ class Effect:
         name: the identifier used in code, JSON and on the command line.
         title: short description for a process engineer.
         stage: stage of printing or measurement at which the effect acts.
-        role: ``process`` if the printer causes the effect, ``measurement`` if the microscope causes it,
-            ``undetermined`` if the scans must show which of the two does, and ``nuisance`` if designs should
-            not depend on it. Only ``process`` effects become part of the exported process model.
-        acts_on: ``layout``, the input of the base model, or ``height``, its output; both are in µm.
-        parameters: the parameters by name. At least one of them must be an amplitude.
+        role: ``process`` if the printer causes the effect; ``measurement`` if the microscope causes it;
+            ``undetermined`` if it is not known which of the two causes it; ``nuisance`` if designs should not
+            depend on the effect. Only ``process`` effects become part of the exported process model.
+        acts_on: what the effect changes: ``layout``, the input of the base model, or ``height``, the output
+            of the base model. Both are in µm.
+        parameters: the parameters, keyed by name. At least one of them must be an amplitude.
         apply: the formula, a pure function ``apply(field, values, context)`` that returns the changed field.
             Both fields have shape (b, 1, ny, nx) and are in µm. For per-scan effects, it is
             ``of_single_scans``.
-        trials: parameter sets whose results screening compares with those of the null values. By default,
-            screening tries one amplitude at a time: each of its ``tried`` values, for every combination of
-            the values of the shapes.
-        source: source of the formula.
+        trials: parameter sets that screening tries. By default, one amplitude is switched on at a time. Each
+            of its ``tried`` values is combined with every combination of the ``tried`` values of the shapes.
+        source: where the formula comes from, such as a publication.
         separating: experiment that distinguishes this effect from similar effects.
-        needs: what a test of the effect requires: a known order of the scans, or a microscope with a probe.
-        reverses: names of the parameters whose sign is opposite on retrace lines.
-        of_tip: whether a new tip removes this effect.
+        needs: what a test of the effect requires: ``order`` if the writing order of the scans must be known,
+            and ``probe`` if the microscope must have a probe.
+        reverses: names of the parameters whose sign changes between trace and retrace lines.
+        of_tip: whether the effect is absent from scans made with a new tip.
         of_films: True if this effect moves the edges of a film seen from above, and False if it changes
             heights.
         knowledge: what is known about the effect. For a ``cause``, the physical cause is known; for a
@@ -281,8 +289,8 @@ class Effect:
         is off.
 
         Args:
-            scanned: whether the microscope causes the effect. If so, the effect depends on the orientation,
-                the direction and the tip of the scan.
+            scanned: whether to treat the effect as caused by the microscope. If so, it depends on the
+                orientation, the direction and the tip of the scan.
         """
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
@@ -308,8 +316,9 @@ def entry(
     acts_on: ActsOn,
     **facts: Any,
 ) -> Callable[[Apply], Effect]:
-    """Make a decorator that turns a formula (a function ``apply``) into an effect. The effect gets the name
-    of the function, with hyphens for underscores. ``facts`` sets the other fields of ``Effect``.
+    """Make a decorator that turns a formula (a function of the type ``Apply``) into an effect. The effect
+    gets the name of the function, with hyphens instead of underscores. ``facts`` sets the other fields of
+    ``Effect``.
     """
 
     def of_formula(apply: Apply) -> Effect:

@@ -13,12 +13,12 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, of_expo
 from litho_models.effects.filters import add_blur, add_filtered
 
 # If the variances of the spot along its two axes differ by less than about this value, the spot is narrowed
-# along one axis by as much as it is widened along the other. If they differ by more, the additional
-# difference only widens the spot, so that high frequencies are not amplified further.
+# along one axis by as much as it is widened along the other. If the variances differ by more, the excess only
+# widens the spot along one axis, so that high frequencies are not amplified further.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
 
-# Variance and reach of the spot that cures the slices.
+# Variance of the spot that cures the slices, and the distance from its centre at which it is cut off.
 _SLICED_VARIANCE_UM2 = 0.02
 _SLICED_REACH_UM = 0.8
 
@@ -33,8 +33,8 @@ _SLICED_REACH_UM = 0.8
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² f' C f), where the
-    matrix C is added to the second moments of the spot. The parameters are Cxx - Cyy and 2 Cxy.
+    """Make the spot elliptical: multiply the spectrum of the layout by T = exp(-2 π² fᵀ C f). The matrix C is
+    what is added to the second moments of the spot. The parameters are Cxx - Cyy and 2 Cxy.
     """
     stretch, shear = values["stretch_um2"], values["shear_um2"]
     isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
@@ -71,8 +71,8 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
     separating="a wide staircase of all levels and a power sweep",
 )
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Raise the dose to a power: D = M_ref (M / M_ref)^p, where M_ref is the full height. Beforehand, 1 % of
-    M_ref is added to M, so that the slope at M = 0 stays finite.
+    """Raise the dose to a power: D = M_ref (M / M_ref)^p, where M_ref is the full height. Before the power is
+    taken, 1 % of M_ref is added to M, so that the slope at M = 0 stays finite.
     """
     foot = 0.01
     exponent, full = values["exponent"], context.full_height_um
@@ -96,9 +96,9 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Cure slices of height t separately: the blurred layout G*M becomes
     (1 - w) G*M + w Σ t·step(G * 1[M >= k t]).
 
-    The difference between these two expressions is added to the height. The function ``step`` is a logistic
-    function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is narrower than the
-    spot is lost, and a gap that is narrower than the spot is filled.
+    The difference between the second and the first expression is added to the height. The function ``step``
+    is a logistic function about the threshold, scaled so that it maps 0 to 0 and 1 to 1. A slice that is
+    narrower than the spot is lost, and a gap that is narrower than the spot is filled.
     """
     exposed = context.kept("slices", _exposed_slices)
     gained = _step(exposed, values["threshold"], values["steepness"]) - exposed

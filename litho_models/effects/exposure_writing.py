@@ -20,7 +20,8 @@ from litho_models.effects.filters import (
 )
 
 _TAIL_LENGTHS = 6
-# Lowest frequency of a ripple. Slower ripples cannot be distinguished from smooth maps over the field.
+# Lowest frequency of a ripple. Ripples of lower frequency cannot be distinguished from smooth changes over
+# the field.
 _SLOWEST_PER_UM = 0.19
 _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
 
@@ -32,7 +33,9 @@ _RIPPLES_PER_UM = tuple(round(0.2 + 0.02 * i, 2) for i in range(21))
     separating="print one layout at the centre and at the edge of the write field",
 )
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Reduce the light towards the edge of the write field: D = M (1 - v r² / R²)."""
+    """Reduce the dose towards the edge of the write field: D = M (1 - v r² / R²), where R is half the width
+    of the write field.
+    """
     y, x = context.centred_um()
     return layout * (1 - values["strength"] * (y * y + x * x) / context.radius_um() ** 2)
 
@@ -45,8 +48,9 @@ def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     separating="leave bare substrate in every field as a reference for the levelling",
 )
 def field_curvature(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Change the height of the print by the tilt and curvature of the focus surface over the write field:
-    H + 1[M > 0] (a x + b y + c r²). The coordinates are relative to R, half the width of the write field.
+    """Change the height of the print by the tilt and curvature of the focus surface over the write field: H +
+    1[M > 0] (a x + b y + c r²). The coordinates x, y and r are in units of R, half the width of the write
+    field.
     """
     y, x = context.centred_um()
     radius = context.radius_um()
@@ -86,8 +90,9 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     """Remove the part of the print that was written below the surface H_s of the substrate: max(H - z, H_s)
     where H > H_s.
 
-    The lost part has height z and shrinks like the rest of the print: z = z0 (1 - k (1 - u)), where u is the
-    mean nominal height nearby as a fraction of the full height.
+    The lost part has height z and shrinks as the remaining print does: z = z0 (1 - k (1 - u)). Here z0 is the
+    depth below the surface at which writing started, and u is the mean nominal height nearby as a fraction of
+    the full height.
     """
     substrate_um = values["substrate_um"]
     thinned = values["shrinkage"] * (1 - dose_nearby(context, values["length_um"]))
@@ -105,8 +110,9 @@ def interface_offset(height: Tensor, values: Values, context: FieldContext) -> T
     separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
 )
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the beam lag behind its command: filter the layout along the written lines with a one-sided
-    exponential of length l = v τ. The mean delay of this filter is removed.
+    """Let the beam lag behind the commanded position: filter the layout along the written lines with a
+    one-sided exponential of length l = v τ (speed times time constant). The mean delay of this filter is
+    removed.
     """
     length, direction, pitch = values["length_um"], values["direction"], context.pitch_um
 
@@ -127,8 +133,8 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Shorten every written line by δ at both ends (or lengthen it): M - δx |∂M/∂x| - δy |∂M/∂y|.
 
-    The formula is correct for the area that an edge loses, but not for the shape of the edge. The shape is
-    determined by the spot, which is wider than δ.
+    The formula gives the correct area that is lost at an edge, but not the correct shape of the edge. This
+    does not matter, because the spot is wider than δ and determines the shape.
     """
     along_y, along_x = gradient(layout, context.pitch_um)
     return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
@@ -179,7 +185,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach_um = _TAIL_LENGTHS * float(length.detach())
     starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach_um)
-    # Where another effect has already made the dose negative, the dose is not reduced further.
+    # Where another effect has already made the dose negative, this effect does not reduce it further.
     least = layout.clamp(max=0)
     return least + torch.relu(starved - least)
 

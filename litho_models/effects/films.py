@@ -1,4 +1,5 @@
-"""Effects and laws of films, which move the edges of a written, developed or etched film seen from above.
+"""Effects and laws (short formulas without a known cause) of films. They move the edges of a written,
+developed or etched film seen from above.
 
 Lengths are in pixels of the layout. These pixels are fine enough to resolve the blur of the beam or lens.
 """
@@ -21,10 +22,11 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, entry
 from litho_models.effects.filters import add_blur, add_warp
 from litho_models.models.parts import etch
 
-# Standard deviation of the blur from which the normals of a film's edges are computed, standard deviation of
-# the blur that locates a sharp rim, and range of the diffusion.
+# ``_NORMAL_PX``: standard deviation of the blur that is applied before the normals of edges are computed.
+# ``_RIM_PX``: standard deviation of the blur that is applied before a sharp rim is located.
+# ``_DIFFUSION_REACH_PX``: largest distance to which diffusion reaches.
 _NORMAL_PX, _RIM_PX, _DIFFUSION_REACH_PX = 1.0, 1.6, 50.0
-# Along a straight edge, no point is farther than this from the nearest crossing of the edge with the grid of
+# No point on a straight edge is farther than this from the nearest crossing of the edge with the grid of
 # pixels.
 _BESIDE_PX = 0.75
 # A film is flat at all points that are farther than this from its edges.
@@ -46,7 +48,7 @@ _of_films = partial(entry, role="process", of_films=True)
 )
 def electron_backscatter(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
     """Add the dose that the substrate scatters back into the film: D = (M + η G_b * M) / (1 + η), where G_b
-    is a Gaussian of standard deviation b.
+    is a Gaussian of standard deviation b, * is convolution, and η is the weight.
     """
     weight, length = values["weight"], values["length_px"]
     blurred = add_blur(layout, length**2, 1.0, 3 * float(length.detach()))
@@ -68,7 +70,8 @@ def resist_diffusion(height: Tensor, values: Values, context: FieldContext) -> T
     full = context.full_height_um
 
     def edged(variance_px2: Tensor) -> Tensor:
-        # A sharp rim does not show where in a pixel its edge lies, so both films are slightly blurred.
+        # A sharp rim does not show where within a pixel its edge lies. The film with diffusion and the film
+        # without it are therefore both slightly blurred.
         blurred = add_blur(height / full, variance_px2 + _RIM_PX**2, 1.0, _DIFFUSION_REACH_PX)
         return full * etch(functional.pad(blurred, (1,) * 4, mode="replicate"), 0.5, 0.0, 1.0)
 
@@ -98,8 +101,8 @@ _AS_LAW: dict[str, Any] = {
 edge_shift = replace(etch_bias, name="edge-shift", title="edges shifted outwards by a constant", **_AS_LAW)
 
 
-# If the length were greater, the mean would be nearly the same at all edges of a field, and the law would be
-# a constant shift.
+# If the length were greater than this range allows, the mean would be nearly the same at all edges of a
+# field, and the law could not be distinguished from a constant shift.
 _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
 
 
@@ -112,8 +115,8 @@ _DENSITY_PX = Parameter("px", 10.0, 45.0, 25.0, "shape", tried=(15.0, 45.0))
     **_AS_LAW,
 )
 def edge_shift_by_density(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Move edges outwards by the bias times 2 M̄ - 1. With a positive bias, edges with little film nearby
-    therefore move inwards.
+    """Move edges outwards by the bias times 2 M̄ - 1, where M̄ is the mean of the film (0 to 1) near the
+    edge. If the bias is positive, edges with little film nearby therefore move inwards.
     """
     length = values["length_px"]
     nearby = add_blur(height, length**2, 1.0, 3 * float(length.detach())) / context.full_height_um
@@ -132,11 +135,12 @@ def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor
     distance, normal = map(torch.from_numpy, _from_edge(share.double().cpu().numpy(), reach_px))
     distance, normal = distance.to(height), normal.to(height)
     wanted = distance + outwards_px
-    # Beyond its rim, a film is flat. The value of a pixel there is looked up no farther away than needed,
-    # because there may be another edge.
+    # Farther than ``_FLAT_PX`` from its edge, a film is flat. The value of such a pixel is looked up no
+    # farther away than necessary, because there may be another edge beyond.
     most = torch.where(wanted * distance > 0, distance.abs().clamp(min=_FLAT_PX), _FLAT_PX)
     flat, farthest = (wanted.abs() - _FLAT_PX).clamp(0, 1), torch.sign(wanted) * most
-    # At zero shift, both limits are reached. The derivative is then that of a shift outwards.
+    # At zero shift, the lower and the upper limit are both reached. The derivative is then that of a shift
+    # outwards.
     nearer = wanted.clamp(min=-most)
     nearer = torch.where(nearer < most, nearer, most)
     inwards = nearer + flat * (farthest - nearer) - distance
@@ -144,11 +148,12 @@ def _moved(height: Tensor, outwards_px: Tensor, context: FieldContext) -> Tensor
 
 
 def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
-    """Return the signed distance of each pixel from the nearest edge of a film, and the unit vector along
-    which this distance grows.
+    """Return the signed distance of each pixel from the nearest edge of a film, and for each pixel the unit
+    vector along which this distance increases.
 
-    The distance is in px, positive on the film, and has shape (ny, nx). The vector has shape (2, ny, nx). For
-    pixels farther than ``reach_px`` from an edge, the distance is ±``reach_px`` and the vector is zero.
+    The distance is in px and positive on the film; the array has shape (ny, nx). The unit vectors are an
+    array of shape (2, ny, nx). For pixels farther than ``reach_px`` from an edge, the distance is
+    ±``reach_px`` and the vector is zero.
 
     Args:
         share: fraction of each pixel that the film covers, of shape (ny, nx). Edges lie where it is one half.

@@ -1,5 +1,5 @@
-"""Linear filters, gradients and warps for effects. At zero strength, each filter or warp returns its input
-bit for bit.
+"""Linear filters, gradients and warps that effects use. At zero strength, each filter or warp returns exactly
+its input (bit for bit).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from litho_models.effects.effect import FieldContext
 
-# Below this slope, the absolute slope is smoothed before it is raised to a power.
+# For slopes below this value, ``rounded_power`` is smoothed so that it stays differentiable.
 _LEAST_SLOPE = 1e-3
 
 
@@ -24,8 +24,8 @@ def add_filtered(
     pitch_um: float,
     reach_um: float,
 ) -> Tensor:
-    """Filter a field with the transfer function T. The field filtered with T - 1 is added to the original, so
-    that T = 1 returns the field bit for bit.
+    """Filter a field with a transfer function T. To do so, the field is filtered with T - 1, and the result
+    is added to the original field. If T = 1, the result is therefore exactly the field (bit for bit).
 
     Args:
         field: tensor of shape (b, 1, ny, nx).
@@ -33,7 +33,7 @@ def add_filtered(
             frequencies are those of the padded field and have shapes (rows, 1) and (1, columns/2 + 1).
         pitch_um: lateral sampling, µm.
         reach_um: half the support of the kernel, µm. As in the base models, the field is padded by this
-            length with its edge values.
+            length on each side, with its edge values.
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
@@ -66,18 +66,18 @@ def dose_nearby(context: FieldContext, length_um: Tensor) -> Tensor:
 
 
 def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Return the transfer function T of the filter y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx), which is a
-    one-sided exponential tail of length l.
+    """Return the transfer function T of the recursive filter y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx).
+    Its kernel is a one-sided exponential of length l.
 
-    The function is analytic in l, and T = 1 at l = 0. Its continuous form is 1 / (1 + i 2π f l).
+    T is an analytic function of l, and T = 1 at l = 0. For small pixels, T approaches 1 / (1 + i 2π f l).
     """
     difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
     return 1 / (1 + length_um / pitch_um * difference)
 
 
 def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
-    """Return ``trailing_response`` with its mean delay l removed, because registration removes a
-    mean shift.
+    """Return ``trailing_response`` without its mean delay l. The delay is removed because registration
+    removes every mean shift.
     """
     advance = torch.exp(2j * math.pi * frequency * length_um)
     return trailing_response(frequency, length_um, pitch_um) * advance

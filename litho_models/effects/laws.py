@@ -1,9 +1,10 @@
-"""Laws: short formulas of height, slopes, surroundings, position and order.
+"""Laws: short formulas that describe how the height departs from the model. They depend on the height,
+slopes, surroundings, position in the scan or writing order.
 
 A law is an effect with one strength (a wave has two) and fitted shapes, such as a power, a length, a
-direction or a position. A law states how the height departs from the model, but not why. The same code
-screens, fits, judges and applies all laws. A table is an effect with many strengths. It can describe any
-dependence on one covariate, such as the level or the position, but it does not explain this dependence.
+direction or a position. It names no cause of the departure. Laws are screened, fitted, judged and applied by
+the same code as other effects. A table is an effect with many strengths. It can describe any dependence on
+one covariate, such as the level or the position, but it does not explain this dependence.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from torch.nn import functional
 from litho_models.effects.effect import ActsOn, Apply, Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_filtered, gradient, rounded_power, trailing_response
 
-# Frequencies of waves that screening tries. Over one micrometre, a wave of any frequency between two of them
-# stays nearly in phase with one of the two.
+# Frequencies of waves that screening tries. They are so close that a wave of any frequency between two of
+# them stays nearly in phase with one of the two over a height of one micrometre.
 _WAVES_PER_UM = tuple(0.5 * half for half in range(2, 21))
 _FIELD: dict[ActsOn, str] = {"height": "height", "layout": "dose"}
 _WORDS = ("x", "y", "r²")
@@ -40,7 +41,8 @@ _SIDES = {"left": ("x", -1), "right": ("x", 1), "above": ("y", -1), "below": ("y
 
 @dataclass(frozen=True)
 class Surface:
-    """Compute the quantities in the formula of a law from a field, its context and the parameters of the law.
+    """Compute the quantities that occur in the formula of a law, such as slopes and local means, from a
+    field, its context and the parameters of the law.
 
     ``h`` is the height, µm, of shape (b, 1, ny, nx). For a law of the exposure, it is the dose, expressed as
     a nominal height.
@@ -63,15 +65,16 @@ class Surface:
         return self.along(axis, *gradient(self.h if of is None else of, self.context.pitch_um))
 
     def size(self, *axes: str, power: float | Tensor = 1.0) -> Tensor:
-        """Return a power of the absolute slope along one axis, or of the steepness if two axes are given. The
-        result is smoothed near zero.
+        """Return a power of the absolute slope along one axis. If two axes are given, return a power of the
+        steepness, i.e. of the magnitude of the gradient. The result is smoothed near zero.
         """
         squared = torch.stack([self.slope(one) for one in axes]).square().sum(dim=0)
         return rounded_power(squared, power)
 
     def place(self, word: str) -> Tensor:
-        """Return the value of x, y, r² or ``rim`` at each pixel, where ``rim`` is e^(-d / length) and d is
-        the distance of the pixel from the edge of the scan.
+        """Return a function of the position in the scan at each pixel. ``word`` is its name: ``x``, ``y``,
+        ``r²`` or ``rim``. ``rim`` is e^(-d / length), where d is the distance of the pixel from the edge of
+        the scan.
         """
         y, x = self.context.scan_position()
         if word == "rim":
@@ -81,8 +84,8 @@ class Surface:
         return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(self.h)
 
     def beyond(self, axis: str) -> Tensor:
-        """Return a step along an axis of the scan. It is 0 before the position that the law states and 1
-        beyond it, and it rises linearly over one pixel.
+        """Return a step function along an axis of the scan. It is 0 before the position that is a parameter
+        of the law and 1 beyond this position, and it rises linearly over one pixel.
         """
         number = "yx".index(axis)
         at, size = self.context.scan_position()[number], self.context.whole_shape()[number]
@@ -90,14 +93,14 @@ class Surface:
 
     def mean(self, of: Tensor | None = None) -> Tensor:
         """Return the Gaussian-weighted local mean of a map (by default the height). The standard deviation of
-        the Gaussian is the length of the law.
+        the Gaussian is the parameter ``length_um`` of the law.
         """
         field, reach = self.h if of is None else of, self.values["length_um"]
         return add_blur(field, reach**2, self.context.pitch_um, 4 * float(reach.detach()))
 
     def trailing(self, *sides: str) -> Tensor:
-        """Return the mean height on one side of each pixel, or on two sides. The weights decay exponentially
-        with distance over the length of the law.
+        """Return the weighted mean height on one side of each pixel, or on two sides. The weights decay
+        exponentially with distance, with the decay length ``length_um`` of the law.
         """
         length, pitch = self.values["length_um"], self.context.pitch_um
 
@@ -108,7 +111,8 @@ class Surface:
         return add_filtered(self.h, transfer_minus_one, pitch, 6 * float(length.detach()))
 
 
-# A function that computes the map, of shape (b, 1, ny, nx), by which the strength of a law is multiplied.
+# A function that computes the map by which the strength of a law is multiplied. The map has shape (b, 1, ny,
+# nx).
 Column = Callable[[Surface], Tensor]
 _UNIT_OF_STRENGTH = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
@@ -121,8 +125,8 @@ def _law(
     shapes: Mapping[str, Parameter] = {},
     on: ActsOn = "height",
 ) -> Effect:
-    """Make a law from its name, its formula, and the function ``column``, which computes the map that its
-    strength multiplies. ``unit`` is the unit of this map.
+    """Make a law from its name, its formula (as text), and the function ``column``, which computes the map
+    that is multiplied by the strength. ``unit`` is the unit of this map.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -133,9 +137,9 @@ def _law(
 
 
 def _wave(on: ActsOn, tried: tuple[float, ...]) -> Effect:
-    """Make a law that adds a sine wave of the field itself (height or dose) to the field. A wave in the dose
-    describes slices, and a wave in the height describes standing waves of light. The added wave is zero where
-    the field is zero.
+    """Make a law that adds a sine wave to a field (height or dose). The phase of the wave is proportional to
+    the value of the field itself. A wave in the dose describes the effect of slices, and a wave in the height
+    describes standing waves of light. The added wave is zero where the field is zero.
     """
 
     def apply(field: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -176,7 +180,8 @@ _POWER = {"power": Parameter("1", 0.5, 4.0, 1.0, "shape", tried=(1.0, 1.5, 2.0, 
 _TURN = {"turn_deg": Parameter("deg", -90.0, 90.0, 0.0, "shape", tried=(0.0, 45.0))}
 _REACH = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape", tried=(0.6, 1.5, 4.0))}
 _TAIL = {"length_um": Parameter("µm", 0.3, 12.0, 2.0, "shape", tried=(0.6, 2.0, 6.0)), **_TURN}
-# For laws that state a position in the scan, one trial value of the length is close enough to start a fit.
+# For laws that depend on the position in the scan, screening tries only one value of the length. It is close
+# enough to the best value to start a fit.
 _NEAR = {"length_um": Parameter("µm", 0.3, 8.0, 1.5, "shape")}
 
 
@@ -276,8 +281,8 @@ def _table(title: str, names: Iterable[str], unit: str) -> Callable[[Apply], Eff
 
 @_table("a separate height for each level", _KNOTS, "µm")
 def level_table(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Add a correction that depends on the nominal height of the layout. It is given at seventeen heights and
-    interpolated linearly between them.
+    """Add to the height a correction that depends on the nominal height of the layout. The correction is a
+    parameter at each of seventeen nominal heights, and is interpolated linearly between them.
     """
     knots = torch.stack([values[name] for name in _KNOTS])
     smooth = functional.avg_pool2d(context.layout_um, 3, 1, 1, count_include_pad=False)

@@ -34,12 +34,13 @@ _BLUR_REACH_UM = 4.0
     needs=("probe",),
 )
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Let the probe lag along the fast axis: at each pixel, z += (H - z) / (1 + l / dx). The mean delay is
-    removed.
+    """Let the probe lag along the fast axis: from pixel to pixel, the measured height z follows the surface H
+    by z += (H - z) / (1 + l / dx). The mean delay is removed.
 
     The lag has length l on falling edges, and length ``rising`` × l on rising edges, where the surface pushes
     the probe. If ``rising`` is 1, the probe acts as a linear filter. If it is below 1, the probe parachutes
-    off falling edges. The delay is a constant time, so smaller pixels make the length shorter.
+    off falling edges, i.e. it loses contact there. The time constant of the lag is fixed, so the length is
+    shorter if the pixels are smaller.
     """
     length, pitch = values["length_um"] * context.pixel_size, context.pitch_um
     rising = length * values["rising"]
@@ -66,7 +67,8 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
     """Let the scanner move unevenly along a line: H(x + c L / 4 (1/3 - u²)), where L is the length of a line
     and u runs from -1 to 1 along it.
 
-    The displacement is c x (1 - x / L) minus its mean, because registration removes a mean shift.
+    The full displacement is c x (1 - x / L), where x is measured from the start of the line. The formula
+    leaves out the part of this displacement that registration removes.
     """
     y, x = context.scan_position()
     length_um = context.whole_shape()[1] * context.pitch_um
@@ -115,8 +117,8 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
     ``across`` × R.
     """
     radius = values["radius_um"]
-    # The formula divides by the radius. For very sharp tips, it is therefore evaluated at the smallest
-    # radius, and the change is scaled linearly to zero.
+    # The formula divides by the radius. For tips sharper than ``_SHARPEST_UM``, it is therefore evaluated at
+    # this radius, and the change of the height is scaled in proportion to the true radius.
     blunt = radius.clamp(min=_SHARPEST_UM)
     # A paraboloid is the sum of two parabolas, so the maximum is taken along one axis after the other.
     across, along = blunt * values["across"], blunt * values["along"]
@@ -126,19 +128,20 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
-    """Dilate rows of shape (..., nx) by a parabola. The surface consists of linear pieces that are half a
-    pixel long.
+    """Dilate rows by a parabola. The surface is approximated by linear pieces that are half a pixel long.
+    ``height`` and the result have shape (..., nx).
 
-    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point is not
-    on the piece, the tip touches the end of the piece that is nearest to this point.
+    The tip touches a linear piece of slope s at a distance R s from the axis of the tip. If this point does
+    not lie on the piece, the tip touches the piece at the end that is nearer to this point.
     """
     half_um, size = pitch_um / 2, height.shape[-1]
     middles = _middles(height)
     # Slopes of the pieces to the right of each pixel, then of the pieces to the right of each mid-point.
     slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
     steepest = max(float(s.detach().abs().max()) for s in slopes)
-    # The tip cannot touch a point that is farther away than R s for the steepest slope s, nor one so far away
-    # that its parabola lies below the lowest height there.
+    # The tip cannot touch a point that is farther from its axis than R s, where s is the steepest slope. Nor
+    # can it touch a point that is so far away that the parabola has risen there by more than the whole height
+    # range.
     tops_um = torch.stack([height, middles]).detach()
     deepest_um = math.sqrt(2 * float(radius_um.detach() * (tops_um.max() - tops_um.min())))
     farthest_um = min(float(radius_um.detach()) * steepest, deepest_um)
@@ -169,8 +172,8 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
 
 
 def _middles(rows: Tensor) -> Tensor:
-    """Interpolate rows of shape (..., nx) half a pixel to the right of each pixel, by a cubic through four
-    neighbours.
+    """Interpolate rows half a pixel to the right of each pixel, by a cubic polynomial through four
+    neighbours. ``rows`` and the result have shape (..., nx).
     """
     padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
     middles = padded.unfold(-1, len(_MIDDLE), 1) @ rows.new_tensor(_MIDDLE)

@@ -85,15 +85,15 @@ EFFECTS = (
 )
 
 
-# Known effects that no residual map on the grid of the layout can show, each with the reason.
+# Known effects that cannot be seen in a residual map on the grid of the layout, each with the reason.
 UNTESTABLE = {
     "min-to-zero-datum": "it shifts each scan by the lowest height of the scan; datum-offset covers it",
     "quantisation": "the raw files are not in the store",
     "scars-and-spikes": "they are masked, not modelled; the loop looks for them among the outliers",
 }
 
-# The order in which effects act. The per-scan effects come first; their place has no meaning, because they
-# are never part of a model.
+# The order in which effects act. The per-scan effects are listed first, but their place has no meaning,
+# because they are never part of a model.
 _FORWARD_ORDER = (
     *EFFECTS,
     exposure_spot.layer_stacking,
@@ -130,18 +130,18 @@ _FORWARD_ORDER = (
 TIP = measurement.tip_dilation.name
 
 CATALOGUE = {effect.name: effect for effect in _FORWARD_ORDER}
-# Laws and tables. They are not in the catalogue, because no cause of them is known.
+# Laws and tables. They are not in the catalogue, because their causes are not known.
 _NAMELESS = {**LAWS, **films.FILM_LAWS, **TABLES}
 
 
 def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
-    """Add an effect to the catalogue, so that the loop also tests it, and return it.
+    """Add an effect to the catalogue and return it. From then on, the loop tests this effect too.
 
     Args:
         effect: the new effect. A per-scan effect (one whose ``apply`` is ``of_single_scans``) also needs a
             scan term; see ``litho_models.scan_terms.register_scan_term``.
-        after: name of the effect after which the new effect acts; by default, the new effect acts last in its
-            stage.
+        after: name of the effect directly after which the new effect acts. By default, the new effect acts
+            last in its stage.
 
     Raises:
         InputError: the name is already taken, or there is no effect named ``after``.
@@ -181,11 +181,12 @@ def in_forward_order(names: Iterable[str]) -> list[str]:
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
-    """Return the effects that screening tests: all effects of the catalogue except the per-scan effects.
+    """Return the effects that screening (the fast test of all effects) tests: all effects of the catalogue
+    except the per-scan effects.
 
     Args:
-        tip_radius_um: radius of the tip of the microscope, or an upper bound for this radius, if the store
-            states one. Screening then also tries this radius.
+        tip_radius_um: radius of the tip of the microscope, or an upper bound for this radius; None if the
+            store states neither. If it is given, screening also tries this radius.
     """
     effects = {name: effect for name, effect in CATALOGUE.items() if not effect.per_scan}
     if tip_radius_um is not None:

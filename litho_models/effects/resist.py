@@ -43,8 +43,8 @@ def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Ten
     separating="a wide staircase of all levels",
 )
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Apply the normalised tanh projection with threshold η. It changes nothing for α² -> 0 and becomes a
-    step for α² -> inf.
+    """Apply the normalised tanh projection with threshold η and steepness α. It changes nothing for α² -> 0
+    and becomes a step for α² -> inf.
 
     With x = H / full height, the projection is sinh(αx) / sinh(α) · cosh(α(1 - η)) / cosh(α(x - η)). This
     expression equals the usual quotient of sums of tanh, and it is even and analytic in α.
@@ -79,7 +79,7 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
     separating="a step standard for the microscope, then a printed staircase",
 )
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Lower the whole print by a fraction of its height: (1 - k) H."""
+    """Reduce the height of the whole print by a fraction k: (1 - k) H."""
     return (1 - values["fraction"]) * height
 
 
@@ -109,8 +109,8 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
     """Shrink the tops of the print inwards more than the bases: H(r + s H(r) / full r), where r is measured
     from the centre of the field.
 
-    The shrinkage at the mean height is a change of magnification, which registration removes. A scan
-    therefore shows at position x the point r = x / (1 + s mean / full) of the print.
+    The shrinkage at the mean height is a change of magnification, which registration removes. In a scan, the
+    point r = x / (1 + s mean / full) of the print therefore appears at position x.
     """
     places = context.centred_um()
     share = values["fraction"] / context.full_height_um
@@ -150,8 +150,8 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
     """Apply a morphological closing by a square to the height, which fills pits narrower than the square.
 
-    Squares are an odd number of pixels wide. For other widths, the results of the next narrower and the next
-    wider square are interpolated.
+    The square must be an odd number of pixels wide. For other widths, the result is interpolated between
+    those of the next narrower and the next wider square.
     """
     half_px = (width_um / context.pitch_um / 2).clamp(min=1)
     below = math.floor(float(half_px.detach()))
@@ -175,7 +175,9 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
 
 
 def _running_maximum(field: Tensor, half_px: int, axis: int) -> Tensor:
-    """Return the maximum over 2 half_px + 1 neighbours along an axis; each step doubles the width."""
+    """Return the maximum over 2 half_px + 1 neighbours along an axis. Each step of the computation doubles
+    the width.
+    """
     size, width = 2 * half_px + 1, 1
     while width < size:
         shift = min(width, size - width)
@@ -207,8 +209,8 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     """Remove height on slopes: H - (cx^(2/p) (dH/dx')^2 + cy^(2/p) (dH/dy')^2)^(p/2), where x' and y' are
     rotated axes.
 
-    If cx = cy = c, the loss is c |grad H|^p in any direction. If p = 1 too, each edge moves inwards by
-    about c.
+    If cx = cy = c, the loss is c |grad H|^p, regardless of the direction of the slope. If in addition p = 1,
+    each edge moves inwards by about c.
     """
     power, turn = values["exponent"], torch.deg2rad(values["turn_deg"])
     y, x = gradient(height, context.pitch_um)

@@ -49,8 +49,8 @@ def cross_fit(
     *,
     scan_line: LineIndex | None = None,
 ) -> CrossFit:
-    """Fit terms to pixels of a scan that are not scored, and subtract the fitted terms from the residual of
-    the scored pixels. Fitted and scored pixels then change places, so that every valid pixel is scored.
+    """Return the residual of a scan after its terms have been subtracted. The terms are fitted to pixels that
+    are not scored. Fitted and scored pixels then change places, so that every valid pixel is scored.
 
     Args:
         height_um: measured height, µm, of shape (ny, nx). It may be NaN at pixels that are not valid.

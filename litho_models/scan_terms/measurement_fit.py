@@ -214,6 +214,6 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    """Return the number of the inner fold of each scan. Scans are assigned to folds by a hash of the scan id."""
+    """Return the number of the inner fold of each scan. A hash of the scan id assigns a scan to its fold."""
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
     return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])
