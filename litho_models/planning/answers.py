@@ -1,5 +1,6 @@
-"""For each open question of a plan, compute how much the rivals (competing explanations) differ and the power
-of the planned prints to decide the question, and list all possible outcomes.
+"""For each open question of a plan, compute how much the rivals (competing explanations) differ, and the
+power (the probability that the planned prints decide the question correctly). Also list all possible
+outcomes.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from litho_models.planning.questions import NoiseSpectrum, OpenQuestions, Questi
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
 
-# A difference of this many standard deviations decides between two rivals. It corresponds to the largest
-# allowed probability of naming a wrong cause.
+# A difference of this many standard deviations decides between two rivals. It corresponds to ``CONFIRM_P``,
+# the largest allowed probability of naming a wrong cause.
 Z_DECIDED = float(norm.isf(CONFIRM_P))
-# If the printer is the cause of a per-scan term, this share of the variance of the term is assumed to be
-# variance between prints.
+# If the printer causes a per-scan term, this fraction of the variance of the term is assumed to be variance
+# between prints. The rest is variance between scans of one print.
 PRINT_SHARE = 0.9
 # Power at which the prints count as enough to decide a question.
 ENOUGH = 0.95
-# At this power or below, the planned prints count as unable to separate the rivals, unless a larger number of
-# prints is enough.
+# If the power does not exceed this value, the planned prints count as unable to separate the rivals, unless a
+# larger number of prints is enough.
 HOPELESS = 0.2
 # Largest number of prints for which the power is computed.
 MOST_PRINTS = 12
@@ -39,10 +40,11 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     are assumed to be like the prints of the contrast.
 
     The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
-    of the squared errors is the squared distance between the two predictions. The variance of this difference
-    has two sources. One is the noise along the difference of the predictions. The other is the distance
-    itself, whose relative spread between prints is ``question.spread``. As in the decision, the part of the
-    difference that an error of ``form_nm`` in the form of the model may explain is subtracted.
+    of the squared errors is the squared distance between the two predictions. The actual difference varies
+    about this value for two reasons. One is the noise, projected onto the difference of the predictions. The
+    other is that the squared distance varies between prints, with the relative spread ``question.spread``. As
+    in the decision, the part of the difference that an error of ``form_nm`` in the form of the model may
+    explain is subtracted.
     """
     squares = prints * float(contrast.squares_um2.mean())
     noise = prints * float((contrast.sd_um2**2).mean())
@@ -55,9 +57,10 @@ def of_repeats(prints: int, scans: int) -> float:
     """Return the power of an experiment that attributes a per-scan term to the printer or to the microscope.
     In this experiment, every print is remounted and scanned several times.
 
-    The test is the F test of an analysis of variance. The printer is the cause if the scans of one print
-    agree better than chance allows (p <= 0.005). The microscope is the cause if they agree less well than an
-    effect of the printer allows (p <= 0.005). The smaller of the powers of these two tests is returned.
+    The test is the F test of an analysis of variance. The term is attributed to the printer if the scans of
+    one print agree better than expected by chance (p <= 0.005). It is attributed to the microscope if they
+    agree less well than expected for an effect of the printer (p <= 0.005). The smaller of the powers of
+    these two tests is returned.
     """
     if prints < 2 or scans < 2:
         return 0.0
@@ -72,7 +75,8 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
     """Return the power to decide whether line offsets with standard deviation ``sd_um`` come from the printer
     or from the microscope.
 
-    The scan is rotated, so the lines of the printer and those of the microscope run along different axes.
+    The experiment uses rotated scans, in which the lines of the printer and those of the microscope run along
+    different axes. ``size_px`` is the side length of a print in pixels.
     """
     grid = noise.on_grid((size_px, size_px))
     # The mean over a line has the noise power at frequency 0 along the line.
@@ -83,45 +87,46 @@ def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> f
 
 
 def prints_needed(powers: Sequence[float]) -> int | None:
-    """Return the smallest number of prints whose power is enough; None if no number that was tried is enough.
-    ``powers`` contains the powers for 1, 2, 3, … prints.
+    """Return the smallest number of prints for which the power reaches ``ENOUGH``, or None if no number that
+    was tried is enough. ``powers`` lists the powers for 1, 2, 3, … prints.
     """
     return next((prints for prints, power in enumerate(powers, start=1) if power >= ENOUGH), None)
 
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
-    """Return by how many standard deviations of the noise a gain exceeds the allowance for the error of the
-    model itself. The sign of the result is the sign of the gain.
+    """Return by how many standard deviations of the noise a gain (difference of two squared errors) exceeds
+    the allowance for the error of the model itself. The result has the same sign as the gain.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
     A is true except for noise n and an error e in the form of the model, which both rivals share. Prints then
     show y = A + e + n, and the difference of the two squared errors is |y - B|² - |y - A|² = |D|² - 2<D, e> -
     2<D, n>. The noise averages out over prints, but e recurs in every print of similar texture. The angle
     between e and D is unknown. As |<D, e>| <= |D| |e| (Cauchy and Schwarz), a difference of up to 2 |D| |e|
-    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. The new prints show part
-    of e, because without e and without noise, the gain would be |D|². A deviation of the gain from |D|² that
-    exceeds the noise therefore also counts as an error of the model. The larger of these two allowances is
-    used.
+    is inconclusive, and no number of prints separates rivals with |D| below 2 |e|. There is a second
+    allowance, which is derived from the new prints: without e and without noise, the gain would be |D|². If
+    the gain falls below |D|² by more than the noise explains, this shortfall therefore also counts as an
+    error of the model. The larger of these two allowances is used.
 
     Args:
         gain: |y - B|² - |y - A|². A positive gain favours A, and a negative gain favours B.
-        difference: |D|², the squared difference of the two predictions.
+        difference: |D|², the squared norm of the difference of the two predictions.
         sd: standard deviation that noise causes in the gain.
-        form: |e|², the squared error of the form of the model; 0 if it is unknown. All four arguments are
-            sums over the same pixels, in the same unit.
+        form: |e|², the squared norm of the error in the form of the model; 0 if it is unknown. All four
+            arguments are computed over the same pixels and have the same unit.
     """
     if sd <= 0:
         return 0.0
     unknown = 2 * math.sqrt(difference * form)
     seen = abs(abs(gain) - difference) - Z_DECIDED * sd
-    # A gain that exceeds the expected gain |D|² raises no doubt; a gain below half of it does.
+    # A gain that exceeds the expected gain |D|² raises no doubt about the form of the model, so it adds no
+    # allowance.
     against = max(unknown, seen if abs(gain) < difference else 0.0)
     return float(np.copysign(max(abs(gain) - against, 0.0) / sd, gain))
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
-# Number of random draws of the rivals' parameters within their uncertainty. The power is averaged over these
-# draws, because the difference between two rivals may depend on a parameter.
+# Number of times that the parameters of the rivals are drawn at random within their uncertainty. The power is
+# averaged over these draws, because the difference between two rivals may depend on the parameters.
 DRAWS = 8
 _HOPELESS: Status = "no experiment separates"
 
@@ -133,13 +138,14 @@ def of_rivals(
     random: Sequence[PlannedPrint],
     prints: int,
 ) -> PlannedQuestion:
-    """Plan the answer to a question whose rivals are models. The power to decide it is computed for the
-    planned prints and, as a control, for the same number of prints with random layouts.
+    """Plan how to answer a question whose rivals (competing explanations) are models. The power to decide the
+    question is computed for the planned prints and, as a control, for the same number of prints with random
+    layouts.
 
     Args:
         rivalry: the rivals of the question.
         tried: separation of the two most similar rivals, in standard deviations, for each way to print and
-            scan that was tried.
+            scan that was tried, keyed by a description of this way.
         planned: planned prints on which the rivals are compared.
         random: the same prints with random layouts.
         prints: number of prints in the plan.
@@ -185,8 +191,9 @@ def of_rivals(
 
 
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
-    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one, and the
-    case with the smaller power is used. The power is averaged over the draws of the rivals' parameters.
+    """Compare all pairs of rivals on the given prints. Either rival of a pair may be the true one; of these
+    two cases, the one with the smaller power is used. The power is averaged over random draws of the
+    parameters of the rivals.
     """
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
     powers = []
@@ -212,8 +219,8 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
 def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
-    """Plan the answer to a question whose answer depends only on how prints are scanned or on a missing fact,
-    not on the layouts.
+    """Plan how to answer a question for which the layouts do not matter. Its answer depends only on the way
+    in which prints are scanned, or on a fact that is missing in the dataset card.
 
     Args:
         question: the question.

@@ -2,8 +2,9 @@
 explanations) differ as much as possible.
 
 A layout is built from tiles. Each tile starts as a calibration pattern or a random layout, and is changed by
-gradient ascent to increase the separation of the rivals. In every step, the tile is low-pass filtered and
-clipped, so it stays similar to the layouts to which the models were fitted.
+gradient ascent to increase the separation of the rivals, i.e. the difference of their predictions relative to
+the noise. In every step, the tile is low-pass filtered and clipped, so that it stays similar to the layouts
+to which the models were fitted.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Levels that cover less than this share of earlier prints count as unknown to the models.
+# A level that covers less than this fraction of earlier prints counts as unknown to the models. Planned
+# prints use only the range between the lowest and the highest known level.
 _RARE = 1e-3
-# The mean and the spread of the levels may differ from those of earlier prints. There is no penalty as long
-# as the sum of these two differences, in levels, does not exceed this value.
+# The mean and the standard deviation of the levels may differ from those of earlier prints. There is no
+# penalty as long as the sum of these two differences, in levels, does not exceed this value.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 TURNED = Way(turned_deg=90)
@@ -45,23 +47,24 @@ WORDS = {
     Way(pixel_size=0.5): "with half the pixel size and the same time per pixel",
 }
 _MOST_EXTRAS = 2
-# A further scan is planned if it increases the separation of the rivals by at least this factor.
+# A further scan of each print is planned if it increases the separation of the rivals by at least this
+# factor.
 _WORTH = 1.3
 # Relative dose of the second print. A dose below 1 keeps every exposure in the range to which the models were
 # fitted; a higher dose would not.
 SECOND_DOSE = 0.8
-# If the separation of the rivals is below this value, in standard deviations, the layout does not show their
-# difference.
+# If the separation of the rivals is below this value (in standard deviations), the layout counts as not
+# showing any difference between them.
 _NOTHING = 0.3
-# Registration rejects layouts whose self-similarity exceeds 0.9. The limit here is lower, because prints have
-# less contrast than layouts.
+# Registration rejects layouts whose self-similarity (see ``_repeats``) exceeds 0.9. The limit here is lower,
+# because prints have less contrast than layouts.
 _MOST_REPEATING = 0.7
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits for planned layouts: the lowest and highest level, the highest spatial frequency (cycles/µm),
-    and the mean and standard deviation of the levels in earlier prints.
+    """Limits for planned layouts: the lowest and highest level number, the highest spatial frequency
+    (cycles/µm), and the mean and standard deviation of the level numbers in earlier prints.
     """
 
     lowest: int
@@ -73,8 +76,9 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Derive the limits from earlier prints. A level is allowed if it covers at least a thousandth of
-        these prints, and structures may not be finer than in these prints.
+        """Derive the limits from earlier prints. The lowest and the highest allowed level are those that
+        still cover at least a thousandth of the area of these prints. Structures must not be finer than those
+        in these prints.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
@@ -92,13 +96,15 @@ class Limits:
         return smooth.clamp(self.lowest, self.highest)
 
     def whole(self, soft: np.ndarray) -> np.ndarray:
-        """Round soft levels to the whole levels that the printer can print."""
+        """Round soft levels to whole level numbers, which the printer can print."""
         span = self.highest - self.lowest
         above = quantise((soft - self.lowest) / span, span + 1)
         return above.astype(np.min_scalar_type(self.highest)) + self.lowest
 
     def price(self, soft: Tensor) -> Tensor:
-        """Return a penalty for levels whose mean or standard deviation is far from that of earlier prints."""
+        """Return a penalty that grows if the mean or the standard deviation of the levels is far from that in
+        earlier prints.
+        """
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
@@ -118,11 +124,11 @@ class Limits:
 
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the layouts from which an optimisation may start, each as its name and its levels of shape
-    (size_px, size_px).
+    """Yield the layouts from which an optimisation may start. Each layout is yielded as a pair: its name, and
+    its level numbers as an array of shape (size_px, size_px).
 
-    Periodic patterns get a frame with a random layout, because scans of periodic patterns cannot be
-    registered. The frame is a fifth of the side wide.
+    A periodic pattern is surrounded by a frame with a random layout, because a scan of only a periodic
+    pattern cannot be registered. The width of the frame is a fifth of the side length.
     """
     for number, finest in enumerate((1.0, 0.5, 0.8)):
         yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
@@ -148,8 +154,8 @@ def score(
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
 ) -> float:
-    """Return the separation of the two most similar rivals, in standard deviations, if one print of the
-    layout is made at each dose.
+    """Return the separation of the two most similar rivals, in standard deviations. It is computed for an
+    experiment in which the layout is printed once at each of the given doses.
     """
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
@@ -176,7 +182,8 @@ def climb(
         if fresh:
             refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
         apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
-        # The separation is exact only at steps in which the rivals were refitted to the current layout.
+        # The separation is exact only in steps in which the rivals have been refitted to the current layout,
+        # so only these steps may give the best layout.
         if fresh and apart.min().item() > highest:
             best, highest = soft.detach().numpy().copy(), apart.min().item()
         # The negative log-sum-exp is a soft minimum over the pairs of rivals. With a hard minimum, the ascent
@@ -188,8 +195,9 @@ def climb(
 
 
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
-    """Assemble the tiles of a print into a layout with whole levels, of shape (size_px, size_px). The order
-    of the tiles differs between prints; ``number`` is the number of the print.
+    """Assemble the tiles of a print into a layout with whole level numbers. The order of the tiles depends on
+    ``number``, the number of the print, so it differs between prints. The result has shape (size_px,
+    size_px).
     """
     side = -(-size_px // tiles[0].shape[0])
     order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
@@ -198,16 +206,17 @@ def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Lim
 
 
 def as_tensor(level: np.ndarray) -> Tensor:
-    """Convert the levels of a planned print to a tensor."""
+    """Convert the levels of a planned print to a float32 tensor."""
     return torch.from_numpy(level.astype(np.float32))
 
 
 class Chosen(NamedTuple):
-    """How prints are made and scanned to decide one question, or all questions.
+    """The chosen ways to make and scan prints so that they decide one question, or all questions.
 
-    ``ways`` lists the scans of each print. Successive prints cycle through the ``places`` in the write field
-    and through the ``doses``. ``tried`` contains the separations of the rivals in standard deviations, for
-    one plain scan and for each other way to scan or print in addition to it.
+    ``ways`` lists the scans that are made of each print. Successive prints cycle through ``places``, the
+    positions in the write field, and through ``doses``, the relative doses. ``tried`` contains the
+    separations of the rivals in standard deviations, keyed by a description of the experiment: one plain
+    scan, or a plain scan together with another way to scan or print.
     """
 
     ways: tuple[Way, ...]
@@ -217,10 +226,10 @@ class Chosen(NamedTuple):
 
 
 def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
-    """Choose the ways to print and scan that separate the rivals of a question.
+    """Choose the ways to print and scan that best separate the rivals of a question.
 
     Args:
-        level: layout on which the ways are tried.
+        level: layout on which the ways are tried, as level numbers of shape (ny, nx).
         can_move: whether the write field is larger than a print.
     """
     ways: tuple[Way, ...] = (Way(),)
@@ -228,8 +237,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
-        # The report states the separation for the plain scan plus a single other scan. Values that were found
-        # in the first round are therefore kept.
+        # The report states the separation for the plain scan plus a single other scan. A later round does not
+        # overwrite the values that were found in the first round, which are of this kind.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
@@ -246,8 +255,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 
 def together(choices: Sequence[Chosen], asked: tuple[Way, ...]) -> Chosen:
-    """Combine the choices that were made for the single questions into one for all questions. ``asked``
-    contains the ways to scan that are needed for questions that do not depend on a layout.
+    """Combine the choices that were made for each question into one choice for all questions. ``asked``
+    contains the ways to scan that are needed for questions whose answer does not depend on a layout.
     """
     ways = dict.fromkeys([Way(), *asked, *(way for one in choices for way in one.ways)])
     places = max((one.places for one in choices), key=len, default=("centre",))
@@ -270,7 +279,8 @@ def climbed(
     kept: Path,
     report: Callable[[str], None],
 ) -> list[np.ndarray]:
-    """Optimise ``count`` tiles, for each question in turn. Return the soft (not rounded) levels of each tile.
+    """Optimise ``count`` tiles. Successive tiles are optimised for successive questions, in turn. Return the
+    soft (not rounded) levels of each tile.
 
     Args:
         rivalries: the rivals of each question.
@@ -305,9 +315,10 @@ def climbed(
 
 
 def _repeats(level: np.ndarray) -> float:
-    """Return the self-similarity of a layout, as registration measures it.
+    """Return the self-similarity of a layout, which registration also computes.
 
-    If the value is 1, the layout fits itself equally well at another shift.
+    If the value is 1, the layout matches a shifted copy of itself perfectly, and registration cannot
+    determine the shift.
     """
     topography = predicted_topography(level, SEARCH_BLUR_PX)
     return rival_alignment(topography, topography)

@@ -1,9 +1,10 @@
-"""List the open questions of a closed loop, with all information that is needed to plan an experiment.
+"""List the open questions of a closed loop (a finished search for causes), with all information that is
+needed to plan an experiment.
 
-Effects that look the same become rivals (competing explanations). For each rival, the effect is added to the
-corrected model, and the model is refitted to all scans. If it is unknown whether the printer or the
-microscope causes an effect, the effect becomes two rivals: in one of them, the effect rotates with the print,
-and in the other it rotates with the scan.
+Effects that look the same become rivals (competing explanations). A rival is the corrected model with one of
+these effects, refitted to all scans. If it is unknown whether the printer or the microscope causes an effect,
+the effect becomes two rivals: in one of them, the effect rotates with the print, and in the other it rotates
+with the scan.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ from litho_models.scan_terms.grouped import ALL
 # Largest number of effects that may become rivals in one question. It is limited because every pair of rivals
 # is compared on every layout.
 _MOST_MEMBERS = 3
-# Smallest side of a layout whose spectrum is measured, and the share of the spectral power that lies below
-# the cut-off frequency.
+# ``_SMALLEST_PX``: smallest side of a layout whose spectrum is measured. ``_POWER_KNOWN``: fraction of the
+# spectral power that lies below the cut-off frequency.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
 def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
-    """Return all open questions with their fitted rivals: first the questions about causes, then those about
-    unconfirmed effects, per-scan terms and missing facts.
+    """Return all open questions with their fitted rivals, in this order: questions about causes and laws that
+    were found, about unconfirmed effects, about per-scan terms, and about missing facts.
     """
     asking = _Asking(closed)
     found = [asking.of_cause(one) for one in closed.traced]
@@ -91,15 +92,16 @@ class _Asking:
         self.noise = noise_spectrum(self.left_nm)
 
     def of_cause(self, cause: Cause) -> Question | None:
-        """Return the open question about a cause: which effect of a set of similar effects is present, or
-        whether the printer or the microscope causes the effect. Return None if neither is open.
+        """Return the open question about a cause. The question is which effect of a set of similar effects is
+        present, or whether the printer or the microscope causes the effect. Return None if both are already
+        known.
         """
         members = [cause.name, *cause.alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(cause.name, self.twin.values()[cause.name])) == 1:
             return None
         without = self.twin.without(cause.name)
-        # A rival effect that replaces the cause starts from the values that screening found before any cause
-        # was added.
+        # If another effect replaces the cause, its fit starts from the values that screening found before any
+        # cause was added to the model.
         first = {**self.closed.lawful.first, **self.closed.named.first}
         twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
         return _question(
@@ -111,8 +113,8 @@ class _Asking:
         )
 
     def of_suspects(self) -> Question | None:
-        """Return the question about effects that are significant but not confirmed: which of them explains
-        the residual, if any.
+        """Return the question about effects that are significant in screening but that held-out scans did not
+        confirm: which of them, if any, explains the residual. Return None if there is no such question.
         """
         named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
@@ -126,8 +128,8 @@ class _Asking:
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
         rivals = self._rivals(names, [_with(self.twin, one) for one in standing])
-        # The loop estimated the error in the form of the model without these effects. Here it is estimated
-        # with each of these effects in the model.
+        # The loop has estimated the error in the form of the model without these effects. Here this error is
+        # estimated for each model with one of these effects, and the smallest estimate is used.
         learner = Learner(self.study, self.maps)
         maps = ([*map(rival.twin(self.twin).height, self.study.scans)] for rival in rivals)
         form_nm = min(learner.rest(one).most_nm for one in maps)
@@ -158,13 +160,14 @@ class _Asking:
         return rivals
 
     def _spread(self, name: str) -> float:
-        """Return how much the evidence for an effect varies over scans: the standard deviation relative to
-        the mean, after the variation that noise causes is subtracted.
+        """Return how much the evidence for an effect varies over scans, as the standard deviation relative to
+        the mean. The variation that noise causes has been subtracted from it.
 
         Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that
         fits the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a -
-        1) plus noise, so the relative spread of this difference is twice the spread of a. Differences between
-        groups of scans are part of d, so they do not contribute to this spread.
+        1) plus noise, so the relative spread of this difference is twice the spread of a. If the strength
+        differs between groups of scans, d contains these differences, so they do not contribute to the
+        spread.
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []
@@ -174,7 +177,8 @@ class _Asking:
             if size:
                 multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
                 own.append(self.noise.along(change) ** 2 / size)
-        # A robust estimate of the spread is used, because a scan may have a defect.
+        # The spread is estimated robustly (from the median absolute deviation), because a scan may have a
+        # defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
 
@@ -184,12 +188,12 @@ def _with(twin: Twin, one: Screened) -> Twin:
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
-    """Return the possible sources of an effect. If scans of one orientation cannot show whether the printer
-    or the microscope causes the effect, the list contains both. Otherwise, it contains only None, which
+    """Return the possible sources (printer or microscope) of an effect. If scans of one orientation cannot
+    show which of the two causes the effect, the list contains both. Otherwise, it contains only None, which
     stands for the source that the catalogue states.
 
-    The tip is a source of doubt too: a tip that is sharper along one axis looks like a print with wider
-    flanks along that axis.
+    The source of the effect of a tip is also doubtful if the tip is asymmetric: a scan with a tip that is
+    blunter along one axis looks like a scan of a print with wider flanks along that axis.
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
@@ -211,8 +215,8 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
-    """Make a question about the named effects, with its text. A question of kind ``fact`` is about one
-    effect, and ``text`` then states which fact is missing.
+    """Make a question about the named effects, and phrase its text. A question of kind ``fact`` is about a
+    single effect; for such a question, ``text`` must state which fact is missing.
     """
     first, *others = [get_effect(name).title for name in names]
     if kind == "lines":

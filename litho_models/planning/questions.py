@@ -1,10 +1,11 @@
 """The record ``open_questions.json`` with the open questions of a closed loop, from which experiments are
 planned.
 
-The possible answers to a question are called rivals (competing explanations). All rivals are fitted from the
-same starting points, because the fit of the base model has more than one optimum. For example, an almost
-straight projection and a steep projection are different optima. If two equivalent effects were fitted from
-different starting points, their predictions on new layouts could differ by several nm² for this reason alone.
+The possible answers to a question are called rivals (competing explanations). The fits of all rivals start
+from the same values of the base parameters, because the fit of the base model has more than one optimum. For
+example, an almost linear and a steep projection from dose to height are different optima. If the fits of two
+equivalent effects ended in different optima, the squared difference of their predictions on new layouts could
+be several nm² for this reason alone.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _TILE_PX = 64
 
 
 class NoiseSpectrum(Record):
-    """The power spectrum of the noise, nm², averaged over tiles of the residuals.
+    """The power spectrum of the noise, nm². It is estimated from residuals, as the average over square tiles.
 
     ``power_nm2`` has shape (n, n), for tiles with a side of n pixels. Its frequencies are in the order of
     ``np.fft.fft2``, and its mean is the variance of a pixel.
@@ -43,14 +44,16 @@ class NoiseSpectrum(Record):
     power_nm2: list[list[float]]
 
     def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the power, nm², at the frequencies of ``np.fft.fft2`` for a map of the given shape."""
+        """Interpolate the power, nm², to the frequencies that ``np.fft.fft2`` uses for a map of the given
+        shape. The result has the given shape.
+        """
         power = np.array(self.power_nm2)
         at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
         return map_coordinates(power, at, order=1, mode="grid-wrap")
 
     def along(self, change: np.ndarray) -> float:
-        """Return the standard deviation, nm, of the noise projected onto a change of the height of shape (ny,
-        nx).
+        """Return the standard deviation, nm, of the noise after projection onto a given change of the height,
+        which is a map of shape (ny, nx).
 
         The projection is the sum over pixels of noise times change, divided by the norm of the change.
         """
@@ -59,8 +62,9 @@ class NoiseSpectrum(Record):
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
-    """Return the measured minus the predicted height of a scan, nm, after its free terms have been fitted and
-    subtracted. The map has shape (ny, nx) and leaves out the edge of the scan.
+    """Return the measured minus the predicted height of a scan, nm, after the per-scan terms that are free in
+    every scan have been fitted and subtracted. The result is a two-dimensional map without the pixels at the
+    edge of the scan.
 
     Pixels that were not measured are NaN.
     """
@@ -73,7 +77,8 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
     """Compute the noise spectrum from the residual maps that ``left_nm`` returns. Only tiles without missing
-    pixels are used; if there are none, the spectrum is that of white noise.
+    pixels are used. If there is no such tile, the spectrum of white noise with the variance of the residuals
+    is returned.
     """
     size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = np.outer(*[np.hanning(size + 2)[1:-1]] * 2)
@@ -96,16 +101,17 @@ Owner = Literal["printer", "microscope"]
 
 
 class Rival(Record):
-    """One possible answer to a question (a competing explanation). It is a model fitted to earlier prints:
-    the base with effects whose strengths are the same in all scans.
+    """One possible answer to a question (a competing explanation). It is a model that was fitted to earlier
+    prints and that consists of the base model and effects. The strengths of these effects are the same in all
+    scans.
 
     Attributes:
         effect: name of the effect that this answer assumes.
         owner: source of the effect (printer or microscope) that this answer assumes, if the question is about
             the source.
-        effects: parameter values of all effects in the model, by the name of the effect.
+        effects: parameter values of all effects in the model, keyed by the name of the effect.
         vector: the p fitted parameters. The parameters of the base come first.
-        information: normal matrix of the fit over all pixels, µm², of shape (p, p).
+        information: normal matrix of the fit, scaled to the number of all pixels, µm², of shape (p, p).
         covariance: cluster-robust covariance of the parameters, of shape (p, p). The clusters are prints or
             scans.
     """
@@ -123,9 +129,9 @@ class Rival(Record):
         return self.effect if self.owner is None else f"{self.effect} as the {self.owner}'s"
 
     def twin(self, base: Twin) -> Twin:
-        """Return the model of this answer, which has the base model of ``base`` and the effects of this
-        answer. If a source of the effect is assumed, the effect rotates with the print (printer) or with the
-        scan (microscope).
+        """Return the model of this answer. It has the base model of ``base`` and the effects of this answer.
+        If this answer assumes that the printer causes the effect, the effect rotates with the print. If it
+        assumes the microscope, the effect rotates with the scan.
         """
         effects = {name: Added(ALL, {"": values}) for name, values in self.effects.items()}
         frames: dict[str, Frame] = {"microscope": "scan", "printer": "print"}
@@ -139,16 +145,19 @@ class Question(Record):
     Attributes:
         kind: what the question asks. ``set``: which effect of an indistinguishable set is present;
             ``suspects``: which of several unconfirmed effects is present; ``role``: whether the printer or
-            the microscope causes an effect; ``per-scan`` and ``lines``: the same for a per-scan term and for
-            line offsets; ``fact``: a fact that is missing in the dataset card.
+            the microscope causes an effect; ``per-scan``: whether the printer or the microscope causes a
+            per-scan term; ``lines``: whether the printer or the microscope causes line offsets; ``fact``: a
+            fact that is missing in the dataset card (the TOML file that describes a campaign).
         text: the question in words.
         experiment: experiments that would answer the question, in words.
         rivals: the possible answers.
-        spread: how much the evidence for the effect varies between prints: the standard deviation relative to
-            the mean, after the variation that noise causes is subtracted.
-        form_nm: upper bound on the rms error in the form of the model; None if it is unknown. The bound is
-            derived from the part of the residual of the best answer that could still be learned.
-        sizes: standard deviations over scans of the parameters of a per-scan term, by parameter.
+        spread: how much the evidence for the effect varies between prints, as the standard deviation relative
+            to the mean. The variation that noise causes has been subtracted from it.
+        form_nm: upper bound, nm, on the rms error that is due to a wrong form of the model; None if it is
+            unknown. The bound is derived from the part of the residual of the best answer that could still be
+            learned.
+        sizes: standard deviations of the parameters of a per-scan term over scans, keyed by the name of the
+            parameter.
     """
 
     name: str
@@ -162,12 +171,12 @@ class Question(Record):
 
 
 class OpenQuestions(Result):
-    """The record ``open_questions.json``, which contains the open questions and the noise that limits how
-    well they can be decided.
+    """The record ``open_questions.json``. It contains the open questions, and the spectrum of the noise,
+    which limits how well these questions can be decided.
 
-    ``level_share`` is the share of each level in earlier layouts, ``cutoff_per_um`` is the spatial frequency
-    of their finest structures, cycles/µm, and ``write_field_um`` is the width of the write field, if it is
-    known.
+    ``level_share`` contains, for each level, the fraction of earlier layouts that it covers.
+    ``cutoff_per_um`` is the spatial frequency of the finest structures in these layouts, cycles/µm.
+    ``write_field_um`` is the width of the write field, or None if it is unknown.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
@@ -182,8 +191,8 @@ class OpenQuestions(Result):
 
 
 def fit_rivals(twins: Sequence[Twin], windows: Sequence[PreparedScan]) -> list[LeastSquaresFit]:
-    """Fit each model first from its current values, and then with the base parameters of the best of these
-    fits as the starting point. For each model, keep the better of the two fits.
+    """Fit each model twice: first from its current parameter values, and then again with the base parameters
+    of the best of these first fits as the starting values. For each model, keep the better of the two fits.
     """
 
     def fitted(twin: Twin) -> LeastSquaresFit:

@@ -16,7 +16,8 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 class PlannedScan(Record):
     """One planned scan. ``field_x_um`` and ``field_y_um`` are the position of its print in the write field,
-    and ``dose`` is the relative dose of this print. ``print`` is 0 for the references.
+    and ``dose`` is the relative dose of this print. ``print`` is the number of the print, or 0 for scans of a
+    reference.
     """
 
     id: str
@@ -34,11 +35,12 @@ class PlannedScan(Record):
 
 
 class PlannedPair(Record):
-    """Two rivals (competing explanations), compared on the planned prints.
+    """The predicted comparison of two rivals (competing explanations) on the planned prints.
 
     ``difference_nm`` is the rms difference between the predictions of the two rivals, after one of them was
-    refitted to the other. ``noise_nm`` is the standard deviation per pixel of the noise along this
-    difference. ``power`` contains the probability of a right decision with 1, 2, 3, … prints.
+    refitted to the prediction of the other. ``noise_nm`` is the standard deviation per pixel of the noise,
+    projected onto this difference. ``power`` lists the probabilities of a right decision with 1, 2, 3, …
+    prints.
     """
 
     rivals: tuple[str, str]
@@ -50,12 +52,13 @@ class PlannedPair(Record):
 class PlannedQuestion(Record):
     """An open question, and how the plan answers it.
 
-    ``power`` contains the probability of a right decision with 1, 2, 3, … prints. ``random_power`` contains
-    the same probability for random layouts that are scanned in the same way. ``difference_nm`` is the rms
-    difference between the two most similar rivals on the planned prints, and ``random_difference_nm`` on the
-    random layouts. ``prints_needed`` is the number of prints for a power of 0.95, or None if no number that
-    was tried is enough. ``form_nm`` is an upper bound on the error in the form of the model, or None if it is
-    unknown.
+    ``power`` lists the probabilities of a right decision with 1, 2, 3, … prints. ``random_power`` lists the
+    same probabilities for prints with random layouts that are scanned in the same way. ``difference_nm`` is
+    the rms difference between the predictions of the two most similar rivals (competing explanations) on the
+    planned prints. ``random_difference_nm`` is the corresponding difference on the random layouts.
+    ``prints_needed`` is the number of prints for a power of 0.95, or None if no number that was tried is
+    enough. ``form_nm`` is an upper bound on the rms error that is due to a wrong form of the model, or None
+    if it is unknown.
     """
 
     name: str
@@ -78,8 +81,9 @@ class PlannedQuestion(Record):
 class NextPrint(Result):
     """A plan: the prints, their scans, and the questions that the prints and scans are meant to decide.
 
-    ``settings`` contains the settings with which the user made the plan. ``levels`` contains the lowest and
-    the highest level of the layouts, and ``cutoff_per_um`` their highest spatial frequency, cycles/µm.
+    ``settings`` contains the settings with which the user made the plan. ``levels`` is a pair: the lowest and
+    the highest level number that the layouts may contain. ``cutoff_per_um`` is the highest spatial frequency
+    in the layouts, cycles/µm.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"

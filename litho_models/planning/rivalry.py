@@ -1,11 +1,13 @@
-"""Compute the separation of rivals (competing explanations) on planned scans: the difference that remains
-between two of them after one is refitted to the other, relative to the noise.
+"""Compute the separation of rivals (competing explanations) on planned scans. The separation is the
+difference that remains between the predictions of two rivals after one is refitted to the other, relative to
+the noise.
 
 The criterion is T-optimality (Atkinson and Fedorov 1975): the distance from the prediction of one model to
 the nearest prediction that the other model can make. It is not known which of the two models is true, so the
 distance is computed in both directions, and the smaller one counts (a simple form of the symmetric criterion
-of Harman and Müller, arXiv:1709.10320). Datum, tilt, bow, gain and affine registration are free in every
-scan. The refitted model must stay consistent with earlier prints and within the ranges of its parameters.
+of Harman and Müller, arXiv:1709.10320). Datum, tilt, bow, gain and affine registration are fitted to every
+scan, so differences of these kinds do not count. The refitted model must stay consistent with earlier prints
+and within the ranges of its parameters.
 """
 
 from __future__ import annotations
@@ -38,11 +40,13 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made. The fields of this class are also columns in the table of planned scans.
+    """The way in which one scan is made. The fields of this class are also columns in the table of planned
+    scans.
 
     ``turned_deg`` is the angle by which the print is rotated under the microscope. ``direction`` is 1 for the
     trace and -1 for the retrace. ``tip`` is 1 for the tip of earlier scans and 2 for a new, sharp tip.
-    ``pixel_size`` is the size of a pixel relative to earlier scans, with the same time per pixel.
+    ``pixel_size`` is the size of a pixel relative to that of earlier scans; the time per pixel stays the
+    same.
     """
 
     turned_deg: int = 0
@@ -55,9 +59,10 @@ class Way:
 class PlannedPrint:
     """One planned print (a printed field) and its scans.
 
-    ``level`` contains the levels of the layout, whole or not rounded, and has shape (ny, nx). ``ways`` lists
-    the scans. ``place`` is the position in the write field. ``order`` is the position in the writing order,
-    from -0.5 (first) to 0.5 (last). ``dose`` is relative to earlier prints.
+    ``level`` contains the levels of the layout and has shape (ny, nx). The levels may be rounded or not.
+    ``ways`` lists the ways in which the print is scanned, one per scan. ``place`` is the position in the
+    write field. ``order`` is the position in the writing order, from -0.5 (first) to 0.5 (last). ``dose`` is
+    relative to earlier prints.
     """
 
     level: Tensor
@@ -79,16 +84,16 @@ class Printing:
     write_field_um: float | None = None
 
     def reach_um(self, printed: PlannedPrint) -> float:
-        """Return the distance, along each axis, from the centre of the write field to the centre of a print
-        at its place, µm. It is 0 for a print at the centre. A print at the edge lies in a corner of the write
-        field.
+        """Return the distance from the centre of the write field to the centre of a print, µm. The distance
+        is the same along both axes. It is 0 for a print at the centre. A print at the edge lies in a corner
+        of the write field.
         """
         if printed.place == "centre" or self.write_field_um is None:
             return 0.0
         return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
 
     def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
-        """Return the context of a planned scan, which effects need."""
+        """Return the facts about a planned scan that effects need, such as its orientation and its dose."""
         reach_um = self.reach_um(printed)
         return FieldContext(
             layout_um,
@@ -113,9 +118,9 @@ class Printing:
 
 @dataclass(frozen=True)
 class Contrast:
-    """The difference between two rivals on some prints: the prediction of a rival that is assumed to be true,
-    and that of another rival refitted to it. Each attribute has one value for each print and has shape
-    (prints,).
+    """The difference between the predictions of two rivals on some prints. One rival is assumed to be true,
+    and the other is refitted to its prediction. Each attribute has shape (prints,), with one value for each
+    print.
 
     ``squares_um2`` is the squared distance between the two predictions, summed over all pixels and scans of a
     print. ``sd_um2`` is the standard deviation that noise causes in the difference of the squared errors of
@@ -133,14 +138,15 @@ class Contrast:
 
     @property
     def noise_nm(self) -> float:
-        """Return the standard deviation per pixel of the noise along the difference of the
+        """Return the standard deviation per pixel of the noise after projection onto the difference of the
         predictions, nm.
         """
         return NM_PER_UM * float((self.sd_um2 / (2 * self.squares_um2.sqrt() + _SMALLEST)).mean())
 
     def separation(self, spread: float) -> Tensor:
-        """Return the squared distance in units of its standard deviation. The result is differentiable.
-        ``spread`` is the field ``spread`` of the question, by which the distance varies between prints.
+        """Return the squared distance between the two predictions in units of its standard deviation. The
+        result is differentiable. ``spread`` is the relative standard deviation of the squared distance
+        between prints (the field ``spread`` of the question).
         """
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
@@ -152,7 +158,7 @@ class Rivalry:
     Args:
         question: a question with at least two rivals.
         base: the base model of all rivals. Its parameters come first in the field ``vector`` of a rival.
-        printing: settings that all prints share.
+        printing: settings that all planned prints share.
         noise: spectrum of the noise, measured on the residuals of earlier prints.
     """
 
@@ -161,7 +167,8 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.twins = [rival.twin(Twin.bare(base)) for rival in question.rivals]
-        # Each of the models in ``true`` is in turn assumed to be true. Refits start from ``twins``.
+        # Each of the models in ``true`` is in turn assumed to be the true one. Refits of a model start from
+        # its entry in ``twins``.
         self.true = self.chains = [*map(_chain, self.twins)]
 
     @property
@@ -173,7 +180,8 @@ class Rivalry:
 
     def drawn(self, random: np.random.Generator) -> Rivalry:
         """Return a copy in which the parameters of the models that are assumed to be true are drawn at
-        random, within the uncertainty that remains after earlier prints.
+        random. They are drawn from the normal distribution that describes their uncertainty after earlier
+        prints.
         """
         other = copy.copy(self)
         other.true = []
@@ -189,11 +197,12 @@ class Rivalry:
         rounds: int = 1,
         first: Sequence[list[Linearised]] | None = None,
     ) -> list[EffectChain]:
-        """For each ordered pair, fit the second model to the prediction of the first. Return the fitted
-        models.
+        """For each ordered pair of rivals, refit the second model to the prediction of the first. Return the
+        refitted models, one per pair, in the order of ``pairs``.
 
         Args:
-            prints: planned prints. The fit is not differentiable in the levels of these prints.
+            prints: planned prints. The refit is not differentiable with respect to the levels of these
+                prints.
             rounds: number of Gauss-Newton steps. With a single step, the refit is linear.
             first: the result of ``linearised`` for these prints, if it has already been computed.
         """
@@ -216,12 +225,15 @@ class Rivalry:
         return found
 
     def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
-        """Linearise all models at the parameters from which a refit starts."""
+        """Linearise the models of all rivals at the parameters from which a refit starts. Return, for each
+        model, one linear problem per scan.
+        """
         return [self._linearise(twin, prints) for twin in self.twins]
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
-        """Return the contrast of every ordered pair on the given prints. It is differentiable in
-        the levels.
+        """Return the contrast of every ordered pair of rivals on the given prints. The argument ``refitted``
+        is what the method of this name returns for these prints. The contrasts are differentiable with
+        respect to the levels of the prints.
         """
         true = [self._predict(chain, prints) for chain in self.true]
         return [
@@ -230,16 +242,16 @@ class Rivalry:
         ]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Return the separation of each ordered pair in standard deviations, of shape (pairs,). It is
-        differentiable in the levels.
+        """Return the separation of each ordered pair of rivals, in standard deviations. The result has shape
+        (pairs,) and is differentiable with respect to the levels of the prints.
         """
         return torch.stack([one.separation(self.question.spread) for one in self.contrasts(prints, refitted)])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
     ) -> Contrast:
-        """Compare two models on the given prints. To compute the noise, the difference maps of the scans of a
-        print are added, because all of these scans show the same roughness.
+        """Compare the predictions of two models for the given prints. To compute the noise, the difference
+        maps of all scans of a print are added first, because all of these scans show the same roughness.
         """
         found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
@@ -263,8 +275,8 @@ class Rivalry:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
     def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
-        """Linearise a model on each scan of the prints. The residual is minus the predicted height, to which
-        the caller adds the target of the fit.
+        """Linearise the predictions of a model for each scan of the prints. The residual in the result is
+        minus the predicted height; the caller must add the target of the fit.
         """
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)

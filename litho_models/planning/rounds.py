@@ -1,12 +1,13 @@
 """Run a loop, write its open questions, and decide these questions with later prints of the same printer.
 
 Every rival (competing explanation) is fitted to all prints, old and new, and judged only on the new prints.
-For each pair of rivals, the difference of their squared errors, minus an allowance for the error of the model
-itself, is compared with its standard deviation. The standard deviation is estimated from the scatter over
-blocks of pixels and, as in the plan, from the spread between prints. The scans of one print share its
-roughness, so the values of their blocks are first added up. A rival is excluded if another rival fits better
-with p <= 0.005 and the difference is at least 1 % of the squared error of the better rival. If only one rival
-remains, it is the answer.
+For each pair of rivals, the difference of their squared errors is computed. An allowance for the error of the
+model itself is subtracted from this difference, and the result is divided by its standard deviation. The
+standard deviation is estimated from the scatter over blocks of pixels and, as in the plan, from the spread
+between prints. All scans of a print show the same roughness, so corresponding blocks of these scans are added
+before the scatter is computed. A rival is excluded if another rival fits better with p <= 0.005 and the
+difference is at least 1 % of the squared error of the better rival. If only one rival remains, it is the
+answer.
 """
 
 from __future__ import annotations
@@ -61,13 +62,13 @@ def close_loop(
     Args:
         store: store on which the loop is closed.
         out: folder of the result.
-        new_prints: further stores with prints of the same printer. They are used to decide the open questions
-            (see ``decide``). The search for effects uses only the first store.
+        new_prints: further stores, which contain later prints of the same printer. These prints are used to
+            decide the open questions (see ``decide``). The search for effects uses only the first store.
         settings: further arguments of ``loop.run.close_loop``.
 
     Raises:
         InputError: as in ``loop.run.close_loop``. The error is also raised if a further store is of another
-            printer, or if a scan is rotated but its dataset card does not say so.
+            printer, or if the orientation of a scan differs from the one that its dataset card states.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
@@ -83,12 +84,12 @@ def close_loop(
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Return the scans of a further store. Before, check that the store is of the same printer as the first
-    store, and that the scans have the orientation that the dataset card states.
+    """Return the scans of a further store, after two checks: the store must be of the same printer as the
+    first store, and the scans must have the orientation that the dataset card states.
 
     Raises:
-        InputError: the store is of another printer, it was planned for another dataset, or a scan has another
-            orientation than its card states.
+        InputError: the store is of another printer, its prints were planned for another dataset, or a scan
+            has another orientation than the dataset card states.
     """
     for name in ("pitch_um", "level_height_um", "levels"):
         if getattr(store, name) != getattr(first, name):
@@ -108,7 +109,8 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
     scans = store.scans()
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
-        # The sign of a rotation is a convention, but registration shows whether a print was rotated by 90°.
+        # Only odd multiples of 90° are compared. Registration shows whether a print was rotated by 90°, but
+        # the sign of a rotation is a matter of convention.
         if (stated - scan.quarter_turns) % 2:
             raise InputError(
                 f"scan {scan.id} of {store.path}",
@@ -126,7 +128,7 @@ def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> 
     Args:
         closed: the loop whose questions these are.
         open_: the open questions of this loop.
-        new: scans that this loop did not use.
+        new: new scans, which this loop did not use.
     """
     judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
     kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
@@ -153,8 +155,8 @@ class Judge:
     new: Sequence[PreparedScan]
 
     def among_rivals(self, question: Question) -> Decision:
-        """Fit every rival, and a model without the effect in question, to the old and new scans. Judge these
-        fits on the new scans.
+        """Fit every rival (competing explanation) of the question to the old and new scans. Also fit a model
+        without the effect in question. Then judge these fits on the new scans.
         """
         twins = [rival.twin(self.twin) for rival in question.rivals]
         without = twins[0].without(question.rivals[0].effect)
@@ -168,8 +170,8 @@ class Judge:
         return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
-        """Compare the variance of a per-scan term between prints with its variance between the
-        scans of one print.
+        """Decide whether the printer or the microscope causes a per-scan term. For this purpose, compare the
+        variance of the term between prints with its variance between the scans of one print.
         """
         own = terms_of_effect(question.name)
         scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
@@ -192,8 +194,9 @@ class Judge:
         return _decision(question, self.new, left, told)
 
     def of_lines(self, question: Question) -> Decision:
-        """In the rotated scans, compare the variance of offsets of the layout's rows with the variance of
-        offsets of the scan lines.
+        """Decide whether the printer or the microscope causes line offsets. For this purpose, compare two
+        variances in the rotated scans: that of the offsets of the layout's rows, and that of the offsets of
+        the scan lines.
         """
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:
@@ -216,8 +219,8 @@ class Judge:
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
     """Add the decisions to the result. If a decision leaves one effect as the only possible answer, the
-    verdict on this effect becomes ``explained``, and its role becomes that of its source (printer or
-    microscope).
+    verdict on this effect becomes ``explained``. Its role becomes ``process`` if the printer causes it and
+    ``measurement`` if the microscope causes it.
     """
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
     roles = {
@@ -243,12 +246,12 @@ def compared(
     Args:
         question: the question.
         new: the new scans.
-        left_nm: for each answer, and for the model without the effect, its residual on each new scan as a map
-            of shape (ny, nx), nm.
+        left_nm: residual of each answer, and of the model without the effect, on each new scan. The lists are
+            keyed by the name of the answer and contain one map of shape (ny, nx), nm, per scan.
     """
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
-    # As in the loop, a difference smaller than this share of the squared error does not count, because it may
-    # come from effects that are not among the rivals.
+    # As in the loop, a difference that is smaller than the fraction ``SMALLEST_SHARE`` of the squared error
+    # does not count, because it may come from effects that are not among the rivals.
     least = {
         name: SMALLEST_SHARE * float(np.mean([np.nanmean(one**2) for one in own]))
         for name, own in left_nm.items()
@@ -277,7 +280,7 @@ def _compare(
     new: Sequence[PreparedScan],
     question: Question,
 ) -> Comparison:
-    """Compare the squared errors of two rivals.
+    """Compare the squared errors of two rivals (competing explanations) on the new scans.
 
     The squared errors are summed over blocks of pixels. Their difference is compared with its spread over the
     blocks of a print and with its spread between prints.
@@ -290,8 +293,8 @@ def _compare(
         name = scan.stored.print_id
         by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
-    # The mean over the blocks of a print is the result of this print. The scatter of the blocks about this
-    # mean is noise.
+    # The mean over the blocks of a print counts as the result of this print. The scatter of the blocks about
+    # this mean counts as noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
     sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
     form = pixels * (question.form_nm or 0.0) ** 2
@@ -310,8 +313,9 @@ def _block_sums(gain: np.ndarray) -> np.ndarray:
 
 
 def _left(printer: bool, microscope: bool) -> Sequence[str]:
-    """Return the sources (printer, microscope) that remain possible after a test. ``printer`` and
-    ``microscope`` say whether the test points to this source.
+    """Return the sources (printer, microscope) that remain possible after a test. ``printer`` states whether
+    the test points to the printer, and ``microscope`` whether it points to the microscope. If it points to
+    neither or to both, both sources remain possible.
     """
     return BOTH if printer == microscope else [PRINTER if printer else MICROSCOPE]
 
@@ -323,14 +327,15 @@ def _decision(
     evidence: str,
     verdict: Decided | None = None,
 ) -> Decision:
-    """Make the decision on a question. By default, the question counts as decided if only one answer remains.
+    """Make the record of the decision on a question. By default, the question counts as decided if only one
+    answer remains.
 
     Args:
         question: the question.
         scans: the scans on which it was decided.
         left: the answers that remain possible.
         evidence: the evidence, in words.
-        verdict: the verdict, if it does not follow from the number of remaining answers.
+        verdict: the verdict; None if it follows from the number of remaining answers.
     """
     return Decision(
         question=question.name,

@@ -1,7 +1,7 @@
 """Plan the next prints from a closed loop.
 
-The plan is a folder that contains a dataset whose scans are still missing, and instruction sheets for the
-people who operate the printer and the microscope.
+The plan is a folder. It contains a dataset in which only the scans are still missing, and instruction sheets
+for the people who operate the printer and the microscope.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from litho_models.planning.record import NextPrint, PlannedScan
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
 
-# Number of planned prints on which the rivals are finally compared. Further prints would repeat the same
-# tiles.
+# Number of planned prints on which the rivals (competing explanations) are finally compared. More prints are
+# not needed for this comparison, because they consist of the same tiles.
 _JUDGED = 2
 _FEWEST_PRINTS, _TILES = 2, 4
 _SMALLEST_PX = 64
@@ -78,7 +78,8 @@ _USES = {
     "flat": "one level everywhere: shows the noise floor",
     "steps": "a staircase of levels: shows the height of each level",
 }
-# Periods of commercial gratings, µm, and the smallest number of periods that a scan must contain.
+# ``_PERIODS_UM``: periods of commercial gratings, µm. ``_FEWEST_PERIODS``: smallest number of periods that a
+# scan must contain.
 _PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 _TREAD_PX = 30
 _LADDER_PX = 5 * _TREAD_PX
@@ -95,14 +96,14 @@ def next_print(
     layouts: Literal["optimised", "random"] = "optimised",
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
-    """Plan prints and scans that decide the open questions of a closed loop. Return None if no question is
-    open.
+    """Plan prints and scans that decide the open questions of a closed loop. Write the plan to the folder
+    ``out`` and return its record. Return None if no question is open.
 
     Args:
         loop: folder with the result of a closed loop.
         out: folder of the plan, which appears only when the plan is complete.
         prints: largest number of prints.
-        field_um: side length of each print.
+        field_um: side length of each print, µm.
         seed: seed of the random layouts.
         steps: number of gradient-ascent steps by which each tile is optimised.
         layouts: ``optimised``, or ``random`` to plan the same scans with random layouts, as a control.
@@ -201,10 +202,11 @@ def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
     """Return the planned scans, which are the rows of the table ``scans.csv``, and the level map of each
-    scan. The scans of the four references come first.
+    scan. The scans of the four references (substrate, flat, steps and grating) come first.
     """
     size_px = len(planned[0].level)
-    # A staircase looks the same when it is shifted, so it gets a random frame if there is room.
+    # A staircase looks the same when it is shifted, so its position could not be determined. It is therefore
+    # surrounded by a random frame if there is room.
     ladder = limits.random(size_px, seed + 13)
     if size_px >= _LADDER_PX:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
