@@ -1,5 +1,5 @@
-"""Make the base models that the loop may correct: the model that the user asked for, or several
-small models.
+"""Make the base models (models of the printer without effects) that the loop may correct: either the model
+that the user asked for, or several small models.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
 AUTO = "auto"
-# A function that trains a model on the given scans. It must be possible to send it to other processes.
+# A function that trains a model on the given scans. The function must be picklable, because it is sent to
+# other processes.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
-# Base models from which the loop chooses one by default. The first has the same form as the Physics model of
-# the paper.
+# Base models from which the loop chooses one by default. The first of them has the same form as the Physics
+# model of the paper.
 _COMPETING = ("physics", "affine-mtf", "blur-table")
 
 
@@ -40,16 +41,17 @@ def bases_for(
     cache: Path,
     fields: Mapping[str, Any] = {},
 ) -> dict[str, nn.Module]:
-    """Return the base models that the loop may correct, by name. If the base is a network, it is trained once
-    for each fold, without the scans of this fold.
+    """Return the base models that the loop may correct, keyed by name. If the base is a network, it is
+    trained once for each fold, without the scans of this fold.
 
     Args:
-        base: name of a model, a frozen model (its folder or ``zoo:NAME``), or ``auto`` for several small
-            models, from which the loop chooses one.
+        base: name of a model; a frozen (saved and no longer trained) model, given by its folder or as
+            ``zoo:NAME``; or ``auto`` for several small models, from which the loop chooses one.
         study: the scans with their folds, the seed and the workers.
-        steps: number of optimiser steps for a network; None for the number in its recipe.
+        steps: number of optimiser steps for a network. If it is None, the number in the training recipe of
+            the network is used.
         cache: folder in which trained networks are kept.
-        fields: settings of a small model, such as ``{"spot.sigma_um": 0.3}``.
+        fields: settings of a small model, keyed by name, such as ``{"spot.sigma_um": 0.3}``.
 
     Raises:
         InputError: the base is unknown, its pitch differs from that of the scans, or settings are given for a

@@ -1,4 +1,5 @@
-"""Check whether an effect that was found is the true cause, in a model that contains all other effects.
+"""Check whether an effect that was found is the true cause of a part of the residual. The check uses a model
+that also contains all other effects that were found.
 
 If it is the true cause, the residual no longer depends on the change that the effect makes. If it only
 resembles the true cause, the residual contains variants of this change: the change scaled with height or
@@ -22,9 +23,10 @@ from litho_models.loop.screening import WORTH_FITTING, Screened, Screening, Seca
 from litho_models.loop.search import Cause, describe, with_table
 from litho_models.scan_terms.grouped import ALL, Block, Products
 
-# An effect is rejected as the cause if variants of the change that it makes would add more than this share to
-# its gain. In trials on the virtual fab, variants of true causes add less than 1 % (layer-stacking: 10 %).
-# Variants of effects that only resemble the true cause add 20 % or more.
+# An effect is rejected as the cause if variants of the change that it makes would add more than this fraction
+# to its gain (its reduction of the squared error on held-out scans). In trials on the virtual fab, variants
+# of true causes add less than 1 % (layer-stacking: 10 %). Variants of effects that only resemble the true
+# cause add 20 % or more.
 FORM_SHARE = 0.15
 
 
@@ -34,11 +36,11 @@ class Check:
 
     Attributes:
         state: the model, with all its effects.
-        others: the causes and laws in the model.
+        others: the causes and laws in the model; each of them is compared with the cause that is checked.
         laws, tables: all laws and tables that could replace a cause.
-        left_nm2: the part of the squared residual of the model that features of layout and position can
-        explain.
-        secants: changes that the laws would make to the predicted scans.
+        left_nm2: the part of the model's squared residual that features of layout and position can still
+            explain, nm².
+        secants: the changes that the laws and tables would make to the predictions.
     """
 
     state: State
@@ -49,8 +51,8 @@ class Check:
     secants: Secants
 
     def of(self, cause: Cause) -> Cause:
-        """Check one cause in the model that contains all other effects. If the cause is rejected, the result
-        states the reason.
+        """Check one cause in the model that contains all other effects. Return the cause with its new
+        judgement and, if it is rejected, the reason.
         """
         without, alone_nm2 = self.state.without(cause.name), cause.judgement.gain_nm2
         laws = ", ".join(one.name for one in self.others if get_effect(one.name).knowledge == "law")
@@ -69,9 +71,9 @@ class Check:
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
             reason = f"its best-fitting strength exceeds the largest possible value: {exhausted}"
-        # If the model still lacks a cause, variants of the change of any other cause explain part of what is
-        # missing. A gain of such variants that is small relative to the unexplained error therefore proves
-        # nothing.
+        # If the model still lacks a cause, variants of the change that any other effect makes explain part of
+        # the missing cause. If the gain of such variants is small relative to the unexplained error, it is
+        # therefore no evidence against the effect.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             added = (
                 "variants of its change (scaled, blurred or displaced) would add "
@@ -81,12 +83,12 @@ class Check:
         return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
-        """Return the name of another law or cause whose formula this cause may merely correct; empty if there
-        is none.
+        """Return the name of another law or cause in the model whose formula this cause may merely correct.
+        The name is empty if there is no such law or cause.
 
-        Such an effect must gain more than ten times as much as this cause. If it is a law, this is enough,
-        because every law is approximate. If it is a cause, variants of the change that it makes must also
-        gain at least half as much as this cause.
+        The other effect must gain more than ten times as much as this cause. If the other effect is a law,
+        this is sufficient, because every law is approximate. If it is a cause, there is a second condition:
+        variants of the change that the other effect makes must gain at least half as much as this cause.
         """
         gain_nm2 = cause.judgement.gain_nm2
         for other in self.others:
@@ -99,9 +101,9 @@ class Check:
         return ""
 
     def beside_laws(self, cause: Cause) -> Cause:
-        """Reject a cause that passed all other checks if short laws in its place fit better.
+        """Reject a cause that passed the checks of ``of`` if short laws in its place fit better.
 
-        At most two laws are tried. Together, they have no more parameters than the cause.
+        At most two laws are put in its place. Together, they have no more parameters than the cause.
         """
         numbers = sum(slot.effect == cause.name for slot in self.state.twin.slots)
         state = self.state.without(cause.name)
@@ -115,10 +117,10 @@ class Check:
         return cause
 
     def beside_table(self, cause: Cause) -> Cause:
-        """Reject a cause that passed all other checks if a table explains more.
+        """Reject a cause that passed the checks of ``of`` if a table explains more.
 
         The cause is rejected if two conditions hold: a table in its place gains more than twice as much as
-        the cause, and adding the cause to the model with this table gains nothing.
+        the cause, and held-out scans do not confirm the cause when it is added to the model with this table.
         """
         least_nm2 = 2 * cause.judgement.gain_nm2
         for table in describe(self.state.without(cause.name), self.tables, 1, self.secants):
@@ -132,8 +134,8 @@ class Check:
         return cause
 
     def _best_law(self, state: State, numbers: int) -> Screened | None:
-        """Return the law with the largest predicted gain among those with at most ``numbers`` parameters;
-        None if all of them gain much less than the cause.
+        """Return the law with the largest predicted gain among the laws with at most ``numbers`` parameters.
+        Return None if all of them would gain much less than the cause.
         """
         laws = [law for law in self.laws if law.name not in state.twin.names]
         least = WORTH_FITTING * (state.mse_nm2 - self.state.mse_nm2)
@@ -148,7 +150,7 @@ class Check:
 
 def reshaped_gain(without: State, state: State) -> float:
     """Return by how much the squared error on held-out scans falls, nm², if variants of the change that a
-    cause makes are added to the model.
+    cause makes to the prediction are added to the model.
 
     Args:
         without: model without the cause.
@@ -160,8 +162,8 @@ def reshaped_gain(without: State, state: State) -> float:
         maps = _shapes(own - other, own, window)
         freed = without_terms(np.column_stack([left, *map(window.at_sample, maps)]), window, own)
         grams.append(freed.T @ freed / len(freed))
-    # The last argument of the block is the weight of the prior that no variant is present, as a number of
-    # scans. Without this prior, the many parameters would fit the noise of the few scans.
+    # The last argument of ``Block`` is the weight of the prior that no variant is present, stated as a number
+    # of scans. Without this prior, the many parameters would fit the noise of the few scans.
     products = Products.ungrouped(np.stack(grams))
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
@@ -173,8 +175,8 @@ def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) ->
     """Return a change of the prediction and its variants, as maps of shape (ny, nx), µm.
 
     Args:
-        change: the change that a cause makes to the prediction.
-        prediction: the prediction with this cause.
+        change: the change that a cause makes to the prediction, µm, of shape (ny, nx).
+        prediction: the prediction of the model with this cause, µm, of shape (ny, nx).
         window: the scan.
     """
     pitch = window.context.pitch_um

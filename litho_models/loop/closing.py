@@ -1,10 +1,10 @@
 """Close the loop on a set of scans: find causes and laws in the residual of a base model.
 
-The search for causes is run with each base model. The base models are then compared, each together with the
-causes that its search has found.
+The search for causes is run once with each base model. The base models are then compared, each together with
+the causes that were found with it.
 
-``close`` is an estimator: it makes all choices and fits on the given scans, and its result can predict any
-other scan. To judge its choices on held-out scans, call ``close`` without these scans.
+``close`` is an estimator: it uses only the given scans for all choices and fits, and its result can predict
+any other scan. To judge its choices on held-out scans, call ``close`` without these scans.
 """
 
 from __future__ import annotations
@@ -41,17 +41,18 @@ class Closed:
     """The result of a loop: all choices and fits that it made on the given scans.
 
     Attributes:
-        base_name: name of the chosen base.
-        rivals: results of the search for causes with the other bases, by the name of the base.
-        plain: the base fitted to the original scans.
-        base: the base fitted to the scans from which the measurement errors that the scans of a group share
-            were subtracted.
-        named: result of the search for causes.
-        lawful: result of the search for short laws, which were added to the model with the causes.
-        described: result of the search for tables, which describe the remaining error as a function of one
-            variable, such as level or position. Tables act last in the process, before the microscope.
-        rests: for each stage of the loop, the part of the residual that features of layout and position still
-            explain.
+        base_name: name of the chosen base model.
+        rivals: results of the search for causes with each of the other base models, keyed by model name.
+        plain: the chosen base model, fitted to the original scans.
+        base: the chosen base model, fitted to corrected scans. From these scans, the measurement errors that
+            the scans of a group share were subtracted.
+        named: result of the search for causes, after all checks.
+        lawful: result of the search for short laws, which are added to the model with the causes.
+        described: result of the search for tables, which are added to the model with the causes and laws. A
+            table describes the remaining error as a function of one variable, such as level or position.
+            Tables act after all other effects of the printer and before those of the microscope.
+        rests: the part of the residual that features of layout and position can still explain after each
+            stage of the loop, keyed by stage (``base``, ``causes``, ``laws``, ``tables``).
         untestable: effects that the scans could not test, each with the reason.
     """
 
@@ -72,7 +73,7 @@ class Closed:
 
     @property
     def study(self) -> Study:
-        """Return the scans from which the measurement errors that the scans of a group share were
+        """Return the corrected scans, from which the measurement errors that the scans of a group share were
         subtracted.
         """
         return self.base.study
@@ -93,9 +94,10 @@ class Closed:
         return [*self.traced, *self.described.causes]
 
     def needed_by_all(self, cause: Cause) -> bool:
-        """Return whether the search has found the cause with every other base, too.
+        """Return whether the search has found the cause also with every other base model.
 
-        Bases with more parameters than the chosen base are ignored, because they may have absorbed the cause.
+        Base models with more parameters than the chosen base model are ignored, because their parameters may
+        have absorbed the cause.
         """
         base = self.plain.twin.own
         small = {name: rival for name, rival in self.rivals.items() if rival.state.twin.own <= base}
@@ -103,12 +105,13 @@ class Closed:
 
 
 def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
-    """Find the effects that a base model lacks on these scans.
+    """Find the effects that a base model lacks on these scans. Return the chosen base model and all effects
+    that were added to it.
 
     Args:
         study: the scans for development, with their folds.
-        bases: base models by name, from which the loop chooses one. Base models with few parameters are
-            refitted.
+        bases: base models, keyed by name, from which the loop chooses one. Base models with few parameters
+            are refitted together with the effects.
     """
     plain, began_s = {}, time.monotonic()
     for name, base in bases.items():
@@ -161,10 +164,11 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
-    """Subtract from each scan the measurement errors that the scans of its group share.
+    """Subtract from each scan the measurement errors that the scans of its group share. Return the corrected
+    scans.
 
-    A measurement error that all scans share is not subtracted, because a cause may explain it. What is
-    subtracted from a scan is learned from the scans outside its fold.
+    Errors that are common to all scans are not subtracted, so they can still be attributed to a cause. The
+    errors that are subtracted from a scan are learned from the scans outside its fold.
     """
     study = state.study
     maps, scans, freed = state.maps_um(study.scans), study.stored, study.stored
@@ -179,8 +183,8 @@ def freed_scans(state: State) -> list[PrintedScan]:
 
 
 def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
-    """Return the names of the bases with which the search has found the cause, or an effect that
-    looks the same.
+    """Return the names of the base models with which the search has found the cause, or an effect that looks
+    the same. ``searches`` contains the results of the searches, keyed by model name.
     """
     alike = {cause.name, *cause.alike}
     return [
@@ -193,8 +197,9 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose the simplest base model among those with nearly the smallest error.
 
-    The simplest base is the one with the fewest causes that the search does not also find with every other
-    base. If several bases have equally few such causes, the one with the fewest parameters is chosen.
+    For each base model, the causes are counted that the search does not find with every other base model as
+    well. The model with the fewest such causes is the simplest. If several models have equally few, the one
+    with the fewest parameters, including those of its effects, is chosen.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())
     close = {
@@ -210,14 +215,16 @@ def _simplest(searches: Mapping[str, Found]) -> str:
 
 def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple[Found, Found]:
     """Search for laws and then for tables that the model with the causes still lacks. Then check each cause
-    in the model that also contains the laws and, if it gains much, a table.
+    in a model that also contains the laws and, if one of the tables gains more than all causes together, this
+    table.
 
     A cause that fails its check is removed, and the search for laws and tables is repeated without it. Return
-    the results of the searches for laws and for tables.
+    two results: that of the search for laws, and that of the search for tables.
 
     Args:
-        start: the fitted base.
-        named: result of the search for causes with this base. Causes that are rejected are removed from it.
+        start: the fitted base model.
+        named: result of the search for causes with this base model. It is changed in place: causes that are
+            rejected are removed.
         rest: function that returns the part of a model's residual that can still be explained.
     """
     study = start.study
@@ -227,7 +234,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
     secants = Secants(start.twin, study.windows)
     while True:
         study.report("searching the residual for laws")
-        # A law with the same formula as a cause in the model would only rename this cause.
+        # A law with the same formula as a cause in the model is not tried, because it would only rename this
+        # cause.
         formulas = {get_effect(name).apply for name in named.names}
         laws = [law for law in all_laws if law.apply not in formulas]
         lawful = search(named.state, laws, 4, secants)
@@ -243,8 +251,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         wrong = sorted((one for one in named.causes if one.reason), key=lambda one: one.judgement.gain_nm2)
         if not wrong:
             return lawful, _in_model(lawful.state, described)
-        # Causes that may only correct the formula of another effect are removed first. The other effect is
-        # then judged without them.
+        # Causes that may merely correct the formula of another effect are removed first, so that the other
+        # effect is judged without them.
         for one in [one for one in wrong if one.corrects] or wrong[:1]:
             study.report(f"{one.name}: {one.reason}")
             named.refused[one.name] = one.reason
@@ -254,8 +262,8 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
 
 
 def _in_model(state: State, described: Sequence[Cause]) -> Found:
-    """Add to the model every table that held-out scans still confirm when it is fitted together with all
-    other parts of the model.
+    """Add tables to the model, one after the other. A table is kept only if held-out scans still confirm it
+    after it has been fitted together with all other parameters of the model.
     """
     found = Found(state)
     for table in described:
@@ -271,7 +279,7 @@ def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: floa
     """Add the table with the largest gain to the model if this gain exceeds ``named_nm2``, the gain of all
     causes together.
 
-    A table fits almost anything, so a gain larger than that of a single cause would not be enough.
+    A table can fit almost anything, so a gain that is larger than that of a single cause would not be enough.
     """
     table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
     if table is None or table.judgement.gain_nm2 <= named_nm2:

@@ -1,5 +1,5 @@
-"""Compute the errors of the models of a loop on held-out scans. A measurement model is fitted together with
-each of these models.
+"""Compute the errors of the models of a loop on held-out scans. Each of these models describes the printer,
+and a measurement model (of the microscope) is fitted together with it.
 """
 
 from __future__ import annotations
@@ -78,13 +78,14 @@ def error_rows(
     seed: int = 0,
     **terms: Any,
 ) -> list[ErrorRow]:
-    """Return the errors of predicted maps under each reported policy. For films, only the policy without
-    fitted terms is reported.
+    """Return the errors of predicted maps for each reported policy, i.e. for each set of terms that are
+    fitted to single scans and subtracted. For films, only the policy without fitted terms is reported.
 
     Args:
         scans: the scans.
-        maps_um: map that each scan is expected to show, µm, of shape (ny, nx).
-        numbers: numbers of fitted parameters of the printer model and of the measurement model.
+        maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
+        numbers: number of fitted parameters of the printer model, and number of those of the measurement
+            model.
         seed: seed of the calibration blocks.
         terms: the fields ``model``, ``measurement`` and ``held_out`` of ``ErrorRow``. The last two have
             defaults.
@@ -118,8 +119,8 @@ def error_rows(
 
 
 class HeldOut:
-    """The errors of the models of a loop on scans to which they were not fitted. For these errors, each model
-    is fitted together with a measurement model.
+    """The errors of the models of a loop on scans to which these models were not fitted. Each model is fitted
+    again, together with a measurement model.
 
     Args:
         closed: the loop, as returned by ``close``.
@@ -133,15 +134,19 @@ class HeldOut:
 
     @property
     def ends(self) -> dict[Stage, State]:
-        """Return the models at both ends of the loop: the base and the corrected model."""
+        """Return the models at the start and at the end of the loop: the base model (``base``) and the
+        corrected model (``all``).
+        """
         return {"base": self.closed.base, "all": self.closed.final}
 
     def errors(self) -> list[ErrorRow]:
-        """Return the errors of the base, the base with the causes, and the corrected model.
+        """Return the errors of three models: the base model, the base model with the causes, and the
+        corrected model.
 
         Each scan is predicted by a fit to the scans outside its fold. If the base is refitted and prints were
-        scanned several times, the base and the corrected model are also scored with fits that leave out the
-        whole print of a scan. The model with only the causes is listed if it differs from both other models.
+        scanned several times, the base model and the corrected model are scored a second time. Each scan is
+        then predicted by a fit that leaves out all scans of the same print. The base model with the causes is
+        listed only if it differs from both other models.
         """
         plain, causes = self.closed.plain, self.closed.named.state
         numbers = len(plain.twin.vector)
@@ -164,17 +169,18 @@ class HeldOut:
         return rows
 
     def maps_um(self, state: State) -> Maps:
-        """Predict the map that each scan shows, µm, of shape (ny, nx). The models of printer and measurement
-        are fitted without the scans of the same fold.
+        """Predict the map that each scan is expected to show, µm, of shape (ny, nx). For each scan, the
+        models of the printer and of the measurement are fitted without the scans of its fold.
         """
         return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
-        """Return for each effect of the corrected model by how much the error (k = 1) grows, nm, when the
-        effect is removed and the model is refitted.
+        """Return by how much the headline error (see ``ErrorRow.is_headline``) grows, nm, when an effect is
+        removed from the corrected model and the model is refitted. The result is keyed by the name of the
+        effect.
 
-        After this refit, the measurement model is fitted again, with the parameters of the printer held
-        fixed.
+        After this refit, the measurement model is fitted again, while the parameters of the printer model are
+        held fixed.
         """
 
         @cache
@@ -189,8 +195,9 @@ class HeldOut:
         return found
 
     def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return for each scan its id and its residual maps before and after the correction, nm, of shape
-        (ny, nx). The median of each map is subtracted.
+        """Return for each scan its id, its residual map before the correction of the model, and its residual
+        map after the correction. The maps are in nm and have shape (ny, nx), and their medians have been
+        subtracted.
         """
 
         def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
@@ -213,11 +220,11 @@ class HeldOut:
         self, starts: Mapping[Any, Twin], part_of: Sequence[Any], refit: bool = True
     ) -> tuple[Maps, tuple[int, int]]:
         """Predict each scan by a fit to the scans of all other parts (folds or prints). Return the predicted
-        maps and the numbers of parameters of the fit with the most parameters.
+        maps, and the numbers of parameters of the printer model and the measurement model in the largest fit.
 
         Args:
-            starts: for each part, the model from which the fit without this part starts.
-            part_of: part to which each scan belongs.
+            starts: model from which the fit without a part starts, keyed by the part.
+            part_of: part to which each scan belongs, one per scan.
             refit: whether the model of the printer is fitted again.
         """
         scans, jobs = self.study.scans, []
@@ -230,8 +237,8 @@ class HeldOut:
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, maps: Maps) -> Maps:
-        """Add to each predicted map the smooth background of the training scans, as the published
-        protocol does.
+        """Add to each predicted map the smooth background that is learned from the scans outside the same
+        fold, as in the published protocol.
         """
         found = list(maps)
         for twin, (rest, own) in zip(self.closed.plain.per_fold, self.study.folds, strict=True):
@@ -252,13 +259,13 @@ def errors_of_others(
     held_out: str,
     seed: int,
 ) -> list[ErrorRow]:
-    """Return the errors of the base and the corrected model on scans that were not used to choose or fit
-    them.
+    """Return the errors of the base model and of the corrected model on scans that were used neither for
+    choosing nor for fitting these models.
 
     Args:
-        found: pairs of the models of a loop and the scans that this loop did not use.
+        found: pairs that each consist of the models of a loop and the scans that this loop did not use.
         scans: all scans of these pairs, in the order in which they are reported.
-        held_out: what was held out, as in ``ErrorRow.held_out``.
+        held_out: a word that states what was held out; see ``ErrorRow.held_out``.
         seed: seed of the calibration blocks.
     """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}

@@ -1,8 +1,8 @@
 """Fit a model of the printer to all scans. Then, for each fold, refit the model to the scans of all other
 folds, and predict the scans of this fold.
 
-Per-scan terms are projected out of the residuals and derivatives, so that they do not bias the parameters of
-the printer.
+Terms that differ from scan to scan, such as datum and tilt, are projected out of the residuals and
+derivatives, so that they do not bias the parameters of the printer.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from litho_models.scan_terms import Terms
 from litho_models.scan_terms.grouped import Labels, groupings
 from litho_models.splits.folds import grouped_folds
 
-# Terms that are free in each scan when a model is fitted. The gain is not free, because long-range effects of
-# the printer change it, too.
+# Terms that are fitted freely to each scan when a model is fitted. The gain is not one of them, because it
+# also depends on long-range effects of the printer.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
-# Terms that are free in each scan when the errors of models are compared.
+# Terms that are fitted freely to each scan when the errors of models are compared.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
 RULES = Rules("squares", steps=24, kept_above=0.8)
 
@@ -47,7 +47,7 @@ def _silent(message: str) -> None:
 
 @dataclass(frozen=True)
 class Study:
-    """Scans with their folds, and the settings by which findings are judged.
+    """Scans with their folds, and the settings for judging findings.
 
     Attributes:
         scans: the prepared scans.
@@ -96,13 +96,13 @@ class Study:
 
     @property
     def windows(self) -> list[PreparedScan]:
-        """Return the part of each scan that fits and screening use."""
+        """Return the window of each scan, which is the part that fits and screening use."""
         return [scan.window for scan in self.scans]
 
     @property
     def tip_radius_um(self) -> float | None:
-        """Return the radius of the tip of the microscope, or an upper bound for it, as the first scan with
-        this information states it; None if no scan states it.
+        """Return the radius of the tip of the microscope, or an upper bound for this radius, µm. It is taken
+        from the first scan that states it. Return None if no scan states it.
         """
         known = (scan.stored.tip_radius_um for scan in self.scans)
         return next((radius for radius in known if radius is not None), None)
@@ -111,13 +111,14 @@ class Study:
     def of_films(self) -> bool:
         """Return whether the scans are electron micrographs of a film.
 
-        For films, the positions of edges are scored, and there are no per-scan height errors such as drift.
+        For films, the positions of edges are scored instead of heights, and single scans have no height
+        errors such as drift.
         """
         return self.scans[0].stored.seen_by == "sem"
 
     @cached_property
     def groups(self) -> dict[str, Labels]:
-        """Return the label of each scan in every grouping."""
+        """Return the labels of all scans, keyed by the name of the grouping."""
         return groupings(self.stored)
 
 
@@ -128,9 +129,10 @@ class State:
     Attributes:
         twin: the model fitted to all scans.
         per_fold: for each fold, the model fitted without the scans of this fold.
-        linear: residual, derivatives and free terms of each window at the parameters of ``twin``.
-        held_out_um: residual of each window at its n sampled pixels, µm, of shape (n,), for the model that
-            was fitted without the fold of this window.
+        linear: linearised problem of each window at the parameters of ``twin``: residual, derivatives and
+            free terms.
+        held_out_um: residual of each window at its n sampled pixels, µm, of shape (n,). The prediction is
+            made by the model that was fitted without the fold of this window.
         freed_um: ``held_out_um`` after the free terms of each scan are projected out.
     """
 
@@ -140,8 +142,8 @@ class State:
     linear: list[Linearised]
     held_out_um: list[np.ndarray]
     freed_um: list[np.ndarray]
-    # Models without one effect, by the name of this effect. They are cached because several steps need the
-    # same model.
+    # Cache of models without one of the effects, keyed by the name of this effect. Several steps of the loop
+    # need the same model.
     _without: dict[str, State] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
@@ -164,8 +166,8 @@ class State:
         return self._without[name]
 
     def maps_um(self, scans: Sequence[PreparedScan]) -> list[np.ndarray]:
-        """Predict the height of the print in each scan (or window), µm, of shape (ny, nx), by the model that
-        was fitted without the fold of this scan.
+        """Predict the height of the print in each scan (or window), µm, of shape (ny, nx). Each prediction is
+        made by the model that was fitted without the fold of this scan.
         """
         folds = zip(self.study.fold_of, scans, strict=True)
         return [self.per_fold[fold].height(scan) for fold, scan in folds]
@@ -208,21 +210,23 @@ class TwinProblem:
         return [window.height - window.at_sample(twin.height(window)) for window in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest allowed step of each parameter. Such steps keep the effects
-        within their ranges and change the parameters of the base only by small amounts.
+        """Return two arrays: the lowest and the highest allowed step of each parameter. Steps within these
+        limits keep all parameters within their ranges and change the parameters of the base only by small
+        amounts.
         """
         return self._twin.at(vector).room()
 
 
 def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
-    """Fit a model to all windows of a study, and then once for each fold without the windows of this fold.
+    """Fit a model to all windows of a study. Then fit it again for each fold, without the windows of this
+    fold.
 
     Args:
         twin: the model.
         study: the scans.
-        from_here: whether to start from the current parameters of the model. Otherwise, two starts are tried:
-            the current parameters, and the default parameters of the base. The start that leads to the
-            smaller error is used.
+        from_here: whether to start only from the current parameters of the model. Otherwise, two starts are
+            tried: the current parameters, and the same with the default parameters of the base. The start
+            that leads to the smaller error is used.
     """
     windows = study.windows
     start = twin.vector if from_here else _best_start(twin, windows)
@@ -244,13 +248,14 @@ def fit_state(twin: Twin, study: Study, *, from_here: bool = False) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Return the better start of a fit: the current parameters, or the same with the default parameters of
-    the base.
+    """Return the better of two starts of a fit: the current parameters, or the current parameters with those
+    of the base replaced by their defaults.
 
     The better start is the one from which a fit to some of the scans reaches the smaller error.
 
-    Two starts are tried because a base that was fitted without an effect has absorbed part of this effect.
-    When the effect is added, a fit from the current parameters may therefore get stuck in a local optimum.
+    Two starts are tried because the parameters of a base that was fitted without an effect have absorbed part
+    of this effect. When the effect is added, a fit from the current parameters may therefore get stuck in a
+    local optimum.
     """
     unfitted = twin.with_base_unfitted().vector
     if not twin.slots or np.array_equal(unfitted, twin.vector):
@@ -287,8 +292,8 @@ def _without(common: Twin, fold: int, linear: Sequence[Linearised], windows: Seq
     if not len(vector):
         return twin
     if twin is not common:
-        # The residuals of the common fit are those of other base models, so they are computed again with the
-        # base of this fold.
+        # The base of this fold differs from that of the common fit, so the residuals are computed again with
+        # the base of this fold.
         linear = with_residuals(linear, problem.residuals(vector))
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(6):

@@ -1,9 +1,9 @@
 """Decide whether held-out scans confirm a change of the model. Each scan counts as one observation.
 
-First, the change must have the right sign: in a scan that contains the effect, the change of the prediction
-has a positive inner product with the residual before the change. A sign-flip test over the scans checks this.
-Second, the change must lower the error when it has the same strength in all scans (or in all scans of a
-group): the confidence interval of the gain must lie above zero.
+First, the change must have the right sign in most scans: if a scan contains the effect, the change of the
+prediction has a positive inner product with the residual before the change. A sign-flip test over the scans
+checks this condition. Second, the change must lower the error when it has the same strength in all scans (or
+in all scans of a group): the confidence interval of the gain must lie above zero.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 FAMILY_P = 0.05
-# Largest accepted p value of a grouping. The limit is small because every candidate is tried with every
-# grouping.
+# Largest accepted p value of a grouping of the scans. The limit is small because every candidate effect is
+# tried with every grouping.
 EXCHANGED_P = 0.01
 # Largest accepted p value of the sign-flip test. Seven scans all have the right sign by chance with a
 # probability of 1/128, which is above this limit, so at least eight scans are needed.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# The same limit for a strength that differs by group. Such a strength has already passed the test with
-# permuted labels, so this limit is looser: up to half of the scans may gain nothing.
+# Largest accepted p value of the sign-flip test if the strength differs by group. Such a strength has already
+# passed the test with permuted labels, so this limit is looser: up to half of the scans may gain nothing.
 GROUPED_P = 0.05
-# Smallest share of the squared error that counts. Strengths that differ by group must gain at least this
-# share more than a common strength. A change of the model must reduce the squared error by twice this share,
-# which is 1 % of the rms error, because every formula is slightly wrong.
+# Smallest fraction of the squared error that counts. Compared with a common strength, strengths that differ
+# by group must reduce the squared error further by at least this fraction. Any change of the model must
+# reduce the squared error by at least twice this fraction (1 % of the rms error), because every formula is
+# slightly wrong.
 SMALLEST_SHARE = 0.01
 
 
@@ -54,11 +55,12 @@ class Judgement:
 
     @property
     def improved(self) -> tuple[int, int]:
-        """Return the number of scans whose error falls, and the number of all scans."""
+        """Return the number of scans whose error falls, and the total number of scans."""
         return int((self.gains_nm2 > 0).sum()), len(self.gains_nm2)
 
     def reason(self, by: str = ALL) -> str:
-        """Return the reason why the scans do not confirm the change; empty if they confirm it.
+        """Return the reason why the held-out scans do not confirm the change. The text is empty if they
+        confirm it.
 
         ``by`` is the grouping by which the strength of the change differs.
         """
@@ -82,8 +84,8 @@ def judge(
     Args:
         before_nm2, after_nm2: mean squared error of each scan before and after the change, of shape (scans,).
         study: the study, which provides the seed.
-        evidence_nm2: mean product of the change and the residual before the change in each scan, of shape
-            (scans,); by default the gains.
+        evidence_nm2: mean product of the change and of the residual before the change in each scan, of shape
+            (scans,). By default, the decreases of the squared error are used instead.
     """
     gains = before_nm2 - after_nm2
     low, _ = bootstrap_interval(gains.tolist(), seed=study.seed)
@@ -108,8 +110,9 @@ def evidence_nm2(before_um: np.ndarray, after_um: np.ndarray) -> float:
 
 
 def told_apart(before_nm2: np.ndarray, best_nm2: np.ndarray, other_nm2: np.ndarray, study: Study) -> bool:
-    """Return whether another change of the model is clearly worse than the best change. It must be worse in
-    nearly every scan, and its gain must be smaller by at least a quarter of the best gain.
+    """Return whether another change of the model is clearly worse than the best change. Two conditions must
+    hold: the other change is worse in nearly every scan, and its gain is smaller than the best gain by at
+    least a quarter of the best gain.
 
     Args:
         before_nm2, best_nm2, other_nm2: mean squared error of each scan before the change, after the best

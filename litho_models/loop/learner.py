@@ -1,7 +1,8 @@
 """Estimate by a cross-validated ridge regression how much of a residual could still be learned.
 
-The ridge regression uses features of layout and position. It names no cause and is part of no model. It shows
-whether the residual has structure, and how large this structure is compared with the gain of a cause.
+The ridge regression uses features of layout and position. It names no cause and is not part of any model. It
+shows whether the residual has structure that could be learned, and how large this structure is compared with
+the gain of a cause.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from litho_models.models.features import Features, FeaturesConfig, RandomFeature
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
-# Memory limit for the values of the features. If there are many scans, fewer pixels of each scan are used.
+# Memory limit for the values of the features. If there are so many scans that it would be exceeded, fewer
+# pixels of each scan are used.
 _KEPT_BYTES = 512 * 2**20
 # Indices of the features whose strength may depend on the writing order or the dose: the height, |∂y| and
 # |∂x| of the layout blurred with σ = 0.3 µm, and the layout blurred with σ = 1.6 µm (the surroundings).
@@ -37,8 +39,8 @@ class Rest:
 
     Attributes:
         gains_nm2: squared error that the ridge regression removes from each held-out scan, of shape (scans,).
-        squares_nm2: squared error of each scan without the ridge regression, of shape (scans,). For both
-            arrays, the free terms of the scans are first projected out.
+        squares_nm2: squared error of each scan without the ridge regression, of shape (scans,). The errors in
+            both arrays are computed after the free terms of each scan have been projected out.
     """
 
     gains_nm2: np.ndarray
@@ -55,30 +57,32 @@ class Rest:
 
     @cached_property
     def ci95_nm2(self) -> tuple[float, float] | None:
-        """Return the 95 % confidence interval of the mean gain over scans; None if there are fewer
-        than six scans.
+        """Return the 95 % confidence interval of the mean over scans of ``gains_nm2``. Return None if there
+        are fewer than six scans.
         """
         return interval(self.gains_nm2.tolist())
 
     @property
     def most_nm(self) -> float:
-        """Return an upper bound on the rms error that a wrong form of the model causes, nm. It is the square
-        root of the upper end of ``ci95_nm2``.
+        """Return an upper bound on the rms error that a wrong form of the model causes, nm. The bound is the
+        square root of the upper end of ``ci95_nm2``.
         """
         _, most_nm2 = self.ci95_nm2 or (None, self.mean_nm2)
         return float(np.sqrt(max(most_nm2, 0.0)))
 
     @property
     def matters(self) -> bool:
-        """Return whether part of the residual can be learned: the explained share exceeds 1 %, and the
-        confidence interval of the gain lies above zero.
+        """Return whether a relevant part of the residual can be learned. This is the case if the ridge
+        regression explains more than 1 % of the squared error and the confidence interval of its gain lies
+        above zero.
         """
         low, _ = self.ci95_nm2 or (0.0, None)
         return self.share > SMALLEST_SHARE and low > 0
 
 
 class Learner:
-    """The features of the scans of a study. They are computed once and are used for any number of residuals.
+    """A ridge regression on features of the scans of a study. The features are computed once and can then be
+    used to explain any number of residuals.
 
     Args:
         study: the scans with their folds.
@@ -110,7 +114,7 @@ class Learner:
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
-        fitted to the scans of other folds.
+        fitted to the scans of other folds. Return the part that it explains.
 
         Args:
             predictions: predicted height of each scan, µm, of shape (ny, nx), by a model that was fitted
@@ -130,8 +134,9 @@ class Learner:
         return Rest(squares - left, squares)
 
     def _rows(self, model: Features, scan: PreparedScan, varied: Sequence[float]) -> NDArray[np.float32]:
-        """Return the m features at n pixels, of shape (m, n): the features of layout and position, some of
-        their products, and products of some features with the writing order and the dose.
+        """Return the m features at n pixels of a scan: the features of layout and position, some of their
+        products, and products of some features with the writing order and the dose. The result has shape (m,
+        n).
         """
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
@@ -151,20 +156,21 @@ def _gram(rows: np.ndarray) -> np.ndarray:
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Return the mean squared residual that the ridge regression leaves in each scan, of shape (scans,). For
-    each scan, the regression is fitted, and its regularisation is chosen, without the scans of the same fold.
+    """Return the mean squared residual that the ridge regression leaves in each scan. For each scan, the
+    regression is fitted, and its regularisation is chosen, without the scans of the same fold. The result has
+    shape (scans,).
     """
     left, products = np.empty(len(grams)), Products.ungrouped(grams)
     columns = tuple(range(1, grams.shape[1]))
-    # The last argument of a block is the strength of the regularisation, as a number of scans.
+    # The last argument of ``Block`` is the strength of the regularisation, stated as a number of scans.
     blocks = [Block(columns, ALL, shrinking) for shrinking in (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)]
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner, inner_of = Products.ungrouped(grams[rest]), fold_of[rest]
         if len(set(inner_of)) == 1:
             inner_of = rest
-        # If only one scan is left, the regularisation cannot be cross-validated, so the strongest one is
-        # used.
+        # If only one scan is left for the fit, the regularisation cannot be chosen by cross-validation, so
+        # the strongest regularisation is used.
         block = blocks[-1]
         if len(rest) > 1:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
@@ -184,18 +190,18 @@ def _all_features(scan: PreparedScan) -> Features:
 
 
 def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
-    """Return the products of splines along y and splines along x at the given flat indices of a
-    scan, of shape (25, n).
+    """Return the 25 products of five splines along y and five splines along x, at the n given flat indices of
+    a scan. The result has shape (25, n).
     """
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
     return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
 
 
 def _splines(size: int) -> np.ndarray:
-    """Return five cubic splines over the sampled part of an axis, which add up to 1, as an array of shape (5,
-    size).
+    """Return five cubic splines, which add up to 1, along an axis with ``size`` pixels. They divide the part
+    of the axis from which fits take their pixels. The result has shape (5, size).
 
-    The splines are constant outside the sampled part, because no measured pixel would determine them there.
+    Outside this part, the splines are constant, because no pixel of the fit would determine them there.
     """
     first = sample_border_px(size)
     position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
