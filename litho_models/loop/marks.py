@@ -1,7 +1,7 @@
 """Find marks in single scans: rounded heights, scars, short lines and bends.
 
-Marks are reported with the evidence for them. No model contains them, because a model of them would not lower
-the errors on held-out scans.
+Marks are reported together with the evidence for them. They are not part of any model, because a model of
+marks would not lower the errors on held-out scans.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from litho_models.scan_terms import POLICIES, freed_um, row_index
 from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
-# Range of distances between pixels, in which the residuals of line-shaped roughness are correlated. They are
-# longer than the resolution of tip and spot, and shorter than a line-shaped feature.
+# Range of distances between pixels over which the residuals of line-shaped roughness are correlated. These
+# distances are longer than the resolution of tip and spot, and shorter than a line-shaped feature.
 _LINE_LAGS_UM = (0.3, 0.8)
-# Marks with a smaller rms height occur but do not matter.
+# Marks with an rms height below this value are not reported as seen, because they do not matter.
 _SMALLEST_RMS_NM = 0.5
 
 
 def marks(
     scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], rounding_um: Mapping[str, float] | None
 ) -> list[ScanFinding]:
-    """Return the findings about all marks.
+    """Return one finding for each kind of mark.
 
     Args:
         scans: the original scans.
-        maps_um: map that each scan is expected to show, µm, of shape (ny, nx).
-        rounding_um: step to which the heights in the raw file of each scan are rounded, by scan id; None if
-            there are no raw files.
+        maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
+        rounding_um: step, µm, to which the heights in the raw file of each scan are rounded, keyed by scan
+            id. None if there are no raw files.
     """
     residuals = [
         freed_um(scan.stored.height_um, own, scan.usable, POLICIES["full"])
@@ -46,13 +46,14 @@ def marks(
 
 
 def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> list[ScanFinding]:
-    """Merge the findings about per-scan terms and about marks. If both lists contain the same name, the
-    effect counts as seen if one of them has seen it.
+    """Merge the findings about per-scan terms (``findings``) with those about marks (``seen``). If both lists
+    contain a finding of the same name, they are merged into one, which counts as seen if either of the two
+    does.
     """
     found: dict[str, list[ScanFinding]] = {}
     for one in (*findings, *seen):
         found.setdefault(one.name, []).append(one)
-    # Of two findings with the same name, the one that was seen is kept, together with the evidence of both.
+    # Of two findings with the same name, the one that counts as seen is kept. It gets the evidence of both.
     ordered = [sorted(own, key=lambda one: not one.seen) for own in found.values()]
     return [
         first.model_copy(update={"evidence": "; ".join(one.evidence for one in (first, *others))})
@@ -61,12 +62,12 @@ def with_marks(findings: Sequence[ScanFinding], seen: Sequence[ScanFinding]) -> 
 
 
 def rounding_step_um(raw_height_um: np.ndarray) -> float:
-    """Return the step to which the heights of a raw scan are rounded: apart from a common offset, all heights
-    are multiples of this step. Return 0 if there is no such step.
+    """Return the step to which the heights of a raw scan are rounded, µm. Apart from a common offset, all
+    heights are multiples of this step. Return 0 if there is no such step.
     """
     heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
     steps = np.diff(heights)
-    # Smaller differences between heights come from storing them in single precision.
+    # Smaller differences between heights arise only from storing the heights in single precision.
     steps = steps[steps > 1e-6 * np.ptp(heights)] if len(heights) > 2 else steps[:0]
     if not len(steps):
         return 0.0
@@ -76,8 +77,8 @@ def rounding_step_um(raw_height_um: np.ndarray) -> float:
 
 
 def _rounding(steps_um: Sequence[float]) -> ScanFinding:
-    """Report the rounding of the heights in the raw files. It adds uniform noise, whose rms is the
-    step divided by √12.
+    """Report the rounding of the heights in the raw files. Rounding adds uniformly distributed noise, whose
+    rms is the step divided by √12.
     """
     steps_nm = NM_PER_UM * np.array(steps_um)
     noise_nm, rounded = float(np.sqrt(np.mean(steps_nm**2) / 12)), steps_nm[steps_nm > 0]
@@ -92,8 +93,8 @@ def _rounding(steps_um: Sequence[float]) -> ScanFinding:
 
 
 def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> ScanFinding:
-    """Test whether there are scars. If so, more outliers are elongated along the scan lines than
-    across them.
+    """Test whether the scans contain scars (scratch-like errors along scan lines). If they do, more outliers
+    are elongated along the scan lines than across them.
     """
     along, across = np.array([*map(_drawn_out, scans, residuals)]).T
     p = one_sided_flip_p((along - across).astype(float))
@@ -105,8 +106,8 @@ def _scars(scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray]) -> Sc
 
 
 def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
-    """Return the number of outliers that are elongated along the scan lines, and the number of those
-    elongated across them. An outlier is a connected patch of pixels with large residuals.
+    """Return two numbers: that of the outliers that are elongated along the scan lines, and that of the
+    outliers that are elongated across them. An outlier is a connected patch of pixels with large residuals.
     """
     seen = residual_um[scan.usable]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
@@ -114,7 +115,8 @@ def _drawn_out(scan: PreparedScan, residual_um: np.ndarray) -> tuple[int, int]:
     sizes, along, across = np.bincount(numbered.ravel()), 0, 0
     for size, box in zip(sizes[1:], find_objects(numbered), strict=True):
         height, width = (part.stop - part.start for part in box)
-        # Patches with fewer pixels are noise; a scratch is at least four times as long as wide.
+        # Patches with fewer than nine pixels count as noise. A patch counts as elongated if it is at least
+        # four times as long as wide.
         if size >= 9:
             along += width >= 4 * height
             across += height >= 4 * width
@@ -149,8 +151,8 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
     flat = scan.usable & (slope <= np.median(slope))
     values = np.where(flat, NM_PER_UM * residual_um, 0.0)
     for line in (scan.line, row_index(flat.shape)):
-        # The mean of every line is subtracted. An error of this mean can only lower the mean product along
-        # the lines.
+        # The mean of every line is subtracted, so that line offsets do not count. An error of this mean can
+        # only lower the mean product along the lines.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )
@@ -171,7 +173,9 @@ def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndar
 
 
 def _bends(scans: Sequence[PreparedScan]) -> ScanFinding:
-    """Report how many scans the registration straightened. All other steps use the straightened scans."""
+    """Report how many bent scans the registration has straightened. All other steps of the loop use the
+    straightened scans.
+    """
     found_um = [scan.stored.bend_um.largest for scan in scans if scan.stored.bend_um is not None]
     text = f"the registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:

@@ -1,5 +1,5 @@
-"""The twin of a machine: a base model with effects. The strength of an effect is the same in all scans or
-differs between groups of scans.
+"""The digital twin of a machine: a base model of the printer together with effects. The strength of an effect
+is either the same in all scans or differs between groups of scans.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
 
 Values = Mapping[str, Mapping[str, float]]
-# If the relative distance of a fitted value from a bound is smaller than this, the value counts as on the
-# bound.
+# A fitted value whose relative distance from a bound is smaller than this counts as lying on the bound.
 _AT_BOUND = 1e-6
 
 
@@ -34,9 +33,9 @@ class FoldedBase(nn.Module):
     without the scans of its fold.
 
     Args:
-        models: the model of each fold, which was trained without the scans of this fold.
-        fold_of: number of the fold of each scan, by scan id.
-        common: model for scans that belong to no fold.
+        models: one model per fold, in the order of the folds. It was trained without the scans of this fold.
+        fold_of: number of the fold of each scan, keyed by scan id.
+        common: model that predicts scans that belong to no fold.
     """
 
     def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
@@ -44,7 +43,8 @@ class FoldedBase(nn.Module):
         self.models = nn.ModuleList(models)
         self.common = common
         self.fold_of = dict(fold_of)
-        # The trained weights are used unchanged, because freezing the model would change their rounding.
+        # The trained weights are used as they are. They are not converted into a frozen model, because this
+        # would change their rounding.
         self.eval()
 
     def of_fold(self, fold: int) -> nn.Module:
@@ -52,15 +52,17 @@ class FoldedBase(nn.Module):
         return self.models[fold]
 
     def of_scan(self, scan_id: str) -> nn.Module:
-        """Return the model that was trained without this scan. A scan in no fold gets the common model."""
+        """Return the model that was trained without this scan. For a scan that belongs to no fold, return the
+        common model.
+        """
         fold = self.fold_of.get(scan_id)
         return self.common if fold is None else self.models[fold]
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One fitted parameter of an effect. ``label`` is the label of the group of scans to which it applies, or
-    None if it applies to all scans.
+    """The identity of one fitted parameter of an effect. ``label`` is the label of the group of scans to
+    which the parameter applies, or None if it applies to all scans.
     """
 
     effect: str
@@ -78,16 +80,16 @@ class Added:
     """The parameters of an effect in a model.
 
     ``by`` is the grouping by which the amplitudes of the effect differ, or ``all`` if they are the same in
-    all scans. ``values`` contains the parameters of each group by the label of the group; the label is ``""``
-    if ``by`` is ``all``.
+    all scans. ``values`` contains the parameter values of each group, keyed by the label of the group. If
+    ``by`` is ``all``, the only label is ``""``.
     """
 
     by: str
     values: Values
 
     def of(self, label: str | None) -> dict[str, float]:
-        """Return the parameters of the group with this label. For a group that was not fitted, return the
-        mean over the fitted groups.
+        """Return the parameter values of the group with this label. If this group was not fitted, or if the
+        label is None, return the mean over the fitted groups.
         """
         if label is not None and label in self.values:
             return dict(self.values[label])
@@ -97,14 +99,16 @@ class Added:
 
 @dataclass(frozen=True)
 class Twin:
-    """A base model and effects with their parameters. A fit changes only the numbers in ``vector``.
+    """A base model and effects with their parameter values. A fit changes only the numbers in ``vector``.
 
     Attributes:
-        base: the base model of the printer. Its parameters are refitted if there are few of them.
-        numbers: fitted parameters of the base; empty if the base is not refitted.
-        effects: the parameters of the effects by name, in the order in which the effects were added.
-        frames: for each effect that does not use its default frame, the frame with which it rotates (``scan``
-            or ``print``); see ``EffectChain``.
+        base: the base model of the printer. Its parameters are refitted together with those of the effects if
+            there are few of them.
+        numbers: values of the fitted parameters of the base; empty if the base is not refitted.
+        effects: the parameter values of the effects, keyed by the name of the effect, in the order in which
+            the effects were added.
+        frames: whether an effect rotates with the scan (``scan``) or with the print (``print``), keyed by the
+            name of the effect. Effects that are not listed use their default; see ``EffectChain``.
     """
 
     base: nn.Module
@@ -129,8 +133,8 @@ class Twin:
 
     @cached_property
     def slots(self) -> list[Slot]:
-        """Return the slots of the fitted effect parameters, in the order in which these parameters stand in
-        ``vector``, behind the parameters of the base.
+        """Return the slots of all fitted parameters of effects. They are in the order of these parameters in
+        ``vector``, where the parameters of the base come first.
         """
         return [
             Slot(name, key, label)
@@ -142,8 +146,8 @@ class Twin:
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """Return all p fitted parameters: first those of the base, then those of the effects. The result has
-        shape (p,).
+        """Return the values of all p fitted parameters: first those of the base, then those of the effects.
+        The result has shape (p,).
         """
         of_slots = [self.effects[one.effect].of(one.label)[one.parameter] for one in self.slots]
         return np.concatenate([self.numbers, of_slots])
@@ -159,15 +163,16 @@ class Twin:
         return replace(self, numbers=vector[: self.own], effects=effects)
 
     def of_fold(self, fold: int) -> Twin:
-        """If the base was trained once for each fold, return the twin with the base that was trained without
-        this fold. Otherwise, return the twin itself.
+        """Return the twin for predicting the scans of a fold. If the base was trained once for each fold, it
+        has the base that was trained without this fold. Otherwise, it is the twin itself.
         """
         base = self.base
         return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
 
     def with_effect(self, name: str, by: str, values: Values) -> Twin:
-        """Return the twin with a further effect, whose starting values are given by label (``""``
-        for all scans).
+        """Return the twin with a further effect. ``by`` is the grouping by which its strength differs.
+        ``values`` contains its starting values, keyed by group label (``""`` if the strength is the same in
+        all scans).
         """
         return replace(self, effects={**self.effects, name: Added(by, values)})
 
@@ -176,8 +181,8 @@ class Twin:
         return replace(self, effects={other: one for other, one in self.effects.items() if other != name})
 
     def ungrouped(self) -> Twin:
-        """Return the twin with strengths that are the same in all scans: the means over the groups. Its
-        effects are in the order in which they act.
+        """Return a twin in which the strength of every effect is the same in all scans: each strength is
+        replaced by its mean over the groups. The effects are in the order in which they act.
         """
         effects = {name: Added(ALL, {"": values}) for name, values in self.values().items()}
         return replace(self, effects=effects)
@@ -189,23 +194,24 @@ class Twin:
         return replace(self, numbers=_numbers(type(self.base)(self.base.config)))
 
     def values(self, label_in: Mapping[str, str] = {}) -> dict[str, dict[str, float]]:
-        """Return the parameter values of all effects, in the order in which they act, for scans with the
-        given labels. For a grouping without a label, the mean over its groups is used.
+        """Return the parameter values of all effects, in the order in which the effects act, for scans with
+        the given labels. If no label is given for a grouping, the mean over its groups is used.
 
         Args:
-            label_in: label of the scans in each grouping, by the name of the grouping.
+            label_in: label of the scans in each grouping, keyed by the name of the grouping.
         """
         return {name: self.effects[name].of(label_in.get(self.effects[name].by)) for name in self.names}
 
     def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
-        """Return whether a parameter applies to this scan, because it applies to the group of the scan or to
-        all scans.
+        """Return whether a parameter applies to this scan. It does so if it applies to the group of the scan
+        or to all scans.
         """
         return slot.label in (None, label_of(scan.stored, self.effects[slot.effect].by))
 
     def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
-        """Return the twin with only those strengths that the given scans can determine. Strengths of the
-        groups to which the scans belong are kept, and every other group gets the mean of the kept strengths.
+        """Return the twin with only those strengths that the given scans can determine. The strengths of the
+        groups to which these scans belong are kept. The strengths of every other group are replaced by the
+        means of the kept strengths.
         """
         effects = {}
         for name, one in self.effects.items():
@@ -219,8 +225,8 @@ class Twin:
 
     @cached_property
     def fitted_base(self) -> nn.Module:
-        """Return the base with its fitted parameters. If there are such parameters, the result is a
-        copy of the base.
+        """Return the base with its fitted parameters. If the base has fitted parameters, the result is a copy
+        of it.
         """
         if not self.own:
             return self.base
@@ -229,8 +235,9 @@ class Twin:
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
-        """Return the base and the effects as a chain for one scan. Without a scan, the chain has the mean
-        strengths over groups. ``extra`` contains the parameter values of a further effect to try.
+        """Return the base and the effects as a chain that predicts one scan. If no scan is given, strengths
+        that differ by group are replaced by their means over the groups. ``extra`` contains the parameter
+        values of a further effect to try, keyed by the name of the effect.
         """
         base, labels = self.fitted_base, dict[str, str]()
         if scan is not None:
@@ -246,16 +253,16 @@ class Twin:
 
         Args:
             scan: the scan.
-            extra: parameter values of a further effect to try, by its name.
-            known: cached fields of this scan that twins with the same base have already computed. Newly
-                computed fields are added to it.
+            extra: parameter values of a further effect to try, keyed by the name of the effect.
+            known: cache of intermediate fields of this scan, which twins with the same base have already
+                computed. Newly computed fields are added to this cache.
         """
         chain, context = self.chain(scan, extra), scan.context
         return chain(context.layout_um, context, known, self.numbers.tobytes())[0, 0].numpy()
 
     def steps(self) -> np.ndarray:
-        """Return the step of each parameter for difference quotients, of shape (p,). A step is negative only
-        if the parameter is near its upper bound.
+        """Return the step by which each parameter is changed to compute a difference quotient. A step is
+        negative only if the parameter is near its upper bound. The result has shape (p,).
         """
         _, upper, usual = self._ranges()
         own, size = self.vector[: self.own], 0.05 * usual
@@ -263,8 +270,8 @@ class Twin:
         return np.concatenate([5e-3 * np.maximum(np.abs(own), 0.2), effects])
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest step of each parameter that keep the parameters of base and
-        effects within their ranges. Both arrays have shape (p,).
+        """Return two arrays of shape (p,): the lowest and the highest allowed step of each parameter. Steps
+        within these limits keep the parameters of the base and of the effects within their ranges.
         """
         lower, upper, _ = self._ranges()
         own, effects = self.vector[: self.own], self.vector[self.own :]
@@ -275,8 +282,8 @@ class Twin:
         )
 
     def _ranges(self) -> np.ndarray:
-        """Return the lower bound, the upper bound and the usual size of each effect parameter, of
-        shape (3, slots).
+        """Return three numbers for each fitted parameter of an effect: its lower bound, its upper bound and
+        its usual size. The result has shape (3, slots).
         """
         known = [
             # A parameter that is usually zero, such as an angle, gets a tenth of its range as its usual size.
@@ -286,22 +293,23 @@ class Twin:
         return np.array(known).reshape(-1, 3).T
 
     def free(self) -> np.ndarray:
-        """Return a mask of shape (p,) that is True for parameters that are not on a bound."""
+        """Return a mask of the fitted parameters that do not lie on a bound. The mask has shape (p,)."""
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
     def at_bounds(self) -> dict[str, float]:
-        """Return the names of the fitted parameters of base and effects that lie on a bound, each
-        with this bound.
+        """Return the fitted parameters of the base and of the effects that lie on a bound. The result is
+        keyed by the name of the parameter, and its values are the bounds.
         """
         base = self.fitted_base
         found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
         return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
 
     def at_limits(self, name: str, kind: Kind) -> str:
-        """Return the names of the parameters of an effect that lie on a limit of their range in some group,
-        separated by commas. For the kind ``amplitude``, these are amplitudes, and the null of an amplitude
-        does not count as a limit. For the kind ``shape``, these are lengths, such as ranges and depths.
+        """Return the names, separated by commas, of the parameters of an effect that lie on a limit of their
+        range in at least one group. If ``kind`` is ``amplitude``, only amplitudes are examined, and the null
+        value of an amplitude does not count as a limit. If ``kind`` is ``shape``, only lengths, such as
+        ranges and depths, are examined.
         """
         own = ((one.parameter, one.facts, bound) for one, bound in self._on_bounds() if one.effect == name)
         counted = (

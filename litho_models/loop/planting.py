@@ -1,4 +1,6 @@
-"""Plant an effect in copies of the scans, and test whether the loop finds it there."""
+"""Plant a known effect in copies of the scans (add the change that it would make), and test whether the loop
+finds it there.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ def parse_planted(text: str) -> tuple[Effect, float]:
 def plant(
     effect: Effect, amount: float, closed: Closed, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> Planted:
-    """Plant an effect in copies of the scans, run the loop again on these copies, and return what it finds.
+    """Plant an effect in copies of the scans, run the loop again on these copies, and return the record of
+    what it finds.
 
     Args:
         effect, amount: the effect and the value of its first amplitude, as ``parse_planted`` returns them.

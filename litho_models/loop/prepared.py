@@ -20,8 +20,8 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
 
-# If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan,
-# with a margin.
+# If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan. The
+# quadrant is predicted with a margin.
 LARGE_PX = 400
 
 
@@ -31,12 +31,14 @@ class PreparedScan:
 
     Attributes:
         stored: the scan in the store.
-        context: the exposed layout, the position and other facts about the scan, which effects use.
-        sample: flat indices of the n pixels that fits and screening use. They are a thinned selection of the
-            measured pixels away from the edge.
+        context: facts about the scan that effects use, such as the exposed layout and the position in the
+            write field.
+        sample: flat indices of the n pixels that fits and screening use. These pixels are a thinned selection
+            of the measured pixels that are not near the edge.
         height: measured height at ``sample``, µm, float64, of shape (n,).
         line: index of the scan line of each pixel, of shape (ny, nx).
-        quadrant: for a large scan, the part that fits and screening use; see ``window``.
+        quadrant: for a large scan, the quadrant that fits and screening use; None for other scans. See
+            ``window``.
     """
 
     stored: PrintedScan
@@ -48,7 +50,9 @@ class PreparedScan:
 
     @cached_property
     def usable(self) -> np.ndarray:
-        """Return a mask of the measured pixels, which are scored, of shape (ny, nx)."""
+        """Return the mask of the measured pixels, which are the pixels that are scored. The mask has shape
+        (ny, nx).
+        """
         return self.stored.usable
 
     @property
@@ -60,17 +64,21 @@ class PreparedScan:
         return self.quadrant or self
 
     def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
-        """Return the values of a map of shape (…, ny, nx) at the sampled pixels, as float64."""
+        """Return the values of a map at the sampled pixels, as float64. The map has shape (ny, nx), possibly
+        with leading axes of length 1, and the result has shape (n,).
+        """
         flat = field_map.detach().cpu().numpy() if isinstance(field_map, Tensor) else field_map
         return flat.reshape(-1)[self.sample].astype(np.float64)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
-        """Return the smooth maps of the named scan terms at the sampled pixels, of shape (k, n)."""
+        """Return the smooth maps of the named scan terms at the sampled pixels, for the given predicted
+        height. The result has shape (k, n).
+        """
         return term_maps(TermPixels(prediction_um, self.line, self.sample), terms)
 
     def free_basis(self, prediction_um: np.ndarray, terms: Terms) -> np.ndarray:
-        """Return an orthonormal basis of the named scan terms at the sampled pixels, of shape (n, k). The
-        terms are computed for a predicted height of shape (ny, nx), µm.
+        """Return an orthonormal basis of the named scan terms at the sampled pixels. The terms are computed
+        from a predicted height, µm, of shape (ny, nx). The result has shape (n, k).
         """
         return orthonormal(self.terms_at_sample(prediction_um, terms).T)
 
@@ -90,8 +98,9 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
 
 
 def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Prepare further scans. Their scaled positions in the writing order are interpolated between those of
-    the scans ``known``, so that both are on the same scale.
+    """Prepare further scans, in addition to the prepared scans ``known``. The scaled positions of the further
+    scans in the writing order are interpolated between those of the known scans, so that all scans are on the
+    same scale.
     """
     orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
 
@@ -162,8 +171,8 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
 
 
 def _half(size: int, second: bool) -> tuple[slice, slice]:
-    """Return one half of an axis as two slices: first with a margin of 48 pixels into the other
-    half, then without it.
+    """Return one half of an axis as two slices: first the half with a margin of 48 pixels that extends into
+    the other half, then the half without this margin. ``second`` selects the second half.
     """
     middle = size // 2
     if second:
@@ -172,8 +181,8 @@ def _half(size: int, second: bool) -> tuple[slice, slice]:
 
 
 def sample_border_px(size: int) -> int:
-    """Return the number of pixels at each end of an axis that fits leave out, because the neighbourhood of
-    these pixels extends beyond the layout. ``size`` is the length of the shorter axis.
+    """Return the number of pixels that fits leave out at each edge of a scan. The neighbourhood of these
+    pixels extends beyond the layout. ``size`` is the length of the shorter axis.
 
     Errors are nevertheless scored on all pixels, as in the benchmark (``NuisanceProtocol.border_px``).
     """

@@ -1,5 +1,5 @@
-"""The record of a loop, which is the file ``close_loop.json`` (schema 4). The report and its tables
-are made from it.
+"""The record of a loop, i.e. of a search for effects that a base model lacks. It is written to the file
+``close_loop.json`` (schema 4). The report and its tables are made from this record.
 """
 
 from __future__ import annotations
@@ -44,17 +44,20 @@ class ErrorRow(Record):
         measurement: what was added to the predicted print. ``print alone`` adds nothing, ``published`` adds
             the smooth background of the training scans (the published protocol), and ``shared`` adds the
             changes of the whole measurement model.
-        policy: name of the set of terms that were fitted to each scan, on pixels that are not scored.
+        policy: name of the policy, i.e. of the set of terms that were fitted to each scan, on pixels that are
+            not scored.
         k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
-            not only the fit but also all choices were made without the held-out scans.
+            not only the fits but also all choices (such as which effects to add) were made without the
+            held-out scans.
         printer_numbers: number of fitted parameters of the printer model.
         measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
             number is largest.
         mae_nm, rmse_nm: mean absolute error and root mean square error.
         mae_ci95_nm: 95 % confidence interval of the mean absolute error over scans.
-        by_scan_nm: mean absolute error of each scan, by its id.
-        edge_by_scan_nm: for films, the mean distance between measured and predicted edges of each scan.
+        by_scan_nm: mean absolute error of each scan, keyed by scan id.
+        edge_by_scan_nm: for films, the mean distance between measured and predicted edges of each scan, keyed
+            by scan id. It is empty for other prints.
     """
 
     model: Stage
@@ -109,23 +112,25 @@ class FoundEffect(Record):
     """An effect, law or table that was added to the model.
 
     Attributes:
-        by: the grouping by which the strength of the effect differs, or ``all`` if it is the same in all
-        scans.
-        strengths: fitted values of each parameter, by the name of the parameter.
+        by: the grouping by which the strength of the effect differs, or ``all`` if the strength is the same
+            in all scans.
+        strengths: fitted values of each parameter, one per group, keyed by the name of the parameter.
         confusable_with: other effects that look the same in these scans.
         separating_experiment: experiments that would distinguish these effects.
-        gain_nm2: decrease of the squared error of held-out scans when the effect is added to all other
-            effects in the model. The error is computed on the pixels that fits use, after seven terms and an
-            affine registration error have been subtracted from each scan.
+        gain_nm2: decrease of the squared error of held-out scans when the effect is added to a model with all
+            other effects. The error is computed on the pixels that fits use, after seven terms and an affine
+            registration error have been subtracted from each scan.
         before_nm2: the same squared error without the effect.
-        scans_improved: number of held-out scans whose error falls, and number of all scans.
+        scans_improved: number of held-out scans whose error falls, and total number of scans.
         p_confirm: p value of the test that held-out scans confirm the effect.
-        family_p: p value of the effect in the screening of all candidates.
-        group_p: p value of the grouping, from permuted labels; None if the strength does not differ by group.
-        reshaped_share: further gain if variants of the change that the effect makes were added to the model,
-            divided by the gain of the effect itself.
+        family_p: p value of the effect in the screening of all candidates, corrected for the number of
+            candidates.
+        group_p: p value of the grouping, computed by permuting the labels of the scans; None if the strength
+            does not differ by group.
+        reshaped_share: further gain that would result if variants of the change that the effect makes were
+            added to the model, divided by the gain of the effect itself.
         left_out_nm: increase of the mean absolute error (k = 1) if the effect is removed from the model.
-        survives_on: other base models with which the search also found the effect.
+        survives_on: names of the other base models with which the search also found the effect.
     """
 
     name: str
@@ -160,13 +165,14 @@ class Candidate(Record):
 
 
 class ScanFinding(Record):
-    """What single scans show about a per-scan term or about a mark, such as a scar. No model contains them.
+    """The evidence of single scans for a per-scan term or for a mark, such as a scar. Such terms and marks
+    are not part of any model.
 
     Attributes:
         seen: whether the scans show the term or mark.
         evidence: the evidence, in words.
         p: p value of the test.
-        spread: standard deviation over scans of each parameter, by the name of the parameter.
+        spread: standard deviation of each parameter over scans, keyed by the name of the parameter.
         confusable_with: other effects that look the same in these scans.
     """
 
@@ -181,7 +187,9 @@ class ScanFinding(Record):
 
     @classmethod
     def of(cls, name: str, evidence: str, *, seen: object, **facts: Any) -> ScanFinding:
-        """Make a finding. Its title and role are those in the catalogue, unless ``facts`` contains others."""
+        """Make a finding. Its title and role are taken from the catalogue of effects, unless ``facts``
+        contains them.
+        """
         effect = CATALOGUE.get(name)
         role = effect.role if effect else "measurement"
         known = {"title": effect.title if effect else name, "role": role, **facts}
@@ -189,10 +197,11 @@ class ScanFinding(Record):
 
 
 class Planted(Record):
-    """An effect that was planted in copies of the scans, and what the loop found in these copies.
+    """The record of an effect that was planted in copies of the scans, and of what the loop found in these
+    copies.
 
     ``amount`` is the planted strength. ``rms_nm`` is the rms of the change that the planted effect makes,
-    after the free terms of each scan are fitted to it and subtracted. ``named`` is the set of
+    after the free terms of each scan have been fitted to this change and subtracted. ``named`` is the set of
     indistinguishable effects that contains the planted effect; it is empty if the loop found no such set.
     ``found`` is the fitted strength; it is None if the effect is not in the model.
     """
@@ -206,8 +215,8 @@ class Planted(Record):
 
 
 class Explained(Record):
-    """The squared error on held-out scans after one stage of the loop, and the part of it that features of
-    the layout and of the position can still explain, both in nm². ``matters`` is True if this part is
+    """The squared error on held-out scans after one stage of the loop, nm², and the part of this error that
+    features of the layout and of the position can still explain, nm². ``matters`` is True if this part is
     significant and exceeds 1 % of the error.
     """
 
@@ -218,11 +227,11 @@ class Explained(Record):
 
 
 class Comparison(Record):
-    """A comparison of two answers to a question on new prints.
+    """A comparison, on new prints, of two possible answers to a question.
 
     ``better`` is the answer that fits better, and ``worse`` is the other answer. ``gain_nm2`` is the
     difference of their squared errors. ``z`` is this difference in standard deviations, after an allowance
-    for an error in the form of the model is subtracted. ``difference_nm`` is the rms difference of the two
+    for a wrong form of the model has been subtracted. ``difference_nm`` is the rms difference of the two
     predictions.
     """
 
@@ -234,11 +243,11 @@ class Comparison(Record):
 
 
 class Decision(Record):
-    """What new prints say about an open question.
+    """The decision that new prints allow on an open question.
 
     ``declared`` lists the possible answers, which were stated before these prints were made, and ``left``
-    lists the answers that are still possible. ``prints`` and ``scans`` are the numbers of new prints and
-    scans.
+    lists the answers that are still possible. ``prints`` and ``scans`` are the numbers of new prints and of
+    new scans.
     """
 
     question: str
@@ -256,12 +265,14 @@ class CloseLoop(Result):
     """The record of a loop.
 
     Attributes:
-        errors: the errors of all models on held-out scans.
+        errors: the errors of all models on held-out scans, one row per model, policy and kind of held-out
+            scans.
         gain_nm: the headline error of the base model minus that of the corrected model (see
             ``ErrorRow.is_headline``). ``over_scans`` and ``over_prints`` contain its confidence intervals.
         confounded: pairs of parameters that these scans cannot determine separately, each with the
             correlation of the two parameters.
-        decisions: decisions on open questions of this store, made with the prints of further stores.
+        decisions: decisions on the open questions of this store. They are based on the prints of further
+            stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
@@ -300,7 +311,8 @@ class CloseLoop(Result):
     ) -> ErrorRow | None:
         """Return the error with the given properties, or None if this error was not computed.
 
-        By default, ``policy`` is the usual policy: one offset for each scan, or none for films.
+        By default, ``policy`` is the usual policy, in which one offset is fitted to each scan, or nothing for
+        films.
         """
         policy = policy or usual_policy(any(row.edge_by_scan_nm for row in self.errors))
         wanted = model, policy, measurement, held_out

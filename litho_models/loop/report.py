@@ -19,9 +19,9 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
 
     Args:
         result: the record of the loop.
-        maps: for each scan, its name and its residual maps before and after the correction, nm, of shape (ny,
-        nx).
-        folder: folder for the files.
+        maps: for each scan, its name, its residual map before the correction of the model, and its residual
+            map after the correction. The maps are in nm and have shape (ny, nx).
+        folder: folder to which the files are written.
     """
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",

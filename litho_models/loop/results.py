@@ -1,5 +1,5 @@
-"""Make the record of a loop, which states errors, the strengths of effects with confidence intervals, and the
-reasons why the other effects were rejected.
+"""Make the record of a loop. It states the errors of the models, the strengths of the effects that were
+found, with confidence intervals, and the reasons why the other effects were rejected.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def record(
     Args:
         closed: the loop, as returned by ``close``.
         errors: the errors of all models, as returned by ``HeldOut.errors``.
-        single_scans: terms and marks found in single scans.
-        left_out_nm: the value of ``FoundEffect.left_out_nm`` for each effect, by its name.
+        single_scans: findings about per-scan terms and marks.
+        left_out_nm: values of ``FoundEffect.left_out_nm``, keyed by the name of the effect.
         given: the remaining fields of the record.
     """
     study, final = closed.study, closed.final.twin
@@ -101,8 +101,8 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted values of the parameters of the base model by name, in physical units if these are
-    known. The result is empty if the base model was not fitted.
+    """Return the fitted values of the parameters of the base model, keyed by name. The values are in physical
+    units if these are known. The result is empty if the base model was not fitted.
     """
     base = twin.fitted_base
     if not twin.own or not isinstance(base, Simulator):
@@ -150,8 +150,8 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Return the fitted values of the parameters of an effect, with confidence intervals from the scatter
-    over prints (or over scans, if there are too few prints).
+    """Return the fitted values of the parameters of an effect, keyed by the name of the parameter. Their
+    confidence intervals are computed from the scatter over prints, or over scans if there are too few prints.
     """
     twin, units = closed.final.twin, independent(closed.study.scans)
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
@@ -169,8 +169,8 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
-    """Return the name of the unit to which each scan belongs. Confidence intervals treat these units as
-    independent. A unit is a print, or a single scan if there are too few prints.
+    """Return the name of the statistical unit to which each scan belongs. Confidence intervals treat these
+    units as independent. A unit is a print, or a single scan if there are too few prints.
     """
     prints = [scan.stored.print_id for scan in scans]
     return prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in scans]
@@ -180,7 +180,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
     """Return the cluster-robust covariance of the p fitted parameters, of shape (p, p).
 
     Args:
-        linear: the linearised problem of each scan at the optimum.
+        linear: the linearised least-squares problem of each scan at the optimum.
         units: the cluster (print or scan) to which each scan belongs.
     """
     parts = [eliminated(part, RULES.term_weight) for part in linear]
@@ -195,7 +195,7 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
 
 def confounded(state: State) -> list[tuple[str, str, float]]:
     """Return the pairs of fitted parameters that the scans cannot determine separately, each with the
-    correlation of the two parameters. These are the pairs with an absolute correlation of at least 0.95.
+    correlation of the two parameters. A pair is returned if the absolute correlation is at least 0.95.
     """
     twin = state.twin
     normal = eliminated_sum(state.linear, RULES.term_weight)[0]
@@ -217,7 +217,7 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
     Args:
         closed: the loop.
         added: the effects that were added.
-        seen: names of the per-scan effects, which the record lists elsewhere.
+        seen: names of the per-scan terms and marks, which the record lists elsewhere.
     """
     named, films, count = closed.named, closed.study.of_films, len(closed.study.scans)
     sets = {other: one.name for one in added for other in one.confusable_with}

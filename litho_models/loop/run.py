@@ -81,8 +81,10 @@ def close_loop(
         seed: seed of the folds, the calibration blocks and the permutations.
         workers: number of local processes.
         dask: address of a Dask scheduler to use instead of local processes.
-        further: function that may change the record, or return further records, before anything is written.
-        decided_by: hashes of the further stores that the function ``further`` uses.
+        further: function that receives the closed loop and its record before anything is written. It returns
+            the record to write, which it may have changed, and further records to write.
+        decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
+            settings.
         report: function that receives the progress messages.
 
     Raises:
@@ -151,7 +153,8 @@ def close_loop(
 
 
 def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
-    """Return the scans for development, the locked scans, and a list of excluded scans, each with the reason.
+    """Return three lists: the scans for development, the locked scans, and texts that state which scans are
+    excluded and why.
 
     Raises:
         InputError: there are fewer than two scans for development.
@@ -191,8 +194,8 @@ def _nested(
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
-    """Return the step to which the heights in the raw file of each scan are rounded, µm, by scan id; None if
-    the store has no raw files.
+    """Return the step to which the heights in the raw file of each scan are rounded, µm, keyed by scan id.
+    Return None if the store has no raw files.
     """
     try:
         return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
@@ -210,8 +213,8 @@ def save_laws(result: CloseLoop, folder: Path) -> None:
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
-    """Save the corrected model as a frozen model. If strengths differ by group, those of the latest
-    scan are used.
+    """Save the corrected model as a frozen model, i.e. with fixed parameters. If the strength of an effect
+    differs by group, the strength of the group of the latest scan is used.
     """
     base = closed.final.twin.fitted_base
     base = base.common if isinstance(base, FoldedBase) else base
