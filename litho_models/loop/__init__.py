@@ -1,3 +1,3 @@
-"""Find causes and empirical laws in the residual of a model on measured prints, and correct the
-model with them.
+"""The loop: search the residual of a model on measured prints for causes and empirical laws, and correct the
+model with those that are found.
 """

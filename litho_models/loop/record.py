@@ -114,7 +114,8 @@ class FoundEffect(Record):
     Attributes:
         by: the grouping by which the strength of the effect differs, or ``all`` if the strength is the same
             in all scans.
-        strengths: fitted values of each parameter, one per group, keyed by the name of the parameter.
+        strengths: fitted values of each parameter, keyed by the name of the parameter. There is one value per
+            group if the parameter differs by group, and otherwise a single value.
         confusable_with: other effects that look the same in these scans.
         separating_experiment: experiments that would distinguish these effects.
         gain_nm2: decrease of the squared error of held-out scans when the effect is added to a model with all

@@ -1,9 +1,11 @@
-"""Predict how much every candidate effect would gain on held-out scans, without fitting it.
+"""Predict for every candidate effect how much it would reduce the squared error on held-out scans (its gain),
+without fitting it.
 
-Each parameter set that is tried for an effect gives a column: the change (secant) that the effect with these
-parameters makes to the predictions of the current model. The gain is predicted by a linear regression of the
-residual on the columns of the effect. The strength of an effect is the same in all scans or differs by group.
-The computation needs only the inner products between residual and columns of each scan.
+Each parameter set that is tried for an effect gives a column (regressor): the change (secant) that the effect
+with these parameters makes to the predictions of the current model. The gain is predicted by a linear
+regression of the residual on the columns of the effect. The regression coefficients, i.e. the strengths of
+the effect, are either the same in all scans or differ by group. The computation needs only the inner products
+of the residual and the columns of each scan.
 """
 
 from __future__ import annotations
@@ -27,11 +29,11 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
-# The scan terms and the model's own parameters are projected out of each column. A test is valid only if at
-# least this share of the squared norm of the column remains.
+# The scan terms and the changes that the model's own parameters can make are projected out of each column. An
+# effect can be tested only if at least this fraction of the squared norm of its column remains.
 SMALLEST_RETAINED = 1e-5
-# A candidate is fitted if its predicted gain reaches this share of the smallest useful gain. The share is
-# below 1 because the gain of a fit is predicted only to within a factor of three.
+# A candidate is fitted if its predicted gain reaches this fraction of the smallest gain that counts. The
+# fraction is below 1 because screening predicts the gain of a fit only to within a factor of three.
 WORTH_FITTING = 0.3
 # Number of random permutations of the scans by which groupings are tested.
 PERMUTATIONS = 199
@@ -39,10 +41,10 @@ PERMUTATIONS = 199
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect that differ only in which amplitudes are switched on. All of them have the
-    same values of the shapes, and their strengths are fitted together.
+    """Parameter sets of one effect that are tried together. The sets have the same values of the shapes and
+    differ only in which amplitudes are switched on. A regression fits a multiple of each set.
 
-    ``columns`` contains the column numbers of these parameter sets among the columns of all trials.
+    ``columns`` contains the column numbers of these parameter sets in the inner products of all trials.
     """
 
     effect: Effect
@@ -51,24 +53,25 @@ class Trial:
 
     @cached_property
     def _facts(self) -> np.ndarray:
-        """Return the null value, the lowest value and the highest value of each amplitude, and its usual
-        distance from the null value. The result has shape (4, amplitudes).
+        """Return four numbers for each amplitude: its null value, its lowest value, its highest value, and
+        its usual distance from the null value. The result has shape (4, amplitudes).
         """
         facts = [self.effect.parameters[name] for name in self.effect.amplitudes]
         return np.array([(f.null, f.lower, f.upper, abs(f.typical - f.null) or 1.0) for f in facts]).T
 
     def steps(self, multiples: np.ndarray) -> np.ndarray:
-        """Return the distance of each amplitude from its null value, of shape (…, amplitudes), after the
-        parameter sets are multiplied by ``multiples``, which has shape (…, sets).
+        """Return the signed distance (step) of each amplitude from its null value, after each parameter set
+        has been multiplied by its factor in ``multiples``. ``multiples`` has shape (…, sets), and the result
+        has shape (…, amplitudes).
         """
         return multiples @ _steps(self.effect, self.sets)
 
     def allowed(self, multiples: np.ndarray) -> bool:
-        """Return whether every amplitude lies on the allowed side of its null value after the parameter sets
-        are multiplied by ``multiples``, which has shape (…, sets).
+        """Return whether every amplitude lies on the allowed side of its null value, after each parameter set
+        has been multiplied by its factor in ``multiples``, which has shape (…, sets).
 
-        An amplitude on the wrong side is ignored as noise if it is small relative to the largest amplitude of
-        all groups.
+        An amplitude on the wrong side is attributed to noise and ignored if it is small relative to the
+        largest amplitude in all groups.
         """
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
@@ -76,10 +79,10 @@ class Trial:
         return not (sizes[wrong] > 0.3 * sizes.max()).any()
 
     def reach(self, multiples: np.ndarray) -> float:
-        """Return the largest factor, at most 1, by which all steps can be multiplied so that the amplitudes
-        stay within their ranges.
+        """Return the largest factor, at most 1, by which the steps of all amplitudes can be multiplied so
+        that the amplitudes stay within their ranges.
 
-        The full steps may lead out of the ranges, because they are linear extrapolations.
+        The full steps may lead out of the ranges, because they are obtained by linear extrapolation.
         """
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
@@ -88,7 +91,7 @@ class Trial:
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
         """Return the parameter values from which a fit starts. No amplitude is farther from its null value
-        than in the trial with its largest value.
+        than the largest value that screening tries for this amplitude.
         """
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
@@ -99,8 +102,8 @@ class Trial:
 
 
 def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
-    """Return the distance of each amplitude from its null value in each parameter set, of shape
-    (sets, amplitudes).
+    """Return the signed distance (step) of each amplitude from its null value in each parameter set. The
+    result has shape (sets, amplitudes).
     """
     nulls = {name: effect.parameters[name].null for name in effect.amplitudes}
     return np.array([[one.get(name, null) - null for name, null in nulls.items()] for one in sets])
@@ -110,8 +113,8 @@ def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
     """Combine the parameter sets of the effects into trials. The columns are numbered from ``first``.
 
     The sets of a trial have the same values of the shapes. If the same amplitudes are tried at two sizes, the
-    sizes belong to different trials, because the change that a large effect makes need not be a multiple of
-    the change that a small effect makes.
+    two sizes belong to different trials. The reason is that the change that a large effect makes need not be
+    a multiple of the change that a small effect makes.
     """
     found: list[Trial] = []
     for effect in effects:
@@ -133,8 +136,8 @@ class Secants:
     these changes.
 
     Attributes:
-        free_terms: orthonormal basis of the free terms at the n sampled pixels of each window, of shape (n,
-            k).
+        free_terms: for each window, an orthonormal basis of the free scan terms at its n sampled pixels, of
+            shape (n, k).
     """
 
     def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
@@ -148,8 +151,8 @@ class Secants:
         self._known: dict[tuple[object, ...], list[NDArray[np.float32]]] = {}
 
     def of(self, trials: Sequence[Trial]) -> list[list[NDArray[np.float32]]]:
-        """Return for each window the changes that the parameter sets of all trials make, µm, each
-        of shape (n,).
+        """Return for each window a list of the changes that the parameter sets of all trials make to its
+        prediction. Each change is an array of shape (n,), µm.
         """
         rows = []
         for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
@@ -169,23 +172,24 @@ class Secants:
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """A trial with the grouping of its strength, and the gain that is predicted for held-out scans.
+    """The result of screening a trial with strengths that differ by one grouping. It contains the gain that
+    is predicted for held-out scans.
 
     Attributes:
         trial: the parameter sets that were tried.
-        by: the grouping by which the strength differs.
+        by: the grouping by which the strength differs, or ``all`` if the strength is the same in all scans.
         gains_nm2: predicted decrease of the squared error of each scan, of shape (scans,), with strengths
             that are fitted without the fold of this scan.
-        multiples: for each label, the factors by which the parameter sets of the trial are multiplied. They
-            are fitted to all scans.
-        allowed: whether the amplitudes have signs that are physically possible.
-        retained: share of the squared norm of the columns that remains after the scan terms and the model's
-            own parameters are projected out.
-        beside_base: the same share if only the scan terms are projected out.
-        family_p: p value of the candidate: the share of random sign flips of the scans after which at least
-            one candidate gains as much as this one.
-        group_p: p value of the grouping: the share of random permutations of the scans after which at least
-            one grouping gains as much as this one. None if no grouping was tested.
+        multiples: the factors by which the parameter sets of the trial are multiplied, keyed by group label.
+            They are fitted to all scans.
+        allowed: whether the fitted amplitudes lie on physically possible sides of their null values.
+        retained: fraction of the squared norm of the columns that remains after the scan terms and the
+            changes that the model's own parameters can make have been projected out.
+        beside_base: the same fraction if only the scan terms are projected out.
+        family_p: p value of the candidate: the fraction of sign flips of the gains of the scans after which
+            at least one candidate gains as much as this one.
+        group_p: p value of the grouping: the fraction of random permutations of the scans after which at
+            least one grouping gains as much as this one. None if no grouping was tested.
     """
 
     trial: Trial
@@ -212,7 +216,7 @@ class Screened:
         return len(self.trial.sets) * len(self.multiples) + shapes
 
     def start(self) -> dict[str, dict[str, float]]:
-        """Return the starting values of a fit, by label."""
+        """Return the parameter values from which a fit starts, keyed by group label."""
         return {label: self.trial.start(own) for label, own in self.multiples.items()}
 
 
@@ -221,11 +225,11 @@ class Screening:
 
     Args:
         state: the fitted model.
-        effects: the candidates, none of which is in the model.
-        secants: changes that the candidates make to the predictions of a similar model; by default, they are
-            computed for the fitted model.
+        effects: the candidate effects, none of which is in the model.
+        secants: changes that the candidates make to the predictions of a similar model, which saves computing
+            them. By default, they are computed for the fitted model.
         beside_own: whether the changes that the model's own parameters can make are projected out of the
-            columns.
+            columns of the candidates.
     """
 
     def __init__(
@@ -254,7 +258,9 @@ class Screening:
 
     @cached_property
     def candidates(self) -> dict[str, dict[str, Screened]]:
-        """Return the best trial of each effect for each grouping, by the names of effect and grouping."""
+        """Return the best trial of each effect for each grouping. The result is keyed by the name of the
+        effect and then by the name of the grouping.
+        """
         found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
@@ -273,13 +279,15 @@ class Screening:
 
     @property
     def common(self) -> dict[str, Screened]:
-        """Return the best trial of each effect with a strength that is the same in all scans, by
-        the name of the effect.
+        """Return the best trial of each effect for a strength that is the same in all scans, keyed by the
+        name of the effect.
         """
         return {name: own[ALL] for name, own in self.candidates.items()}
 
     def standing(self) -> list[Screened]:
-        """Return the significant candidates, each with its best grouping, in order of decreasing gain."""
+        """Return the significant candidates, in order of decreasing gain. For each candidate, the best
+        grouping is given, or ``all`` if no grouping of its strength is significant.
+        """
         standing = []
         for own in self.candidates.values():
             grouped = self._grouped(own)
@@ -292,8 +300,8 @@ class Screening:
         return sorted(standing, key=lambda one: -one.gain_nm2)
 
     def _grouped(self, own: Mapping[str, Screened]) -> Screened | None:
-        """Return the candidate with the best grouping of its strength; None if the additional gain over a
-        strength that is the same in all scans may be chance.
+        """Return the candidate with the best grouping of its strength. Return None if no grouping gains
+        significantly more than a strength that is the same in all scans.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
         better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
@@ -304,11 +312,11 @@ class Screening:
         return replace(better[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
-        """Return the cosine of the angle between the changes that two candidates make in all scans
-        together.
+        """Return the cosine of the angle between the changes that two candidates make to the predictions of
+        all scans, taken together as one vector.
         """
-        # The change of a candidate is a sum of columns. ``factors`` contains the factors of the columns in
-        # each scan.
+        # The change that a candidate makes is a weighted sum of columns. ``factors`` contains the weights of
+        # the columns in each scan.
         factors = np.zeros((2, *self.freed.shape[:2]))
         for own, one in zip(factors, (a, b), strict=True):
             own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
@@ -336,14 +344,15 @@ class Screening:
         columns: Sequence[int],
         taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return the gains on held-out scans, nm², of shape (scans,), for columns whose strengths differ by
-        label. Also return the strengths of each label that are fitted to all scans.
+        """Return two results for columns whose strengths differ by label. The first is the gain on each scan,
+        nm², for strengths that are fitted without the fold of this scan, as an array of shape (scans,). The
+        second is the strengths that are fitted to all scans, keyed by label.
 
         Args:
             labels: label of each scan.
-            columns: column numbers.
-            taken: function that receives the strengths fitted without a fold and returns the factor by which
-                they are multiplied before the gain is computed.
+            columns: numbers of the columns in the inner products.
+            taken: function that receives the strengths that are fitted without a fold. It returns the factor
+                by which these strengths are multiplied before the gain is computed.
         """
         own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
         scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
@@ -363,17 +372,20 @@ class Screening:
     def best_grouping(
         self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, Labels], np.ndarray]
     ) -> tuple[str, float] | None:
-        """Choose the grouping with the fewest parameters among those that gain nearly the most.
+        """Choose a grouping of the scans by which strengths differ. Among the groupings whose gains are
+        nearly the largest, the one with the fewest parameters is chosen.
 
         Args:
-            options: for each grouping, the gain in nm² and the number of parameters.
-            gains_of: function ``gains_of(by, labels)`` that returns the gains in nm², of shape (scans,), of
-                the candidate for the grouping ``by`` if its strengths differ by the given labels instead.
+            options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
+            gains_of: function ``gains_of(by, labels)`` that returns the gains, nm², of the candidate for the
+                grouping ``by`` if its strengths differ by the given labels instead. The gains have shape
+                (scans,).
 
         Returns:
-            The chosen grouping, and its p value: the share of random permutations of the scans after which
-            any grouping gains as much. Permutations that reproduce the chosen grouping are not counted. None
-            if no grouping has a gain, or if the gain may be chance.
+            The name of the chosen grouping, and its p value: the fraction of random permutations of the scans
+                after which any grouping gains as much. Permutations that reproduce the chosen grouping are
+                not counted. The result is None if no grouping has a gain, or if the gain of the chosen
+                grouping is not significant.
         """
         most = max((gain for gain, _ in options.values()), default=0.0)
         close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

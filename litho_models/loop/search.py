@@ -1,10 +1,10 @@
-"""Search for the effects that a model lacks. Effects are added as long as they reduce the error on held-out
-scans, and every added effect is tested again at the end.
+"""Search for the effects that a model lacks. Effects are added one at a time, as long as they reduce the
+error on held-out scans. At the end, every added effect is tested again.
 
-All candidates are screened at once, with strengths that are the same in all scans and with strengths that
-differ by group. Before one of them is chosen, the most promising candidates are fitted in full, because
-screening uses the derivative at zero strength, which gives only a rough estimate of the gain of a large
-effect.
+Before each addition, all candidates are screened at once, both with strengths that are the same in all scans
+and with strengths that differ by group. The most promising candidates are then fitted in full before one of
+them is chosen. This is necessary because screening assumes that the change an effect makes is proportional to
+its strength, which gives only a rough estimate of the gain of a large effect.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from litho_models.loop.model import Twin, Values
 from litho_models.loop.screening import Screened, Screening, Secants
 from litho_models.scan_terms.grouped import ALL, Labels
 
-# Two effects whose changes correlate at least this much count as indistinguishable.
+# Two effects count as indistinguishable if the cosine between the changes that they make to the predictions
+# is at least this large.
 SAME_COSINE = 0.8
 
 
@@ -32,17 +33,17 @@ class Cause:
 
     Attributes:
         name: name of the effect.
-        by: the grouping by which its strength differs.
+        by: the grouping by which its strength differs, or ``all`` if its strength is the same in all scans.
         alike: other effects that look the same in these scans.
-        judgement: the gain on held-out scans when the effect is added to all other effects of the model, and
-            whether this gain is significant.
+        judgement: the gain on held-out scans when the effect is added to the model with all other effects,
+            and the test of this gain.
         family_p: p value of the effect in the screening of all candidates.
         group_p: p value of the grouping; None if the strength does not differ by group.
-        values: for a table, the starting values of its parameters by label.
-        reshaped_share: further gain if variants of the change that the effect makes were added to the model,
-            divided by the gain of the effect itself.
+        values: for a table, the starting values of its parameters, keyed by group label.
+        reshaped_share: further gain that would result if variants of the change that the effect makes were
+            added to the model, divided by the gain of the effect itself.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
-        corrects: whether it was rejected because it may merely correct the formula of another effect.
+        corrects: whether the effect was rejected because it may merely correct the formula of another effect.
     """
 
     name: str
@@ -64,8 +65,9 @@ class Found:
     Attributes:
         state: the model with the effects that were added.
         causes: the effects that were added.
-        first, last: the first and the last screening result of each candidate, by its name.
-        refused: reasons why candidates were rejected, by name.
+        first, last: the first and the last screening result of each candidate, keyed by the name of the
+            candidate.
+        refused: reasons why candidates were rejected, keyed by the name of the candidate.
         failed: effects that were added at first and later rejected as causes.
     """
 
@@ -94,9 +96,10 @@ def search(
         start: the fitted model.
         candidates: effects that may be added.
         most: largest number of effects in the result.
-        secants: changes that the candidates make to the predictions of a similar model; by default, these
-            changes are computed for the current model.
-        seed: result of the same search with another base. The search starts with the effects in this result.
+        secants: changes that the candidates make to the predictions of a similar model, which saves computing
+            them. By default, these changes are computed for the current model.
+        seed: result of the same search with another base model. If it is given, the search starts with the
+            effects in this result.
     """
     found = _seeded(start, seed) if seed and seed.causes else Found(start)
     while len(found.causes) < most and _add_one(found, candidates, secants):
@@ -106,8 +109,8 @@ def search(
 
 
 def _seeded(start: State, seed: Found) -> Found:
-    """Add all effects that a search with another base has found, and remove those that this base
-    does not need.
+    """Start a search with all effects that the search with another base model has found. Effects that are not
+    confirmed with this base model are removed.
     """
     twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
     found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
@@ -119,7 +122,7 @@ def describe(
     state: State, tables: Sequence[Effect], most: int, secants: Secants | None = None
 ) -> list[Cause]:
     """Find tables that held-out scans confirm as an addition to a model. Each table is judged separately, by
-    a linear fit. At most ``most`` tables are tried.
+    a linear fit, and is not added to the model. At most ``most`` tables are judged.
     """
     found: list[Cause] = []
     for one in Screening(state, tables, secants).standing()[:most]:
@@ -168,10 +171,10 @@ def _add_one(found: Found, candidates: Sequence[Effect], secants: Secants | None
 
 
 def _regroup(found: Found, name: str) -> None:
-    """Let the strength of a cause differ by group if held-out scans confirm the difference.
+    """Let the strength of a cause differ by group if held-out scans confirm that it does.
 
     Screening has already tried strengths that differ by group. This second test is more reliable, because it
-    uses the derivative at the fitted strength instead of the derivative at zero strength.
+    uses the derivative of the prediction at the fitted strength of the cause.
     """
     twin, study = found.state.twin, found.state.study
     at_cause = found.names.index(name)
@@ -183,8 +186,8 @@ def _regroup(found: Found, name: str) -> None:
         for at, slot in enumerate(twin.slots, twin.own)
         if slot.effect == name and slot.facts.kind == "amplitude"
     }
-    # Parameters that all scans share cannot explain a difference between groups, so they are not projected
-    # out.
+    # Parameters that are the same in all scans cannot explain a difference between groups, so the changes
+    # that they can make are not projected out.
     screening = Screening(found.state, (), beside_own=False)
 
     def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -219,8 +222,8 @@ def _regroup(found: Found, name: str) -> None:
 def _alike(
     one: Screened, fitted: Mapping[str, State], before: State, screening: Screening
 ) -> tuple[str, ...]:
-    """Return the names of the other effects that look the same as this effect in the scans. Effects are
-    compared by their fits if they were fitted, and otherwise by the results of screening.
+    """Return the names of the other effects that look the same as this effect in the scans. Effects that were
+    fitted are compared by their fits, and all other effects by the results of screening.
     """
     own = fitted[one.name]
     by_fit = [
@@ -255,11 +258,11 @@ def _fit(job: tuple[str, Twin, Study]) -> State:
 
 
 def same_change(before: State, one: State, other: State) -> bool:
-    """Return whether two models change the predictions of held-out scans in nearly the same way.
+    """Return whether two changes of a model change the predictions of held-out scans in nearly the same way.
 
     Args:
         before: the model before the change.
-        one, other: the two models.
+        one, other: the model after the first change, and the model after the second change.
     """
     inner = np.zeros((2, 2))
     for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
@@ -270,10 +273,11 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Test each cause again in the model with all other causes, and remove it if it is no longer confirmed.
+    """Test each cause again in the model with all other causes, and remove it if held-out scans no longer
+    confirm it.
 
-    Before that, test again whether its strength differs by group, because such a difference may become
-    visible only when the other causes are in the model.
+    Before these tests, test for each cause again whether its strength differs by group, because such a
+    difference may become visible only when the other causes are in the model.
     """
     if len(found.causes) > 1:
         for name in found.names:
@@ -282,8 +286,8 @@ def _defend(found: Found) -> None:
 
 
 def _test_again(found: Found) -> None:
-    """Judge the gain of each cause in the model with all other causes, and remove each cause that
-    is not confirmed.
+    """Judge the gain of each cause in the model with all other causes, and remove each cause that held-out
+    scans do not confirm.
     """
     study = found.state.study
     for cause in list(found.causes):

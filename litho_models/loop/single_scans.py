@@ -1,7 +1,9 @@
-"""Find terms that differ from scan to scan: datum, gain, bow, drift, registration errors and line offsets.
+"""Find out which terms differ from scan to scan: datum, gain, bow, drift, registration errors and line
+offsets.
 
-These terms cannot be predicted for the next print, so no model contains them. A term is judged by its
-variance: the term fitted to one half of the pixels of a scan must agree with the residual of the other half.
+Such terms cannot be predicted for the next print, so they are not part of any model. A term counts as present
+if it agrees between two halves of a scan: the term that is fitted to one half of the pixels must agree with
+the residual of the other half.
 """
 
 from __future__ import annotations
@@ -36,13 +38,14 @@ from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided
 
 
 class SingleScans:
-    """Test which per-scan terms the scans contain. Terms are fitted to pixels that are not scored.
+    """Test which per-scan terms the scans contain. To test a term, it is fitted to pixels that are not scored
+    and subtracted from the pixels that are scored.
 
     Args:
         study: the study, which provides the seed and the folds.
         scans: the original scans.
-        maps_um: map that each scan is expected to show, µm, of shape (ny, nx). It includes the measurement
-            model, and both models were fitted without this scan.
+        maps_um: map that each scan is expected to show, µm, of shape (ny, nx). It is predicted by a model of
+            the printer and a measurement model, both of which were fitted without this scan.
     """
 
     def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
@@ -50,8 +53,8 @@ class SingleScans:
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
-        """Test all per-scan effects, each in addition to the effects that were already found. Line offsets
-        are tested last.
+        """Test all per-scan effects, one after the other, and return the findings. Each effect is tested in
+        addition to the effects that were found before it. Line offsets are tested last.
         """
         accepted: Terms = frozenset({"offset"})
         found: list[ScanFinding] = []
@@ -77,7 +80,8 @@ class SingleScans:
         judgement = _as_variance(before, after, self.study)
         values = self.coefficients(own, accepted | own)
         grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
-        # If the scans of one print agree, the printer may be the cause instead of the microscope.
+        # If the term agrees between the scans of one print, the printer may be its cause instead of the
+        # microscope.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
         spread = zip(effect.parameters.items(), values.T, strict=True)
         few, many = (np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after))
@@ -96,8 +100,8 @@ class SingleScans:
         )
 
     def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """Fit all ``terms`` to each scan, and return the k coefficients of the terms in ``own``, of shape
-        (scans, k).
+        """Fit all ``terms`` to each scan, and return the k coefficients of those terms that are in ``own``.
+        The result has shape (scans, k).
 
         Coefficients of displacements are in µm.
         """
@@ -111,7 +115,9 @@ class SingleScans:
         return np.stack(found)
 
     def _spread(self, values: np.ndarray, unit: str) -> Strength:
-        """Return the standard deviation of the values over scans, with its bootstrap confidence interval."""
+        """Return the standard deviation over scans of the given values (one per scan), with its bootstrap
+        confidence interval.
+        """
         count = len(values)
         draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
         low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
@@ -120,10 +126,11 @@ class SingleScans:
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
         """Test whether the scan lines, or the rows of the layout, have height offsets.
 
-        These two kinds of offsets are compared with each other. They are also compared with offsets of the
+        The offsets of scan lines are compared with those of rows. Both are also compared with offsets of the
         layout's columns, which serve as a control. Scans are slightly rotated relative to their layouts.
         Offsets that follow the layout's rows come from the printer, and offsets that follow the scan lines
-        come from the microscope. Without a rotation, the two kinds cannot be distinguished.
+        come from the microscope. If no scan were rotated, the two kinds of offsets could not be
+        distinguished.
         """
         by_row, by_column = self._with_profile(axis=1), self._with_profile(axis=0)
         before = self._freed(by_row, accepted)
@@ -163,10 +170,11 @@ class SingleScans:
         return found
 
     def _with_profile(self, axis: int) -> list[np.ndarray]:
-        """Add to each expected map a profile across its lines: the mean residual of each line, over the scans
-        of other folds. Rows are the lines if ``axis`` is 1, and columns are the lines if it is 0.
+        """Add to each expected map a profile that contains, for each line, the mean residual of this line
+        over the scans of other folds. The lines are rows if ``axis`` is 1, and columns if ``axis`` is 0.
 
-        Nothing is added if the scans differ in size, because their lines then do not correspond.
+        If the scans differ in size, nothing is added, because the lines of different scans then do not
+        correspond to each other.
         """
         if len({scan.usable.shape[1 - axis] for scan in self.scans}) > 1:
             return list(self.maps_um)
@@ -180,10 +188,10 @@ class SingleScans:
         return found
 
     def _period(self, name: str) -> str:
-        """Return a description in words of a period that the line means of all scans have in common, such as
-        the period of mains hum. The text is empty if there is none.
+        """Return a text that describes a period with which the line means of all scans repeat, such as the
+        period of mains hum. The text is empty if no such period is significant.
 
-        All frequencies are tested at once.
+        The test allows for the number of frequencies that are tried.
         """
         (term,) = line_terms(terms_of_effect(name))
         assert term.lines is not None
@@ -202,9 +210,10 @@ class SingleScans:
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:
-        """Return the residual of each scan after datum and bow are subtracted, µm, of shape (ny, nx).
+        """Return the residual map of each scan after its datum and bow have been fitted and subtracted, µm.
+        Each map has shape (ny, nx).
 
-        Pixels that were not measured are 0.
+        Pixels that were not measured have the value 0.
         """
         return [
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
@@ -215,7 +224,8 @@ class SingleScans:
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:
     """Judge a per-scan term by whether the two halves of each scan agree on it.
 
-    The gain of each scan would not be a suitable test, because a scan whose term is near zero gains nothing.
+    Counting the scans whose error falls would not be a suitable test, because the error of a scan whose term
+    is near zero does not fall.
     """
     residuals_um = [[fit.residual_um for fit in fits] for fits in (before, after)]
     was, now = (np.array([NM_PER_UM**2 * np.nanmean(one**2) for one in own]) for own in residuals_um)
