@@ -383,9 +383,9 @@ class Screening:
 
         Returns:
             The name of the chosen grouping, and its p value: the fraction of random permutations of the scans
-                after which any grouping gains as much. Permutations that reproduce the chosen grouping are
-                not counted. The result is None if no grouping has a gain, or if the gain of the chosen
-                grouping is not significant.
+            after which any grouping gains as much. Permutations that reproduce the chosen grouping are not
+            counted. The result is None if no grouping has a gain, or if the gain of the chosen grouping is
+            not significant.
         """
         most = max((gain for gain, _ in options.values()), default=0.0)
         close = {by: (numbers, -gain) for by, (gain, numbers) in options.items() if gain >= 0.95 * most > 0}

@@ -291,7 +291,7 @@ def climbed(
         seed: seed of the random layouts from which the optimisation starts.
         steps: number of ascent steps for each tile.
         kept: folder in which finished tiles are saved. Tiles that an interrupted run has saved there are
-        reused.
+            reused.
         report: function that receives the progress messages.
     """
     kept.mkdir(parents=True, exist_ok=True)
