@@ -205,7 +205,7 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     """For every scan that could not be registered, find out whether it shows a layout of another id.
 
     If it does, the id of that layout is added to the scan's reason in ``skipped``. The result maps the id of
-    each such scan to a text that names the layout.
+    each of these scans to a message that names the layout.
     """
     named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}

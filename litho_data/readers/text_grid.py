@@ -33,8 +33,8 @@ class Map:
 
     ``size_um`` contains the side lengths (y, x) in µm, if the table states them with a unit. ``extent``
     contains the side lengths (y, x) in the unit of the coordinates, which the table may not state. ``x_is``
-    says in words which direction in the file runs along x. ``corner`` is true if the first cell of the table
-    does not belong to the map. This cell may then contain a word.
+    says in words whether rows or columns of the file run along x. ``corner`` is true if the first cell of the
+    table does not belong to the map. This cell may then contain a word.
     """
 
     values: Array

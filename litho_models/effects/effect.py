@@ -64,7 +64,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class FieldContext:
-    """The information about a printed field that an effect receives in addition to the array that it changes.
+    """Information about a printed field, passed to an effect along with the array to be changed.
 
     Args:
         layout_um: exposure of the field, which is the nominal height times the relative dose, µm, as a tensor

@@ -140,7 +140,7 @@ class Rival(Record):
 
 
 class Question(Record):
-    """An open question of a loop.
+    """A question that a run of the closed loop left open.
 
     Attributes:
         kind: what the question asks. ``set``: which effect of an indistinguishable set is present;

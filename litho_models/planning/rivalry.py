@@ -307,5 +307,7 @@ def _flat(field: Tensor) -> np.ndarray:
 
 
 def _free_basis(prediction_um: Tensor) -> np.ndarray:
-    """Return an orthonormal basis of the free terms of a scan on its n inner pixels, of shape (n, k)."""
+    """Return an array of shape (n, k) whose columns are an orthonormal basis of the k terms that are fitted
+    to each scan, at its n interior pixels.
+    """
     return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)
