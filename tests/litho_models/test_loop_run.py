@@ -230,7 +230,7 @@ def test_texts_follow_the_verdict(closed) -> None:
         "described": "confirm no cause and no short law",
         "nothing-missing": "These scans show nothing",
         "unexplained": "The model lacks something",
-        "too-few-scans": f"at least {result.fewest_scans} scans",
+        "too-few-scans": f"at least {result.fewest_scans} are needed",
     }
     for verdict, text in words.items():
         assert text in said("verdict", result.model_copy(update={"verdict": verdict, "effects": []}))
