@@ -140,7 +140,7 @@ class Photograph:
     finest_per_um: float
     record: CameraRecord
     expected: np.ndarray
-    other_warps: list[np.ndarray]
+    other_warps: list[list[np.ndarray]]
 
     def image(self) -> np.ndarray:
         """Return the photograph resampled on the pixels of the window, shape (m, m), in counts per camera
@@ -174,7 +174,7 @@ class Photograph:
         level and vignetting.
         """
         generator = np.random.default_rng(0)
-        for pair in zip(self.other_warps[::2], self.other_warps[1::2], strict=True):
+        for pair in self.other_warps:
             dark, edge = generator.standard_normal(2) * (self.record.dark_level_sd, self.record.vignetting_sd)
             for sign, warp in zip((1, -1), pair, strict=True):
                 yield self._warped(self.counts - np.float32(sign * dark), warp, sign * edge)
@@ -409,7 +409,7 @@ class _Fit:
     gamma: float = 1.0
     gamma_sd: float = 0.0
     blur_px: float = 0.0
-    other_warps: list[np.ndarray] = field(default_factory=list)
+    other_warps: list[list[np.ndarray]] = field(default_factory=list)
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
@@ -482,18 +482,18 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
+    scale_sd = 0.0
     if pitch_sd:
         spread[3, 3] += (min(pitch_sd, _PRINT_SCALE_SD) / unit[3]) ** 2
-    scale_sd = float(np.sqrt(spread[3, 3]) * unit[3]) if pitch_sd else 0.0
+        scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
     light = _light(seen(photo, pose), wanted, alike)
     size, ways = np.linalg.eigh(spread)
     generator, others = np.random.default_rng(0), []
     for _ in range(DRAWS):
         step = ways @ (np.sqrt(size.clip(0)) * generator.standard_normal(len(size)))
-        for sign in (1, -1):
-            at = pose.copy()
-            at[with_tilt] += sign * step * unit[with_tilt]
-            others.append(_camera(at, photo.shape, side, scale))
+        change = np.zeros_like(pose)
+        change[with_tilt] = step * unit[with_tilt]
+        others.append([_camera(at, photo.shape, side, scale) for at in (pose + change, pose - change)])
     return _Fit(
         warp,
         correlation,

@@ -315,11 +315,7 @@ def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) 
         under_tip = paraboloid_erosion(measured, pitches, record.tip_um).surface - measured
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
     for _ in range(DRAWS):
-        moved, scale, tip = (
-            generator.standard_normal(2),
-            generator.standard_normal(),
-            generator.standard_normal(),
-        )
+        moved, (scale, tip) = generator.standard_normal((2, 2))
         own_um = removed @ (record.removed_sd_um * generator.standard_normal(removed.shape[-1]))
         for sign in (1, -1):
             print_um = shift(measured, sign * position_px * moved, order=3, mode="nearest")

@@ -165,7 +165,8 @@ def _from_edge(share: Array, reach_px: float) -> tuple[Array, Array]:
     pixels = np.moveaxis(np.indices(share.shape, float), 0, -1)
     away_px, nearest = cKDTree(points).query(pixels, distance_upper_bound=reach_px)
     near = nearest < len(points)
-    away, along = (pixels - points[nearest * near])[near], normals[nearest[near]]
+    index = nearest[near]
+    away, along = pixels[near] - points[index], normals[index]
     inwards = (away * along).sum(-1)
     # At a corner, the nearest point of the edge does not lie on the normal through the pixel.
     corner = np.linalg.norm(away - inwards[:, None] * along, axis=-1) > _BESIDE_PX

@@ -26,7 +26,7 @@ from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
 
-DARK, WHITE, RANGE = 8000.0, 40000.0, 65535
+DARK = 8000.0
 
 
 @pytest.fixture(scope="module")
