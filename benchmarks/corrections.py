@@ -129,7 +129,7 @@ def wanted_um(name: str, seed: int, settings: ReliefSettings) -> np.ndarray:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Return the summary, and a table with one row per relief and printer. A cell contains the range over the
+    """Return the summary, and a table with one row per relief and printer. Each entry is the range over the
     seeds.
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}

@@ -21,7 +21,7 @@ _LOADED: dict[str, str] = {}
 
 
 def load_plugins(files: Iterable[str | Path] = ()) -> None:
-    """Import all installed plug-ins and the plug-in files ``files``, each once per process.
+    """Import all installed plug-ins and the given plug-in files. Each is imported once per process.
 
     Raises:
         InputError: a file is not Python, or a plug-in fails to load.

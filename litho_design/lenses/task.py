@@ -283,8 +283,8 @@ def _check(settings: LensSettings) -> None:
 
 
 def _check_outermost_zone(settings: LensSettings) -> None:
-    """Check that at least two cells fit into the outermost zone of the lens. The width of this zone is the
-    wavelength divided by the sine of the angle between the axis and the ray from the rim.
+    """Check that the outermost zone of the lens is at least two cells wide. The width of this zone is the
+    wavelength divided by the sine of the angle between the axis and the ray from the rim to the image.
     """
     layout, optics = settings.layout, settings.optics
     radius_um = layout.size_px * layout.pitch_um / 2

@@ -57,10 +57,12 @@ def polish_levels(
 def _rank_moves(
     levels: Tensor, cells: CellMap, objective: Objective, level_count: int
 ) -> tuple[Tensor, Tensor, float]:
-    """Estimate, to first order, by how much the best move by one level of each cell lowers the loss.
+    """Estimate, to first order, how much the loss falls if a single cell moves by one level in the better
+    direction.
 
-    Return three items: for each cell, this decrease of the loss and the move (-1 or +1), and the loss of the
-    unchanged layout.
+    Returns:
+        The decrease of the loss for each cell, the move of each cell (-1 or +1), and the loss of the
+        unchanged layout.
     """
     values = levels.float().requires_grad_()
     loss, _ = objective(cells(values)[None, None])
