@@ -1,11 +1,11 @@
 """Check whether the uncertainties of measured scores cover their errors.
 
-    python -m benchmarks.coverage [--seed 50616] [--count 200] [--publish]
+    python -m benchmarks.coverage [--seed 1] [--count 200] [--publish]
 
-Holograms are designed through the Physics model of the zoo. Each is printed by another model of the zoo, with
-another height scale and a rough surface. Then an imperfect camera photographs its image, or an imperfect
-microscope scans the print. The error of a score is its difference from the score of the true print. An
-interrupted run resumes.
+Holograms are designed through the Physics model of the zoo. Each print is a random mixture of the prints of
+two other models of the zoo, with another height scale and a rough surface. Then an imperfect camera
+photographs its image, or an imperfect microscope scans the print. The error of a score is its difference from
+the score of the true print. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from litho_design.judging.score import judge_design
 PAGE = Path(__file__).parents[1] / "docs" / "scores.md"
 RESULT = PAGE.parent / "results" / "coverage" / "coverage.json"
 FIGURE = "si_psnr_db"
-TARGETS = ("ring", "text", "letters")
+TARGETS = ("ring", "text", "letters", "spots", "chart")
 DESIGNED_BY = "zoo:physics"
 PRINTED_BY = ("zoo:pbl", "zoo:random-features", "zoo:blur-table", "zoo:affine-mtf", "zoo:features")
 SETTINGS = {"layout.size_px": 128, "optics.distance_um": 25, "search.iterations": 60, "window.yield_draws": 2}
@@ -92,10 +92,13 @@ class Camera:
 def printed(loaded: LoadedDesign, rng: np.random.Generator, printers: Mapping[str, Any]) -> torch.Tensor:
     """Return the heights (size, size), µm, of a print by another printer than the design expects.
 
-    The power spectrum of its roughness falls with the square of the frequency, as that of the deviation of
-    the measured prints from Physics does.
+    It is a random mixture of the prints of two models. The power spectrum of its roughness falls with the
+    square of the frequency, as that of the deviation of the measured prints from Physics does.
     """
-    height = loaded.printed_um(printers[str(rng.choice(PRINTED_BY))]).double().numpy()
+    one, other = (
+        loaded.printed_um(printers[name]).double().numpy() for name in rng.permutation(PRINTED_BY)[:2]
+    )
+    height = one + rng.uniform() * (other - one)
     size = len(height)
     # The field is a part of a larger one, so its slowest waves are longer than the field.
     frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(2 * size)] * 2))
@@ -193,6 +196,8 @@ def line_of(rows: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
     """Return the table's row about the measurements of one kind."""
     own = [row for row in rows if row["kind"] == kind]
     kept = [row for row in own if "error" in row]
+    if not kept:
+        return kind, f"0 of {len(own)}", *["–"] * 4
     error, sd = (np.array([row[name] for row in kept]) for name in ("error", "sd"))
     within = [f"{100 * np.mean(np.abs(error) <= k * sd):.0f} %" for k in (1, 3)]
     spread = f"{np.sqrt(np.mean(error**2)):.2f} dB"

@@ -4,6 +4,7 @@ scores.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
@@ -14,12 +15,8 @@ from litho_data.foundation.results import Record
 
 T = TypeVar("T")
 
-# Number of variants of a measurement that are drawn at random within its uncertainty. The rms change over
-# this number of variants is known to 25 %.
+# Number of random draws of the noise. The rms change of a score over this number of draws is known to 25 %.
 DRAWS = 8
-# The errors of a print are correlated over long distances. A fit to the print therefore absorbs more of these
-# errors than it would absorb of independent errors, by this factor (found with ``benchmarks.coverage``).
-HIDDEN = 1.5
 # Beyond this frequency (cycles/px) along both axes, neither prints nor images have structure.
 _NOISE_BAND = 0.35
 
@@ -69,18 +66,22 @@ def estimated(
 
     The measurement already contains noise, and each variant in ``noisier`` adds the same amount of noise
     again. The mean change of a score over these variants therefore estimates how much noise changed the
-    score, and is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Each
-    variant in ``elsewhere`` is a measurement that the registration and the levelling cannot distinguish from
-    the best fit. Fits make a print look more like the expected one than it is, so the mean change of these
-    variants is added. Variants come in pairs with opposite signs, so the mean change of a score that is
-    linear in the variation is zero.
+    score, and is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10).
+
+    The variants in ``elsewhere`` are measurements that the registration and the levelling cannot distinguish
+    from the best fit. They come in pairs. In a pair, one independent parameter differs by plus and minus its
+    standard deviation. Fits make a print look more like the expected one than it is, so the mean change of a
+    score is added. Mean and variance are those of a score that is quadratic in each normally distributed
+    parameter (JCGM 100:2008, 5.1.2 with the note on higher orders).
     """
     noise, place = (dict(_changes(score, measured, variants)) for variants in (noisier, elsewhere))
-    figures = {
-        name: getattr(measured, name) - float(noise[name].mean()) + float(place[name].mean())
-        for name in noise
-    }
-    return figures, {name: float(np.hypot(noise[name].std(), HIDDEN * place[name].std())) for name in noise}
+    figures, spread = {}, {}
+    for name, of_noise in noise.items():
+        plus, minus = place[name].reshape(-1, 2).T
+        linear, square = (plus - minus) / 2, (plus + minus) / 2
+        figures[name] = getattr(measured, name) - float(of_noise.mean()) + float(square.sum())
+        spread[name] = math.sqrt(of_noise.var() + np.sum(linear**2 + 2 * square**2))
+    return figures, spread
 
 
 def _changes(

@@ -17,7 +17,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
 from litho_design.images.measurements import PhotoSource
-from litho_design.images.noise import DRAWS, HIDDEN, noise_of_light
+from litho_design.images.noise import DRAWS, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
@@ -37,15 +37,18 @@ _VIGNETTING_SD = 0.1
 _NEEDED = 0.93
 # A fitted tilt counts as real if its chi squared exceeds this limit. Random errors exceed 13.8 with a
 # probability of 0.1 % (two degrees of freedom).
-_TILT_SURE = 13.8 * HIDDEN**2
+_TILT_SURE = 13.8
 # The images of the prints that different models of the same printer predict differ in size by this standard
-# deviation, so the scale of a photograph cannot be determined more accurately from its image.
-_PRINT_SCALE_SD = 0.01
+# deviation (rms over three holograms and five models of ``benchmarks.coverage``), so the scale of a
+# photograph cannot be determined more accurately from its image.
+_PRINT_SCALE_SD = 0.015
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
 _TILT_SD = 0.1
-# Number of tiles along each side of the window.
-_TILES = 6
+# Number of tiles along each side of the window. Residuals are correlated over longer distances than a tile,
+# so the standard deviations that are computed from tiles are multiplied by ``_BEYOND_TILES`` (found with
+# ``benchmarks.coverage``).
+_TILES, _BEYOND_TILES = 6, 1.5
 # Orientations are compared on images with about this side, px; correlations that differ by less than ``_TIE``
 # are a tie.
 _SMALL_PX = 192
@@ -129,8 +132,8 @@ class Photograph:
         finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
         record: source and processing of the photograph.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
-        other_warps: pairs of maps that are as plausible as ``window_to_photo``, given the accuracy with which
-            the photograph determines this map.
+        other_warps: for each independent movement of the camera, the two maps after a movement by plus and
+            minus its standard deviation.
     """
 
     counts: np.ndarray
@@ -152,10 +155,7 @@ class Photograph:
         """Convert the counts in ``image`` to shares of the light that is incident on the element.
         ``power_counts`` is the sum of the counts that all of this light would give.
         """
-        # The counts per camera pixel are multiplied by the number of camera pixels per window pixel, computed
-        # in the middle of the window.
-        warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
-        return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
+        return image * self._camera_pixels(self.window_to_photo) / power_counts
 
     def with_more_noise(self) -> Iterator[np.ndarray]:
         """Yield pairs of images to which random noise as strong as that of the photograph is added. The noise
@@ -170,14 +170,21 @@ class Photograph:
                 yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
     def with_other_cameras(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images that are as plausible as the measured one, with another position, size, dark
-        level and vignetting.
+        """Yield pairs of images in which one property of the camera differs by plus and minus its standard
+        deviation. The properties are its independent movements, its dark level and its vignetting.
         """
-        generator = np.random.default_rng(0)
         for pair in self.other_warps:
-            dark, edge = generator.standard_normal(2) * (self.record.dark_level_sd, self.record.vignetting_sd)
-            for sign, warp in zip((1, -1), pair, strict=True):
-                yield self._warped(self.counts - np.float32(sign * dark), warp, sign * edge)
+            for warp in pair:
+                yield self._warped(self.counts, warp)
+        for dark, edge in ((self.record.dark_level_sd, 0.0), (0.0, self.record.vignetting_sd)):
+            for sign in (1, -1):
+                darker = self.counts - np.float32(sign * dark)
+                yield self._warped(darker, self.window_to_photo, sign * edge)
+
+    def _camera_pixels(self, warp: np.ndarray) -> float:
+        """Return the number of camera pixels per window pixel in the middle of the window."""
+        middle = np.array([self.side_px / 2, self.side_px / 2, 1])
+        return float(abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3))
 
     def _warped(self, counts: np.ndarray, warp: np.ndarray, vignetting: float = 0.0) -> np.ndarray:
         import cv2
@@ -187,6 +194,8 @@ class Photograph:
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
         way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
+        # The light is spread over as many camera pixels as this map assigns to a window pixel.
+        found = found * (self._camera_pixels(warp) / self._camera_pixels(self.window_to_photo))
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
         # Detail finer than the light from the element can form is noise. The remaining detail is corrected
         # for the averaging over a pixel.
@@ -397,8 +406,9 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fitted camera: the map from window pixels to photograph pixels (a matrix of shape (3, 3)), pairs of
-    other maps that are as plausible, and the other parameters of the camera with their standard deviations.
+    """A fitted camera: the map from window pixels to photograph pixels (a matrix of shape (3, 3)), the pairs
+    of maps after each independent movement, and the other parameters of the camera with their standard
+    deviations.
     """
 
     window_to_photo: np.ndarray
@@ -471,14 +481,18 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         pose, _ = solved(free, *images, pose)
     correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
     if further:
-        with_tilt = [*free, 4, 5]
-        tilted, of_tilt = solved(with_tilt, smooth, fixed, pose)
+        fitted = [*free, 4, 5]
+        tilted, of_tilt = solved(fitted, smooth, fixed, pose)
         closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
         spread = _covariance(of_tilt.jac, of_tilt.fun, side)
         tilt = tilted[4:] / unit[4:]
-        surely = tilt @ np.linalg.solve(spread[-2:, -2:], tilt) > _TILT_SURE
+        surely = tilt @ np.linalg.pinv(spread[-2:, -2:], hermitian=True) @ tilt > _TILT_SURE
         if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
             pose, correlation = tilted, closer
+        else:
+            # A tilt that is not fitted absorbs no error of the print.
+            fitted = free
+            spread = _covariance(of_tilt.jac[:, : len(free)], of_tilt.fun, side)
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
@@ -487,12 +501,11 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         spread[3, 3] += (min(pitch_sd, _PRINT_SCALE_SD) / unit[3]) ** 2
         scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
     light = _light(seen(photo, pose), wanted, alike)
-    size, ways = np.linalg.eigh(spread)
-    generator, others = np.random.default_rng(0), []
-    for _ in range(DRAWS):
-        step = ways @ (np.sqrt(size.clip(0)) * generator.standard_normal(len(size)))
+    variance, ways = np.linalg.eigh(spread)
+    others = []
+    for step in (ways * np.sqrt(variance.clip(0))).T:
         change = np.zeros_like(pose)
-        change[with_tilt] = step * unit[with_tilt]
+        change[fitted] = step * unit[fitted]
         others.append([_camera(at, photo.shape, side, scale) for at in (pose + change, pose - change)])
     return _Fit(
         warp,
@@ -516,7 +529,7 @@ def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarr
     pull = np.zeros((_TILES**2 + 1, slopes.shape[1]))
     np.add.at(pull, number, slopes * residual[:, None])
     inverse = np.linalg.pinv(slopes.T @ slopes)
-    found: np.ndarray = inverse @ (pull.T @ pull) @ inverse
+    found: np.ndarray = _BEYOND_TILES**2 * inverse @ (pull.T @ pull) @ inverse
     return found
 
 

@@ -31,11 +31,19 @@ _SMALLEST_FOR_TIP = 64
 # Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
 # step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
+# Largest share of the places of one expected height that dust may cover.
+_LARGEST_DUSTY_SHARE = 0.3
 # Standard deviation of the change of the heights that the AFM tip causes, as a share of this change.
 _TIP_SD = 0.3
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
+# The deviations of a print from the expected print are larger in tilt and bow than in these orders, by this
+# factor. Tilt and bow of the expected print also have a common relative error with this standard deviation.
+# Both numbers were found with ``benchmarks.coverage``.
+_LARGER, _COMMON_SD = 2.0, 0.1
+# Number of groups of pixels with nearly the same expected height.
+_HEIGHTS = 32
 
 
 class MeasuredRecord(Record):
@@ -134,7 +142,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         )
     expected = loaded.expected_um.cpu().numpy()
     background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
-    defects = _defects(np.where(valid, height - background.map_um - expected, 0.0)) & valid
+    defects = _defects(np.where(valid, height - background.map_um - expected, 0.0), expected) & valid
     valid = valid & ~defects
     background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     levelled = height - background.map_um
@@ -160,7 +168,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         levelling=source.levelling,
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
-        removed_sd_um=_removed_sd_um(complete - expected),
+        removed_sd_um=_removed_sd_um(complete - expected, expected),
         noise_um=white_noise(complete - expected),
         position_sd_um=placed.position_sd_um,
         scale_sd=source.scale_sd,
@@ -190,11 +198,13 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
     return replace(scan, height_um=surface), radius_um, change_um
 
 
-def _defects(off_um: np.ndarray) -> np.ndarray:
+def _defects(off_um: np.ndarray, expected_um: np.ndarray) -> np.ndarray:
     """Return a mask of dust and scars. ``off_um`` is the deviation of a print from the expected print after
-    tilt and bow are removed, shape (ny, nx).
+    tilt and bow are removed; both maps have shape (ny, nx).
+
+    Dust falls anywhere. If most places of the same expected height deviate, the printer is the cause.
     """
-    from scipy.ndimage import binary_dilation, gaussian_filter
+    from scipy.ndimage import binary_dilation, gaussian_filter, label
 
     from litho_data.level.scars import mark_scars
 
@@ -203,10 +213,20 @@ def _defects(off_um: np.ndarray) -> np.ndarray:
     smooth = gaussian_filter(off_um, _DUST_BLUR_PX)
     middle = np.median(smooth)
     spread = 1.4826 * float(np.median(np.abs(smooth - middle)))
-    dust = np.abs(smooth - middle) > max(_DUST_SIGMAS * spread, _LOWEST_DUST_UM)
+    size_um = np.abs(smooth - middle)
+    dust = size_um > max(_DUST_SIGMAS * spread, _LOWEST_DUST_UM)
+    spots, count = label(dust)
+    foreign = np.zeros_like(dust)
+    for spot in range(1, count + 1):
+        inside = spots == spot
+        core = inside & (size_um >= np.median(size_um[inside]))
+        low, high = np.percentile(expected_um[core], (25, 75))
+        alike = (expected_um >= low) & (expected_um <= high)
+        if dust[alike].mean() < _LARGEST_DUSTY_SHARE:
+            foreign |= inside
     strict: Any = {"high": 4.0, "low": 2.5, "max_width_px": 2}
     scars = mark_scars(off_um, **strict) | mark_scars(off_um.T, **strict).T
-    return binary_dilation(dust | scars, iterations=2)
+    return binary_dilation(foreign | scars, iterations=2)
 
 
 class _Placed(NamedTuple):
@@ -298,30 +318,45 @@ def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tenso
 
 
 def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one. They have
-    another position, height scale and tip, and they have a tilt and a bow that the levelling would have
-    removed.
+    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one. In a pair,
+    one quantity differs by plus and minus its standard deviation: the height scale, the effect of the tip, a
+    term of the tilt and bow that the levelling would have removed, or a parameter of the affine registration.
     """
-    from scipy.ndimage import shift
-
     from litho_data.tip import paraboloid_erosion
 
-    generator = np.random.default_rng(0)
     measured = height_um.double().cpu().numpy()
-    position_px = record.position_sd_um / pitch_um
-    under_tip = np.zeros_like(measured)
+    changes_um = [record.scale_sd * measured]
     if record.tip_um:
-        pitches = (pitch_um, pitch_um)
-        under_tip = paraboloid_erosion(measured, pitches, record.tip_um).surface - measured
+        narrower = paraboloid_erosion(measured, (pitch_um, pitch_um), record.tip_um).surface
+        changes_um.append(_TIP_SD * (narrower - measured))
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
-    for _ in range(DRAWS):
-        moved, (scale, tip) = generator.standard_normal((2, 2))
-        own_um = removed @ (record.removed_sd_um * generator.standard_normal(removed.shape[-1]))
+    changes_um.append(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed))
+    changes_um += list(record.removed_sd_um * np.moveaxis(removed, -1, 0))
+    for change_um in changes_um:
         for sign in (1, -1):
-            print_um = shift(measured, sign * position_px * moved, order=3, mode="nearest")
-            print_um *= 1 + sign * record.scale_sd * scale
-            print_um += sign * (_TIP_SD * tip * under_tip + own_um)
-            yield torch.from_numpy(print_um).to(height_um)
+            yield torch.from_numpy(measured + sign * change_um).to(height_um)
+    # The uncertainty of a corner is that of both axes together.
+    corner_px = record.position_sd_um / math.sqrt(2) / pitch_um
+    for step in np.eye(6).reshape(6, 2, 3):
+        for sign in (1, -1):
+            yield torch.from_numpy(_displaced(measured, sign * corner_px * step)).to(height_um)
+
+
+def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:
+    """Displace a print of shape (ny, nx) by an affine map. If the numbers in ``corner_px``, shape (2, 3), are
+    random with the standard deviation s, the corners move by s px (rms) along each axis.
+
+    An affine map that is fitted to points spread evenly over a square has this uncertainty: the variances of
+    its shift and of the displacements of an edge by its two linear terms are in the ratio 1 : 3 : 3.
+    """
+    from scipy.ndimage import affine_transform
+
+    middle = (np.array(height_um.shape) - 1) / 2
+    part = corner_px * np.sqrt([1 / 7, 3 / 7, 3 / 7])
+    matrix = np.eye(2) + part[:, 1:] / middle
+    offset = part[:, 0] + middle - matrix @ middle
+    found: np.ndarray = affine_transform(height_um, matrix, offset, order=3, mode="nearest")
+    return found
 
 
 def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
@@ -335,16 +370,21 @@ def _shapes(shape: tuple[int, ...], orders: Iterable[int]) -> np.ndarray:
     return np.stack(products, axis=-1) if products else np.zeros((*shape, 0))
 
 
-def _removed_sd_um(off_um: np.ndarray) -> float:
+def _removed_sd_um(off_um: np.ndarray, expected_um: np.ndarray) -> float:
     """Return the standard deviation, in µm, of the tilt and bow that the print itself may have, for each
     polynomial term of order 1 or 2.
 
-    The value is extrapolated from the higher orders (3 to 6) of ``off_um``, the deviation from the expected
-    print, shape (ny, nx). The power of an order is assumed to fall with the square of the order.
+    The value is ``_LARGER`` times the rms of the terms of orders 3 to 6 in ``off_um``, the deviation from the
+    expected print, after its mean at every expected height is subtracted. Both maps have shape (ny, nx).
     """
-    power = []
-    for order in _ORDERS:
-        shapes = _shapes(off_um.shape, [order])
-        amounts = np.tensordot(shapes, off_um, ((0, 1), (0, 1))) / off_um.size
-        power.append(float(np.mean(amounts**2)) * (order / 2) ** 2)
-    return math.sqrt(np.mean(power))
+    foreign = off_um.ravel().copy()
+    for places in np.array_split(np.argsort(expected_um, axis=None), _HEIGHTS):
+        foreign[places] -= foreign[places].mean()
+    finer = _amounts(foreign.reshape(off_um.shape), _shapes(off_um.shape, _ORDERS))
+    return _LARGER * float(np.sqrt(np.mean(finer**2)))
+
+
+def _amounts(height_um: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Return how much of each of the orthogonal ``shapes``, shape (ny, nx, n), a map contains."""
+    found: np.ndarray = np.tensordot(height_um, shapes, 2) / height_um.size
+    return found

@@ -14,12 +14,20 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.measurements import MeasuredSource, PhotoSource
-from litho_design.images.noise import HIDDEN, estimated
-from litho_design.images.photograph import _saturated
+from litho_design.images.noise import estimated
+from litho_design.images.photograph import CameraRecord, Photograph, _saturated
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import _without_tip, fitted_background
+from litho_design.judging.measured import (
+    _LARGER,
+    _defects,
+    _displaced,
+    _removed_sd_um,
+    _shapes,
+    _without_tip,
+    fitted_background,
+)
 from litho_design.judging.photographs import score_hologram_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
@@ -262,7 +270,7 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
         pairs = [seen + sign * one for one in noise for sign in (1, -1)]
         measured = Power(mean=seen.mean(), power=np.square(seen).mean())
         figures, spread = estimated(
-            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs, [seen]
+            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs, [seen, seen]
         )
         assert figures["mean"] == pytest.approx(measured.mean, abs=1e-12)
         drawn.append(measured.power)
@@ -275,20 +283,77 @@ def test_the_mean_contribution_of_noise_is_subtracted_from_figures():
 
 
 def test_what_a_fit_hides_is_added_to_figures():
-    """Check that the mean effect of what a fit cannot see is added. A shift of standard deviation s that is
-    fitted away hides a mean square of s^2.
+    """Check that the mean effect of what a fit cannot see is added. Two independent shifts with standard
+    deviations s and t that are fitted away hide a mean square of s^2 + t^2.
     """
-    shifts = 0.3 * np.random.default_rng(0).standard_normal(2000)
-    pairs = [sign * np.full(10, shift) for shift in shifts for sign in (1, -1)]
+    pairs = [sign * shift * np.eye(2)[axis] for axis, shift in enumerate((0.3, 0.4)) for sign in (1, -1)]
 
     def score(one: np.ndarray) -> Power:
-        return Power(mean=one.mean(), power=np.square(one).mean())
+        return Power(mean=one.mean(), power=np.square(one).sum())
 
-    figures, spread = estimated(score, score(np.zeros(10)), [np.zeros(10)], pairs)
-    # The mean of 2000 squares is known to sqrt(2 / 2000) = 3 %.
-    assert figures["power"] == pytest.approx(0.3**2, rel=0.1)
+    figures, spread = estimated(score, score(np.zeros(2)), [np.zeros(2)], pairs)
+    assert figures["power"] == pytest.approx(0.3**2 + 0.4**2)
     assert figures["mean"] == pytest.approx(0, abs=1e-12)
-    assert spread["mean"] == pytest.approx(0.3 * HIDDEN, rel=0.1)
+    assert spread["mean"] == pytest.approx(np.hypot(0.3, 0.4) / 2)
+    # The variance of the square of a normally distributed number is twice the square of its variance.
+    assert spread["power"] == pytest.approx(np.sqrt(2 * (0.3**4 + 0.4**4)))
+
+
+def test_dust_is_masked_and_what_the_printer_does_to_all_tall_places_is_not():
+    generator = np.random.default_rng(0)
+    expected_um = cv2.resize(generator.uniform(0, 0.8, (32, 32)), (128, 128), interpolation=cv2.INTER_AREA)
+    noise_um = 0.002 * generator.standard_normal(expected_um.shape)
+    y, x = np.mgrid[:128, :128]
+    dust_um = 0.4 * np.exp(-((x - 40) ** 2 + (y - 70) ** 2) / 2 / 4**2)
+    dusty = _defects(noise_um + dust_um, expected_um)
+    assert dusty[dust_um > 0.15].all()
+    # The mask ends at a deviation of 0.1 µm, which the blur and the widening move by at most 3 px.
+    assert not dusty[np.hypot(x - 40, y - 70) > 11].any()
+    tall_um = np.where(expected_um > 0.7, 0.4, 0.0)
+    assert not _defects(noise_um + tall_um, expected_um).any()
+
+
+def test_displacements_have_the_stated_standard_deviation_at_the_corners():
+    generator = np.random.default_rng(0)
+    y, x = np.mgrid[:65, :65].astype(float)
+    moved = [
+        [_displaced(one, 0.5 * generator.standard_normal((2, 3)))[16, 48] - one[16, 48] for one in (y, x)]
+        for _ in range(800)
+    ]
+    # Halfway to a corner, the two linear terms have half their amount. The rms of 1600 values is known to
+    # 2 %.
+    assert np.sqrt(np.mean(np.square(moved))) == pytest.approx(0.5 * np.sqrt((1 + 3 / 2) / 7), rel=0.07)
+
+
+def test_hidden_tilt_and_bow_are_extrapolated_from_higher_orders():
+    generator = np.random.default_rng(0)
+    expected_um = generator.uniform(0, 0.8, (96, 128))
+    shapes = _shapes(expected_um.shape, range(1, 7))
+    off_um = shapes @ generator.normal(0, 0.02, shapes.shape[-1])
+    # The 22 terms of orders 3 to 6 give a standard deviation to 1 / sqrt(2 x 22) = 15 %; 3 sigma.
+    assert _removed_sd_um(off_um, expected_um) == pytest.approx(_LARGER * 0.02, rel=0.45)
+    # Levelling does not hide what depends on the expected height alone. A group of heights is 0.025 µm wide.
+    assert _removed_sd_um(0.2 * expected_um**2, expected_um) < 1e-3
+
+
+def test_another_scale_of_the_camera_does_not_change_the_light():
+    y, x = np.mgrid[:200, :200] - 99.5
+    counts = np.exp(-(x**2 + y**2) / 2 / 12**2).astype(np.float32)
+    where = np.array([[1.5, 0, 4], [0, 1.5, 4], [0, 0, 1]])
+    larger = np.array([[1.6, 0, -2.5], [0, 1.6, -2.5], [0, 0, 1]])
+    facts = {"pitch_um": 0.1, "dark_level_sd": 0.0, "vignetting_sd": 0.0, "noise_counts": 0.0}
+    photo = Photograph(
+        counts,
+        where,
+        128,
+        0.15,
+        1.0,
+        CameraRecord.model_construct(**facts),
+        np.zeros((128, 128)),
+        [[larger] * 2],
+    )
+    light = [photo.power_share(image, 1.0).sum() for image in (photo.image(), *photo.with_other_cameras())]
+    assert light == pytest.approx([counts.sum()] * len(light), rel=1e-3)
 
 
 def test_baselines_stand_beside_every_score(printed_design, tmp_path):
