@@ -16,19 +16,6 @@ from benchmarks.record import published
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def photographs(record: dict[str, Any]) -> list[str]:
-    refused = [row for row in record["rows"] if "error_db" not in row]
-    faulty = [row for row in record["rows"] if row["fault"]]
-    unsaid = [row["silent"] for row in record["rows"] if "silent" in row]
-    assert all("refused" in row for row in faulty)
-    assert not any(unsaid)
-    return [
-        f"Of {len(record['rows'])} photographs of simulated prints, {len(refused)} were refused, including "
-        f"all {len(faulty)} with",
-        f"None of {len(unsaid)} mirrored or rotated photographs",
-    ]
-
-
 def mixed_up(record: dict[str, Any]) -> list[str]:
     cases = record["cases"]
     named = sum(set(case["touched"]) <= set(case["named"]) for case in cases)
@@ -165,7 +152,6 @@ def papers_pbl(record: dict[str, Any]) -> list[str]:
 
 
 QUOTED: dict[str, tuple[str, Callable[[dict[str, Any]], list[str]]]] = {
-    "photographs/photographs.json": ("scores.md", photographs),
     "mixed-up/mixed_up.json": ("own_data.md", mixed_up),
     "drift-alarm/drift_alarm.json": ("checking.md", alarms),
     "registration/registration.json": ("registration.md", warps),

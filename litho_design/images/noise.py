@@ -5,7 +5,7 @@ scores.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import TypeVar
 
 import numpy as np
@@ -58,38 +58,49 @@ def _window_and_band(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def estimated(
-    score: Callable[[T], Record], measured: Record, noisier: Iterable[T], elsewhere: Iterable[T]
+    score: Callable[[T], Record],
+    measured: Record,
+    noisier: Iterable[T],
+    left: Iterable[T],
+    hidden: Iterable[T],
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Correct the scores of a measurement for noise, and for the errors of the print that the registration
-    and the levelling have absorbed. Return two dicts, keyed by the name of the score: the corrected scores,
-    and their standard deviations.
+    """Correct the scores of a measurement for its errors. Return two dicts, keyed by the name of the score:
+    the corrected scores, and their standard deviations.
 
-    The measurement already contains noise, and each variant in ``noisier`` adds the same amount of noise
-    again. The mean change of a score over these variants therefore estimates how much noise changed the
-    score, and is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10).
+    Errors that are left in a measurement change a score on average. More of the same error changes it by as
+    much again, so this mean change is subtracted (bias correction by bootstrap, Efron and Tibshirani 1993,
+    chapter 10). A fit hides errors: it makes a print look more like the expected one than it is. The mean
+    change that undoing the fit causes is therefore added.
 
-    The variants in ``elsewhere`` are measurements that the registration and the levelling cannot distinguish
-    from the best fit. They come in pairs. In a pair, one independent parameter differs by plus and minus its
-    standard deviation. Fits make a print look more like the expected one than it is, so the mean change of a
-    score is added. Mean and variance are those of a score that is quadratic in each normally distributed
-    parameter (JCGM 100:2008, 5.1.2 with the note on higher orders).
+    Variants come in pairs, with an error and the same error of opposite sign. In ``left`` and ``hidden``,
+    each pair changes one independent parameter by its standard deviation. Mean and variance are then those of
+    a score that is a sum of quadratic functions of normally distributed parameters (JCGM 100:2008, 5.1.2).
+
+    Args:
+        score: function that scores a variant.
+        measured: scores of the measurement.
+        noisier: pairs of variants with random noise added, of the strength of that in the measurement.
+        left: pairs of variants for errors that are left in the measurement.
+        hidden: pairs of variants that a fit cannot distinguish from the measurement.
     """
-    noise, place = (dict(_changes(score, measured, variants)) for variants in (noisier, elsewhere))
+    noise, rest, fitted = (_changes(score, measured, variants) for variants in (noisier, left, hidden))
     figures, spread = {}, {}
-    for name, of_noise in noise.items():
-        plus, minus = place[name].reshape(-1, 2).T
-        linear, square = (plus - minus) / 2, (plus + minus) / 2
-        figures[name] = getattr(measured, name) - float(of_noise.mean()) + float(square.sum())
-        spread[name] = math.sqrt(of_noise.var() + np.sum(linear**2 + 2 * square**2))
+    for name in noise:
+        (even_left, odd_left), (even, odd) = _parts(rest[name]), _parts(fitted[name])
+        figures[name] = getattr(measured, name) - float(noise[name].mean() + even_left.sum() - even.sum())
+        squares = np.concatenate([odd_left, odd]) ** 2 + 2 * np.concatenate([even_left, even]) ** 2
+        spread[name] = math.sqrt(noise[name].var() + squares.sum())
     return figures, spread
 
 
-def _changes(
-    score: Callable[[T], Record], measured: Record, variants: Iterable[T]
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name of every score in ``measured``, and the changes of this score over the variants of the
-    measurement.
-    """
+def _changes(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, np.ndarray]:
+    """Return the changes of every score in ``measured`` over the variants, keyed by the name of the score."""
     scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
-    for name, value in measured.model_dump(exclude_none=True).items():
-        yield name, np.array([one[name] for one in scores]) - value
+    values = measured.model_dump(exclude_none=True)
+    return {name: np.array([one[name] - value for one in scores]) for name, value in values.items()}
+
+
+def _parts(changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split the changes over pairs of variants into their even and their odd parts."""
+    plus, minus = changes.reshape(-1, 2).T
+    return (plus + minus) / 2, (plus - minus) / 2

@@ -39,8 +39,8 @@ _NEEDED = 0.93
 # probability of 0.1 % (two degrees of freedom).
 _TILT_SURE = 13.8
 # The images of the prints that different models of the same printer predict differ in size by this standard
-# deviation (rms over three holograms and five models of ``benchmarks.coverage``), so the scale of a
-# photograph cannot be determined more accurately from its image.
+# deviation (rms over three holograms and five models), so the scale of a photograph cannot be determined more
+# accurately from its image.
 _PRINT_SCALE_SD = 0.015
 # Standard deviation of the tilts that a camera may plausibly have. A tilt is the relative change of scale
 # over half the window.
@@ -62,6 +62,8 @@ class CameraRecord(Record):
     ``orientation`` is the operation that brings the photograph into the orientation of the image;
     ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the standard deviation of
     the noise in the dark, and ``noise_share`` is that of the additional noise, relative to the light.
+    ``position_sd_um`` is the standard deviation of the fitted position along one axis, and ``scale_sd`` is
+    that of the fitted scale, relative to it.
     ``vignetting_sd`` is the standard deviation of the possible loss of light in the camera's corners.
     ``blur_um`` is the standard deviation (radius) of the fitted blur that is added to the expected image. The
     counts are proportional to a power of the light, and ``gamma`` is the fitted exponent.
@@ -169,17 +171,21 @@ class Photograph:
             for sign in (1, -1):
                 yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
-    def with_other_cameras(self) -> Iterator[np.ndarray]:
-        """Yield pairs of images in which one property of the camera differs by plus and minus its standard
-        deviation. The properties are its independent movements, its dark level and its vignetting.
+    def with_other_vignetting(self) -> Iterator[np.ndarray]:
+        """Yield a pair of images with more and less vignetting, by its standard deviation."""
+        for sign in (1, -1) if self.record.vignetting_sd else ():
+            yield self._warped(self.counts, self.window_to_photo, sign * self.record.vignetting_sd)
+
+    def with_other_fits(self) -> Iterator[np.ndarray]:
+        """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
+        standard deviation. The properties are its independent movements and its dark level.
         """
         for pair in self.other_warps:
             for warp in pair:
                 yield self._warped(self.counts, warp)
-        for dark, edge in ((self.record.dark_level_sd, 0.0), (0.0, self.record.vignetting_sd)):
-            for sign in (1, -1):
-                darker = self.counts - np.float32(sign * dark)
-                yield self._warped(darker, self.window_to_photo, sign * edge)
+        for sign in (1, -1) if self.record.dark_level_sd else ():
+            darker = self.counts - np.float32(sign * self.record.dark_level_sd)
+            yield self._warped(darker, self.window_to_photo)
 
     def _camera_pixels(self, warp: np.ndarray) -> float:
         """Return the number of camera pixels per window pixel in the middle of the window."""
@@ -478,21 +484,17 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         images = smooth, fixed
         if more:
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
-        pose, _ = solved(free, *images, pose)
+        pose, found = solved(free, *images, pose)
     correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
     if further:
-        fitted = [*free, 4, 5]
-        tilted, of_tilt = solved(fitted, smooth, fixed, pose)
+        tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
         closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
-        spread = _covariance(of_tilt.jac, of_tilt.fun, side)
-        tilt = tilted[4:] / unit[4:]
-        surely = tilt @ np.linalg.pinv(spread[-2:, -2:], hermitian=True) @ tilt > _TILT_SURE
+        tilt, spread = tilted[4:] / unit[4:], _covariance(of_tilt.jac, of_tilt.fun, side)
+        surely = tilt @ np.linalg.solve(spread[-2:, -2:], tilt) > _TILT_SURE
         if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
-            pose, correlation = tilted, closer
+            pose, correlation, free = tilted, closer, [*free, 4, 5]
         else:
-            # A tilt that is not fitted absorbs no error of the print.
-            fitted = free
-            spread = _covariance(of_tilt.jac[:, : len(free)], of_tilt.fun, side)
+            spread = _covariance(found.jac, found.fun, side)
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
@@ -505,7 +507,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     others = []
     for step in (ways * np.sqrt(variance.clip(0))).T:
         change = np.zeros_like(pose)
-        change[fitted] = step * unit[fitted]
+        change[free] = step * unit[free]
         others.append([_camera(at, photo.shape, side, scale) for at in (pose + change, pose - change)])
     return _Fit(
         warp,

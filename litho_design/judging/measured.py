@@ -31,16 +31,17 @@ _SMALLEST_FOR_TIP = 64
 # Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
 # step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# Largest share of the places of one expected height that dust may cover.
-_LARGEST_DUSTY_SHARE = 0.3
+# Dust may cover this share of the places whose expected height is that of the dusty place within this
+# difference.
+_LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
 # Standard deviation of the change of the heights that the AFM tip causes, as a share of this change.
 _TIP_SD = 0.3
 # Total orders of the Legendre polynomials from which the possible tilt and bow of the print itself are
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
 # The deviations of a print from the expected print are larger in tilt and bow than in these orders, by this
-# factor. Tilt and bow of the expected print also have a common relative error with this standard deviation.
-# Both numbers were found with ``benchmarks.coverage``.
+# factor. All tilt and bow of a print may also be wrong by the same factor, with this standard deviation. Both
+# numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
 # Number of groups of pixels with nearly the same expected height.
 _HEIGHTS = 32
@@ -52,7 +53,10 @@ class MeasuredRecord(Record):
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
     ``tilt_um_per_um`` (x, y) is the tilt that was removed, and ``bow_um`` is the range, over the element, of
     the bow that was removed. ``noise_um`` is the residual at spatial frequencies at which prints have no
-    structure. ``defect_share`` is the share of the element that shows dust or scars instead of the print.
+    structure. ``removed_sd_um`` is the standard deviation of a term of the tilt and bow of the print itself,
+    which were removed, too. ``position_sd_um`` is that of a corner along one axis, and ``scale_sd`` is the
+    relative one of the heights. ``defect_share`` is the share of the element that shows dust or scars instead
+    of the print.
     """
 
     name: str
@@ -142,7 +146,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         )
     expected = loaded.expected_um.cpu().numpy()
     background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
-    defects = _defects(np.where(valid, height - background.map_um - expected, 0.0), expected) & valid
+    defects = _defects(np.where(valid, height - background.map_um - expected, 0.0), expected, valid)
     valid = valid & ~defects
     background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     levelled = height - background.map_um
@@ -198,11 +202,17 @@ def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
     return replace(scan, height_um=surface), radius_um, change_um
 
 
-def _defects(off_um: np.ndarray, expected_um: np.ndarray) -> np.ndarray:
-    """Return a mask of dust and scars. ``off_um`` is the deviation of a print from the expected print after
-    tilt and bow are removed; both maps have shape (ny, nx).
+def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return a mask of dust and scars.
 
-    Dust falls anywhere. If most places of the same expected height deviate, the printer is the cause.
+    Dust lies in few places. Where many other places of the same expected height deviate, too, the printer is
+    the cause. A deviation at a height that occurs nowhere else counts as dust.
+
+    Args:
+        off_um: deviation of a print from the expected print after tilt and bow are removed, shape (ny, nx).
+            It is zero where nothing was measured.
+        expected_um: height of the expected print, shape (ny, nx).
+        valid: mask of the measured pixels, shape (ny, nx).
     """
     from scipy.ndimage import binary_dilation, gaussian_filter, label
 
@@ -214,24 +224,26 @@ def _defects(off_um: np.ndarray, expected_um: np.ndarray) -> np.ndarray:
     middle = np.median(smooth)
     spread = 1.4826 * float(np.median(np.abs(smooth - middle)))
     size_um = np.abs(smooth - middle)
-    dust = size_um > max(_DUST_SIGMAS * spread, _LOWEST_DUST_UM)
+    dust = (size_um > max(_DUST_SIGMAS * spread, _LOWEST_DUST_UM)) & valid
     spots, count = label(dust)
     foreign = np.zeros_like(dust)
     for spot in range(1, count + 1):
         inside = spots == spot
         core = inside & (size_um >= np.median(size_um[inside]))
         low, high = np.percentile(expected_um[core], (25, 75))
-        alike = (expected_um >= low) & (expected_um <= high)
-        if dust[alike].mean() < _LARGEST_DUSTY_SHARE:
+        near_um = _LIKE_HEIGHT_UM
+        elsewhere = (expected_um >= low - near_um) & (expected_um <= high + near_um) & valid & ~inside
+        if not elsewhere.any() or dust[elsewhere].mean() < _LARGEST_DUSTY_SHARE:
             foreign |= inside
     strict: Any = {"high": 4.0, "low": 2.5, "max_width_px": 2}
     scars = mark_scars(off_um, **strict) | mark_scars(off_um.T, **strict).T
-    return binary_dilation(foreign | scars, iterations=2)
+    return binary_dilation(foreign | scars, iterations=2) & valid
 
 
 class _Placed(NamedTuple):
     """A scan resampled on the pixels of the layout. It contains the heights and the mask of measured pixels,
-    both of shape (ny, nx), the orientation, a warning, and the uncertainty of the position.
+    both of shape (ny, nx), the orientation, a warning, and the standard deviation of a corner's position
+    along one axis.
     """
 
     height_um: np.ndarray
@@ -268,7 +280,9 @@ def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
     height, valid = resample_to_layout(
         scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um
     )
-    return _Placed(height, valid, quality.dihedral, quality.warning, quality.corner_sd_nm / 1000)
+    # The uncertainty of a corner is that along both axes together.
+    position_sd_um = quality.corner_sd_nm / 1000 / math.sqrt(2)
+    return _Placed(height, valid, quality.dihedral, quality.warning, position_sd_um)
 
 
 @dataclass(frozen=True)
@@ -317,29 +331,39 @@ def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tenso
             yield height_um + torch.from_numpy(sign * noise_um).to(height_um)
 
 
-def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Yield pairs of prints of shape (ny, nx), in µm, that are as plausible as the measured one. In a pair,
-    one quantity differs by plus and minus its standard deviation: the height scale, the effect of the tip, a
-    term of the tilt and bow that the levelling would have removed, or a parameter of the affine registration.
+def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, in which the height scale or the effect of the tip
+    differs by plus and minus its standard deviation.
     """
     from litho_data.tip import paraboloid_erosion
 
     measured = height_um.double().cpu().numpy()
-    changes_um = [record.scale_sd * measured]
+    yield from _pairs(record.scale_sd * measured, height_um)
     if record.tip_um:
         narrower = paraboloid_erosion(measured, (pitch_um, pitch_um), record.tip_um).surface
-        changes_um.append(_TIP_SD * (narrower - measured))
+        yield from _pairs(_TIP_SD * (narrower - measured), height_um)
+
+
+def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
+    """Yield pairs of prints of shape (ny, nx), in µm, that registration and levelling cannot distinguish from
+    the measured one. In a pair, one quantity differs by plus and minus its standard deviation: a term of the
+    print's own tilt and bow, all these terms by the same factor, or a parameter of the affine registration.
+    """
+    measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
-    changes_um.append(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed))
-    changes_um += list(record.removed_sd_um * np.moveaxis(removed, -1, 0))
-    for change_um in changes_um:
+    for shape in np.moveaxis(removed, -1, 0):
+        yield from _pairs(record.removed_sd_um * shape, height_um)
+    if removed.size:
+        yield from _pairs(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed), height_um)
+    for step in np.eye(6).reshape(6, 2, 3) if record.position_sd_um else ():
         for sign in (1, -1):
-            yield torch.from_numpy(measured + sign * change_um).to(height_um)
-    # The uncertainty of a corner is that of both axes together.
-    corner_px = record.position_sd_um / math.sqrt(2) / pitch_um
-    for step in np.eye(6).reshape(6, 2, 3):
-        for sign in (1, -1):
-            yield torch.from_numpy(_displaced(measured, sign * corner_px * step)).to(height_um)
+            corner_px = sign * record.position_sd_um / pitch_um * step
+            yield torch.from_numpy(_displaced(measured, corner_px)).to(height_um)
+
+
+def _pairs(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
+    for sign in (1, -1):
+        yield height_um + torch.from_numpy(sign * change_um).to(height_um)
 
 
 def _displaced(height_um: np.ndarray, corner_px: np.ndarray) -> np.ndarray:

@@ -105,9 +105,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    freed, uncertainty = estimated(
-        figures, figures(image), photo.with_more_noise(), photo.with_other_cameras()
-    )
+    variants = photo.with_more_noise(), photo.with_other_vignetting(), photo.with_other_fits()
+    freed, uncertainty = estimated(figures, figures(image), *variants)
     # If the photograph is blurrier than the expected image, the camera or the print may be the cause. Part of
     # the effect of this blur on the score therefore remains uncertain.
     sharp, soft = (
@@ -119,7 +118,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
-            got=f"an uncertainty of {uncertainty['si_psnr_db']:.2f} dB in SI-PSNR from noise and dark level",
+            got=f"an uncertainty of {uncertainty['si_psnr_db']:.2f} dB in SI-PSNR",
             wanted=f"at most {_LARGEST_SD_DB} dB",
             hint="use a longer exposure or the mean of several exposures, and give --camera-dark-level",
         )
@@ -193,9 +192,8 @@ def score_lens_photo(
     pictures = {f"object {object_name(which)}": wanted}
     for name, estimate in estimates(image).items():
         pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
-    freed, uncertainty = estimated(
-        figures, figures(image), photo.with_more_noise(), photo.with_other_cameras()
-    )
+    variants = photo.with_more_noise(), photo.with_other_vignetting(), photo.with_other_fits()
+    freed, uncertainty = estimated(figures, figures(image), *variants)
     return PhotoVerdict(
         LensPhotoScore(**freed),
         uncertainty,

@@ -21,7 +21,13 @@ from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import estimated
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredRecord, measured_print, with_more_noise, with_other_fits
+from litho_design.judging.measured import (
+    MeasuredRecord,
+    measured_print,
+    with_more_noise,
+    with_other_fits,
+    with_other_scale,
+)
 from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
@@ -179,8 +185,9 @@ def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, he
     figures = scored.model_dump()
     measured = isinstance(judge, MeasuredRecord)
     if isinstance(judge, MeasuredRecord):
-        others = with_other_fits(height, judge, loaded.record.layout.pitch_um)
-        figures, spread = estimated(loaded.score, scored, with_more_noise(height, judge), others)
+        pitch_um = loaded.record.layout.pitch_um
+        left, hidden = with_other_scale(height, judge, pitch_um), with_other_fits(height, judge, pitch_um)
+        figures, spread = estimated(loaded.score, scored, with_more_noise(height, judge), left, hidden)
     off = (height - loaded.expected_um).double()
     in_rings = loaded.record.in_rings
     area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)
