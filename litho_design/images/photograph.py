@@ -48,7 +48,7 @@ _TILT_SD = 0.1
 # Number of tiles along each side of the window. Residuals are correlated over longer distances than a tile,
 # so the standard deviations that are computed from tiles are multiplied by ``_BEYOND_TILES`` (found with
 # ``benchmarks.coverage``).
-_TILES, _BEYOND_TILES = 6, 1.5
+_TILES, _BEYOND_TILES = 6, 1.4
 # Orientations are compared on images with about this side, px; correlations that differ by less than ``_TIE``
 # are a tie.
 _SMALL_PX = 192
@@ -134,8 +134,10 @@ class Photograph:
         finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
         record: source and processing of the photograph.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
-        other_warps: for each independent movement of the camera, the two maps after a movement by plus and
-            minus its standard deviation.
+        other_warps: for each independent fitted movement of the camera, the two maps after a movement by plus
+            and minus its standard deviation.
+        other_tilts: if no tilt was fitted, the same for two independent tilts with half their variance.
+            Camera and print are equally likely causes of such a tilt.
     """
 
     counts: np.ndarray
@@ -146,6 +148,7 @@ class Photograph:
     record: CameraRecord
     expected: np.ndarray
     other_warps: list[list[np.ndarray]]
+    other_tilts: list[list[np.ndarray]]
 
     def image(self) -> np.ndarray:
         """Return the photograph resampled on the pixels of the window, shape (m, m), in counts per camera
@@ -171,18 +174,21 @@ class Photograph:
             for sign in (1, -1):
                 yield self._warped((self.counts + sign * noise).astype(np.float32), self.window_to_photo)
 
-    def with_other_vignetting(self) -> Iterator[np.ndarray]:
-        """Yield a pair of images with more and less vignetting, by its standard deviation."""
+    def with_other_faults(self) -> Iterator[np.ndarray]:
+        """Yield pairs of images in which one fault of the camera differs by plus and minus its standard
+        deviation. The faults are vignetting and half of the doubtful tilt.
+        """
+        yield from (self._warped(self.counts, warp) for pair in self.other_tilts for warp in pair)
         for sign in (1, -1) if self.record.vignetting_sd else ():
             yield self._warped(self.counts, self.window_to_photo, sign * self.record.vignetting_sd)
 
     def with_other_fits(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
-        standard deviation. The properties are its independent movements and its dark level.
+        standard deviation. The properties are its independent movements, its dark level and half of the
+        doubtful tilt.
         """
-        for pair in self.other_warps:
-            for warp in pair:
-                yield self._warped(self.counts, warp)
+        pairs = self.other_warps + self.other_tilts
+        yield from (self._warped(self.counts, warp) for pair in pairs for warp in pair)
         for sign in (1, -1) if self.record.dark_level_sd else ():
             darker = self.counts - np.float32(sign * self.record.dark_level_sd)
             yield self._warped(darker, self.window_to_photo)
@@ -304,7 +310,9 @@ def photographed_image(
     )
     side = len(wanted)
     where, lit = fit.window_to_photo, fit.gain * wanted
-    return Photograph(counts, where, side, wanted_pitch_um, finest_per_um, record, lit, fit.other_warps)
+    return Photograph(
+        counts, where, side, wanted_pitch_um, finest_per_um, record, lit, fit.other_warps, fit.other_tilts
+    )
 
 
 def _saturated(raw: np.ndarray) -> float:
@@ -426,6 +434,7 @@ class _Fit:
     gamma_sd: float = 0.0
     blur_px: float = 0.0
     other_warps: list[list[np.ndarray]] = field(default_factory=list)
+    other_tilts: list[list[np.ndarray]] = field(default_factory=list)
 
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
@@ -486,6 +495,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
         pose, found = solved(free, *images, pose)
     correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
+    left = None
     if further:
         tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
         closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
@@ -494,6 +504,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
             pose, correlation, free = tilted, closer, [*free, 4, 5]
         else:
+            left = spread[-2:, -2:]
             spread = _covariance(found.jac, found.fun, side)
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
@@ -503,16 +514,18 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         spread[3, 3] += (min(pitch_sd, _PRINT_SCALE_SD) / unit[3]) ** 2
         scale_sd = float(np.sqrt(spread[3, 3]) * unit[3])
     light = _light(seen(photo, pose), wanted, alike)
-    variance, ways = np.linalg.eigh(spread)
-    others = []
-    for step in (ways * np.sqrt(variance.clip(0))).T:
-        change = np.zeros_like(pose)
-        change[free] = step * unit[free]
-        others.append([_camera(at, photo.shape, side, scale) for at in (pose + change, pose - change)])
+
+    def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
+        variance, ways = np.linalg.eigh(covariance)
+        steps = np.zeros((len(columns), len(pose)))
+        steps[:, columns] = (ways * np.sqrt(variance.clip(0))).T * unit[columns]
+        return [[_camera(at, photo.shape, side, scale) for at in (pose + one, pose - one)] for one in steps]
+
     return _Fit(
         warp,
         correlation,
-        other_warps=others,
+        other_warps=around(free, spread),
+        other_tilts=around([4, 5], left / 2) if left is not None else [],
         position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
         scale_sd=scale_sd,
         **light,

@@ -105,7 +105,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    variants = photo.with_more_noise(), photo.with_other_vignetting(), photo.with_other_fits()
+    variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
     freed, uncertainty = estimated(figures, figures(image), *variants)
     # If the photograph is blurrier than the expected image, the camera or the print may be the cause. Part of
     # the effect of this blur on the score therefore remains uncertain.
@@ -192,7 +192,7 @@ def score_lens_photo(
     pictures = {f"object {object_name(which)}": wanted}
     for name, estimate in estimates(image).items():
         pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
-    variants = photo.with_more_noise(), photo.with_other_vignetting(), photo.with_other_fits()
+    variants = photo.with_more_noise(), photo.with_other_faults(), photo.with_other_fits()
     freed, uncertainty = estimated(figures, figures(image), *variants)
     return PhotoVerdict(
         LensPhotoScore(**freed),

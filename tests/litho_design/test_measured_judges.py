@@ -375,7 +375,7 @@ def test_the_scale_of_a_photograph_is_as_uncertain_as_its_pitch_or_the_print(
     cv2.imwrite(str(tmp_path / "photo.png"), Camera(turn_deg=1.0, noise=1e-3).counts(light, pitch_um, 0))
     source = PhotoSource(tmp_path / "photo.png", 0.15, pitch_sd=pitch_sd, dark_level=DARK)
     photo = photographed_image(light, pitch_um, source, 4.0)
-    assert len(photo.other_warps) == movements
+    assert (len(photo.other_warps), len(photo.other_tilts)) == (movements, 2)
     area = np.linalg.det(photo.window_to_photo)
     scales = [np.sqrt(np.linalg.det(one) / area) - 1 for one, _ in photo.other_warps]
     # A movement may turn the camera and scale its image, so the scales of all movements add up in square.
@@ -388,16 +388,8 @@ def test_another_scale_of_the_camera_does_not_change_the_light():
     where = np.array([[1.5, 0, 4], [0, 1.5, 4], [0, 0, 1]])
     larger = np.array([[1.6, 0, -2.5], [0, 1.6, -2.5], [0, 0, 1]])
     facts = {"pitch_um": 0.1, "dark_level_sd": 0.0}
-    photo = Photograph(
-        counts,
-        where,
-        128,
-        0.15,
-        1.0,
-        CameraRecord.model_construct(**facts),
-        np.zeros((128, 128)),
-        [[larger] * 2],
-    )
+    record, warps = CameraRecord.model_construct(**facts), [[larger] * 2]
+    photo = Photograph(counts, where, 128, 0.15, 1.0, record, np.zeros((128, 128)), warps, [])
     light = [photo.power_share(image, 1.0).sum() for image in (photo.image(), *photo.with_other_fits())]
     # Interpolation changes the light by less than 0.1 %, and the scale by 14 % if it is not corrected.
     assert light == pytest.approx([counts.sum()] * 3, rel=1e-3)
