@@ -230,9 +230,8 @@ def _defects(off_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray) -> 
     for spot in range(1, count + 1):
         inside = spots == spot
         core = inside & (size_um >= np.median(size_um[inside]))
-        low, high = np.percentile(expected_um[core], (25, 75))
-        near_um = _LIKE_HEIGHT_UM
-        elsewhere = (expected_um >= low - near_um) & (expected_um <= high + near_um) & valid & ~inside
+        low, high = np.percentile(expected_um[core], (25, 75)) + _LIKE_HEIGHT_UM * np.array([-1, 1])
+        elsewhere = (expected_um >= low) & (expected_um <= high) & valid & ~inside
         if not elsewhere.any() or dust[elsewhere].mean() < _LARGEST_DUSTY_SHARE:
             foreign |= inside
     strict: Any = {"high": 4.0, "low": 2.5, "max_width_px": 2}
