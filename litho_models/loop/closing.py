@@ -31,8 +31,8 @@ from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
-# Assumed ratio of the duration of a whole loop to that of its first fits. For four datasets, this ratio was
-# between 11 and 33.
+# Assumed ratio of the duration of a loop to that of its first fits. For four datasets of heights, this ratio
+# was between 11 and 33. For films, it was about 25 without an effect, but 260 or more with effects.
 _OVER_FIRST_FITS = 20
 
 
@@ -128,7 +128,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
     ]
     starts = {name: fit_state(state.twin, freed) for name, state in plain.items()}
     if told := estimate("the loop", _OVER_FIRST_FITS * (time.monotonic() - began_s)):
-        study.report(told)
+        study.report(told + ("; if it finds effects, several times as long" if freed.of_films else ""))
     searches: dict[str, Found] = {}
     for name, state in starts.items():
         study.report(f"searching for effects that {name} lacks")
