@@ -199,7 +199,7 @@ def line_of(rows: list[dict[str, Any]], kind: str) -> tuple[str, ...]:
     if not kept:
         return kind, f"0 of {len(own)}", *["–"] * 4
     error, sd = (np.array([row[name] for row in kept]) for name in ("error", "sd"))
-    within = [f"{100 * np.mean(np.abs(error) <= k * sd):.0f} %" for k in (1, 3)]
+    within = [f"{100 * np.mean(np.abs(error) <= k * sd):.1f} %" for k in (1, 3)]
     spread = f"{np.sqrt(np.mean(error**2)):.2f} dB"
     return kind, f"{len(kept)} of {len(own)}", *within, f"{error.mean():+.3f} dB", spread
 
