@@ -74,7 +74,7 @@ class Block:
 
     @property
     def name(self) -> str:
-        """Return the name of the channel, or an empty text if the header gives none."""
+        """Return the name of the channel, or an empty string if the header states none."""
         return self.first("channel")
 
     @property
@@ -88,7 +88,7 @@ class Block:
         return self.first("unit").strip("[]() ") or next(iter(lengths + others), None)
 
     def require_pixels(self, shape: Shape) -> None:
-        """If the header states the numbers of rows and columns, check that ``shape`` agrees with them.
+        """Check that ``shape`` agrees with the numbers of rows and columns, if the header states them.
 
         Raises:
             InputError: the header states other numbers.

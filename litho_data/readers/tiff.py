@@ -81,8 +81,8 @@ def require_upright(page: Any) -> None:
 
 
 def maker_of(path: Path) -> str:
-    """Return the name of the instrument maker's format to which the tags of this TIFF belong. It is the name
-    that SurfaceTopography uses. Return an empty text if the tags belong to no such format.
+    """Recognise the instrument maker's format from the tags of a TIFF file. Return the name that
+    SurfaceTopography gives to this format, or an empty string if no format is recognised.
     """
     try:
         with open_tiff(path) as file:

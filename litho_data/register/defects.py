@@ -147,10 +147,10 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:
-    """Return, on the layout's pixels, the heights of the scan minus the heights that the layout explains.
+    """Return the part of the scan's heights that the layout does not explain, on the pixels of the layout.
 
-    The result has the shape of the layout, and is NaN at its border and where nothing was measured. It is
-    None if the scan covers almost nothing of the layout.
+    The result is NaN at the border of the layout and where nothing was measured. It is None if the scan
+    covers almost nothing of the layout.
     """
     from scipy.ndimage import map_coordinates
 

@@ -79,7 +79,7 @@ def estimated(
     Args:
         score: function that scores a variant.
         measured: scores of the measurement.
-        noisier: pairs of variants with random noise added, of the strength of that in the measurement.
+        noisier: pairs of variants to which random noise as strong as that of the measurement is added.
         left: pairs of variants for errors that are left in the measurement.
         hidden: pairs of variants that a fit cannot distinguish from the measurement.
     """

@@ -63,10 +63,10 @@ class CameraRecord(Record):
     ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the standard deviation of
     the noise in the dark, and ``noise_share`` is that of the additional noise, relative to the light.
     ``position_sd_um`` is the standard deviation of the fitted position along one axis, and ``scale_sd`` is
-    that of the fitted scale, relative to it.
-    ``vignetting_sd`` is the standard deviation of the possible loss of light in the camera's corners.
-    ``blur_um`` is the standard deviation (radius) of the fitted blur that is added to the expected image. The
-    counts are proportional to a power of the light, and ``gamma`` is the fitted exponent.
+    the relative standard deviation of the fitted scale. ``vignetting_sd`` is the standard deviation of the
+    possible loss of light in the camera's corners. ``blur_um`` is the standard deviation (radius) of the
+    fitted blur that is added to the expected image. The counts are proportional to a power of the light, and
+    ``gamma`` is the fitted exponent.
     """
 
     name: str
@@ -136,8 +136,9 @@ class Photograph:
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
         other_warps: for each independent fitted movement of the camera, the two maps after a movement by plus
             and minus its standard deviation.
-        other_tilts: if no tilt was fitted, the same for two independent tilts with half their variance.
-            Camera and print are equally likely causes of such a tilt.
+        other_tilts: the same pairs of maps for two independent tilts that were too small to be fitted; empty
+            if a tilt was fitted. Such a tilt may be the camera's or the print's, so each pair has half of its
+            variance.
     """
 
     counts: np.ndarray
@@ -176,7 +177,7 @@ class Photograph:
 
     def with_other_faults(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fault of the camera differs by plus and minus its standard
-        deviation. The faults are vignetting and half of the doubtful tilt.
+        deviation. The faults are vignetting and, with half of its variance, a tilt too small to be fitted.
         """
         yield from (self._warped(self.counts, warp) for pair in self.other_tilts for warp in pair)
         for sign in (1, -1) if self.record.vignetting_sd else ():
@@ -184,8 +185,8 @@ class Photograph:
 
     def with_other_fits(self) -> Iterator[np.ndarray]:
         """Yield pairs of images in which one fitted property of the camera differs by plus and minus its
-        standard deviation. The properties are its independent movements, its dark level and half of the
-        doubtful tilt.
+        standard deviation. The properties are its independent movements, its dark level and, with half of its
+        variance, a tilt too small to be fitted.
         """
         pairs = self.other_warps + self.other_tilts
         yield from (self._warped(self.counts, warp) for pair in pairs for warp in pair)
@@ -495,7 +496,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
         pose, found = solved(free, *images, pose)
     correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
-    left = None
+    small_tilt = None
     if further:
         tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
         closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
@@ -504,7 +505,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         if surely and 1 - closer**2 < _NEEDED * (1 - correlation**2):
             pose, correlation, free = tilted, closer, [*free, 4, 5]
         else:
-            left = spread[-2:, -2:]
+            small_tilt = spread[-2:, -2:]
             spread = _covariance(found.jac, found.fun, side)
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
@@ -516,6 +517,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     light = _light(seen(photo, pose), wanted, alike)
 
     def around(columns: list[int], covariance: np.ndarray) -> list[list[np.ndarray]]:
+        """Return the two maps after each independent change of these columns of the pose."""
         variance, ways = np.linalg.eigh(covariance)
         steps = np.zeros((len(columns), len(pose)))
         steps[:, columns] = (ways * np.sqrt(variance.clip(0))).T * unit[columns]
@@ -525,7 +527,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         warp,
         correlation,
         other_warps=around(free, spread),
-        other_tilts=around([4, 5], left / 2) if left is not None else [],
+        other_tilts=[] if small_tilt is None else around([4, 5], small_tilt / 2),
         position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
         scale_sd=scale_sd,
         **light,

@@ -31,8 +31,8 @@ _SMALLEST_FOR_TIP = 64
 # Dust causes deviations that are larger than the random errors of a print and wider than those of a displaced
 # step.
 _DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
-# Dust may cover this share of the places whose expected height is that of the dusty place within this
-# difference.
+# A deviation counts as dust if less than the first number, a share, of the other places with the same
+# expected height deviate. Heights count as the same if they differ by less than the second number.
 _LARGEST_DUSTY_SHARE, _LIKE_HEIGHT_UM = 0.3, 0.005
 # Standard deviation of the change of the heights that the AFM tip causes, as a share of this change.
 _TIP_SD = 0.3
@@ -40,8 +40,8 @@ _TIP_SD = 0.3
 # extrapolated.
 _ORDERS = (3, 4, 5, 6)
 # The deviations of a print from the expected print are larger in tilt and bow than in these orders, by this
-# factor. All tilt and bow of a print may also be wrong by the same factor, with this standard deviation. Both
-# numbers were found with ``benchmarks.coverage``.
+# factor. In addition, all tilt and bow of a print may be wrong by one common factor; the second number is its
+# standard deviation. Both numbers were found with ``benchmarks.coverage``.
 _LARGER, _COMMON_SD = 2.0, 0.1
 # Number of groups of pixels with nearly the same expected height.
 _HEIGHTS = 32
@@ -53,10 +53,10 @@ class MeasuredRecord(Record):
     ``orientation`` is the operation that brings the scan into the orientation of the layout.
     ``tilt_um_per_um`` (x, y) is the tilt that was removed, and ``bow_um`` is the range, over the element, of
     the bow that was removed. ``noise_um`` is the residual at spatial frequencies at which prints have no
-    structure. ``removed_sd_um`` is the standard deviation of a term of the tilt and bow of the print itself,
-    which were removed, too. ``position_sd_um`` is that of a corner along one axis, and ``scale_sd`` is the
-    relative one of the heights. ``defect_share`` is the share of the element that shows dust or scars instead
-    of the print.
+    structure. Tilt and bow of the print itself are removed as well; ``removed_sd_um`` is the standard
+    deviation of each of their terms. ``position_sd_um`` is the standard deviation of a corner's position
+    along one axis, and ``scale_sd`` is the relative standard deviation of the height scale. ``defect_share``
+    is the share of the element that shows dust or scars instead of the print.
     """
 
     name: str
@@ -325,9 +325,7 @@ def with_more_noise(height_um: Tensor, record: MeasuredRecord) -> Iterator[Tenso
     """
     generator = np.random.default_rng(0)
     for _ in range(DRAWS):
-        noise_um = record.noise_um * generator.standard_normal(height_um.shape)
-        for sign in (1, -1):
-            yield height_um + torch.from_numpy(sign * noise_um).to(height_um)
+        yield from _pair(record.noise_um * generator.standard_normal(height_um.shape), height_um)
 
 
 def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
@@ -337,10 +335,10 @@ def with_other_scale(height_um: Tensor, record: MeasuredRecord, pitch_um: float)
     from litho_data.tip import paraboloid_erosion
 
     measured = height_um.double().cpu().numpy()
-    yield from _pairs(record.scale_sd * measured, height_um)
+    yield from _pair(record.scale_sd * measured, height_um)
     if record.tip_um:
         narrower = paraboloid_erosion(measured, (pitch_um, pitch_um), record.tip_um).surface
-        yield from _pairs(_TIP_SD * (narrower - measured), height_um)
+        yield from _pair(_TIP_SD * (narrower - measured), height_um)
 
 
 def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
@@ -351,16 +349,17 @@ def with_other_fits(height_um: Tensor, record: MeasuredRecord, pitch_um: float) 
     measured = height_um.double().cpu().numpy()
     removed = _shapes(measured.shape, {"none": (), "plane": (1,), "bow": (1, 2)}[record.levelling])
     for shape in np.moveaxis(removed, -1, 0):
-        yield from _pairs(record.removed_sd_um * shape, height_um)
+        yield from _pair(record.removed_sd_um * shape, height_um)
     if removed.size:
-        yield from _pairs(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed), height_um)
+        yield from _pair(_COMMON_SD * removed @ _amounts(measured - measured.mean(), removed), height_um)
     for step in np.eye(6).reshape(6, 2, 3) if record.position_sd_um else ():
         for sign in (1, -1):
             corner_px = sign * record.position_sd_um / pitch_um * step
             yield torch.from_numpy(_displaced(measured, corner_px)).to(height_um)
 
 
-def _pairs(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
+def _pair(change_um: np.ndarray, height_um: Tensor) -> Iterator[Tensor]:
+    """Yield the print with the change added and with the change subtracted."""
     for sign in (1, -1):
         yield height_um + torch.from_numpy(sign * change_um).to(height_um)
 

@@ -49,8 +49,8 @@ class FitFacts(Record):
 
 
 class Fitted(NamedTuple):
-    """A fitted model, the facts of its fit, and the records of its training rounds. For a fit by least
-    squares, there are no rounds, and the list is empty.
+    """A fitted model, the facts of its fit, and the records of its training rounds. Least-squares fits have
+    no rounds, so their list is empty.
     """
 
     model: Simulator

@@ -102,14 +102,14 @@ class MeasurementModel(Record):
         return sum(part.numbers for part in self.parts)
 
     def fits(self, scan: PrintedScan) -> bool:
-        """Return whether the field of the scan has the same size as those of the training scans."""
+        """Return whether the field of the scan is as large as the fields of the training scans."""
         return is_of_size(scan, self.field_um)
 
     def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
         """Return the map that the scan is expected to show, given the predicted height of the print. Both
         maps have shape (ny, nx) and are in µm.
 
-        If the field of the scan does not have the size of the training fields, only the levelling is applied.
+        If the field of the scan is larger or smaller than those fields, only the levelling is applied.
         """
         parts = self._parts(scan)
         seen = displaced(scan, prediction_um, parts)

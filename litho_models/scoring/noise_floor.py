@@ -117,11 +117,11 @@ def estimated_floor(
     held-out scans.
 
     Args:
-        model: its name, for ``source``.
+        model: name of the model, which is stated in the field ``source`` of the result.
         scans: held-out scans.
         maps_um: height map that the model predicts for each scan, µm, of shape (ny, nx).
         blocks: blocks of pixels that determine to which pixels terms are fitted and which pixels are scored.
-            Use the same blocks as for the errors that are compared with the floor.
+            The floor is comparable only with errors that were computed with the same blocks.
         seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
@@ -162,7 +162,7 @@ def floor_of_residuals(
     up to 6 %.
 
     Args:
-        model: its name, for ``source``.
+        model: name of the model, which is stated in the field ``source`` of the result.
         scans: held-out scans.
         freed: residuals of each scan, keyed by policy, as returned by ``freed_by_policy``. The policy
             ``offset`` must be among the keys.
