@@ -36,7 +36,9 @@ from tests.grids import UNEQUAL
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Made = Callable[[Array, PixelGrid], Array]
-WAVELENGTH_UM = 0.5
+# Half of it is shorter than the finest pitch. Rays of a longer wave would reach grazing incidence, and their
+# kernel takes seconds.
+WAVELENGTH_UM = 0.13
 
 
 def exchanged(grid: PixelGrid) -> PixelGrid:
@@ -104,7 +106,7 @@ MAPS: dict[str, Made] = {
         height, Window(0, grid.shape[0] - 9, grid.shape[1] - 9, 16), 5
     ),
     "light, by rays": light(ASMPropagator, 3.0),
-    "light, summed": light(RSPropagator, 9.0),
+    "light, summed": light(RSPropagator, 22.0),
     "a far field": light(FarFieldPropagator, 60.0),
     "an image": imaged,
     "coarse pixels": by_torch(lambda height: bin_pixels(height[..., :32, :32], 4)),
