@@ -1,9 +1,10 @@
-"""Stop a command after some of its writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
+"""Stop commands after some of their writes: ``python -m tests.stopped_commands NAMES FOLDER [every]``.
 
 This must run in a separate process with one thread, because each stopped command is a fork of that process.
 Every command is a function of its working folder, which already contains its input. The module runs each
 stopped command again, checks that the result equals that of an uninterrupted run, and prints the number of
-stops. By default it tries up to six stops; ``every`` tries all.
+stops. NAMES are separated by commas. By default, a command is stopped up to five times. With ``every``, and
+always if it takes little time, it is stopped after each write.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.exchange.release import export_ro_crate
@@ -53,10 +56,9 @@ from litho_models.monitoring import check
 from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
-from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_data.campaigns import write_campaign
-from tests.litho_models.loop_scans import base_model, planted
+from tests.litho_models.loop_scans import base_model, planted, search_little
 from tests.litho_models.prints import make_scans, write_store
 from tests.stops import stopped_after, writes_of
 
@@ -174,10 +176,7 @@ def _planted(folder: Path) -> None:
     """Write prints with write-order memory, and make the loop use a small base and try only a few causes."""
     strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
     write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
-    causes = [get_effect(one) for one in ("write-order-memory", "slope-thinning")]
-    closing.screened_effects = lambda tip_radius_um: causes
-    closing.LAWS, closing.TABLES = {}, {}
-    measurement_fit._OFFERS = ()
+    search_little(pytest.MonkeyPatch(), ["write-order-memory", "slope-thinning"])
     bases.build_model = lambda *name, **facts: base_model()
     loop_run.close = _once(closing.close)
 
@@ -301,6 +300,8 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
     "score": (_designed, score_design),
     "sheet-new": (nothing, sheet),
 }
+# These commands take so little time that they are always stopped after each of their writes.
+SHORT = {"freeze", "export-design"}
 
 
 def content(folder: Path) -> dict[str, Any]:
@@ -367,4 +368,6 @@ if __name__ == "__main__":
     assert os.environ.get("OMP_NUM_THREADS") == "1", "forks need a single thread: set OMP_NUM_THREADS=1"
     # Pictures are part of the page. They take most of the time and write no files, so they are left undrawn.
     page.svg_address = lambda figure: "data:,"
-    stop_everywhere(sys.argv[1], Path(sys.argv[2]), 10**9 if "every" in sys.argv else 3)
+    for name in sys.argv[1].split(","):
+        most = 10**9 if name in SHORT or "every" in sys.argv else 2
+        stop_everywhere(name, Path(sys.argv[2]) / name, most)

@@ -21,9 +21,10 @@ from litho_design.sheets.new import PAGE, new_sheet
 from litho_design.sheets.read import read_sheet, sheet_text
 from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Sheet
 from litho_models import load_frozen
+from tests.litho_models.loop_scans import search_little
 
 SMALL = {
-    "layout.size_px": 160,
+    "layout.size_px": 128,
     "optics.distance_um": 15,
     "search.iterations": 2,
     "search.polish_rounds": 0,
@@ -46,7 +47,7 @@ def print_and_scan(sheet: Path) -> None:
     for folder in ("scans", SCANS_OF_HOLOGRAMS):
         (sheet / folder).mkdir()
     for field in record.fields:
-        level = _levels(sheet, field.file) if field.file else np.zeros((160, 160), np.uint8)
+        level = _levels(sheet, field.file) if field.file else np.zeros((128, 128), np.uint8)
         place = SCANS_OF_HOLOGRAMS if field.id in ARMS else "scans"
         job = Job(id=field.id, level=level, index=field.order, order=field.order / len(record.fields) - 0.5)
         scan = scan_job(fab, job)
@@ -69,7 +70,7 @@ def test_a_lab_gets_every_file_and_instructions(sheet):
         if field.file:
             assert field.file in page
             # The files for the printer contain the layouts that the card names.
-            assert _levels(sheet, field.file).shape == (160, 160)
+            assert _levels(sheet, field.file).shape == (128, 128)
     levels = {arm: np.load(design_folder(sheet / HOLOGRAM, arm, 0) / "layout_level.npy") for arm in ARMS}
     for arm in ARMS:
         printed = _levels(sheet, f"to-printer/hologram-{arm}/layout.png")
@@ -79,8 +80,9 @@ def test_a_lab_gets_every_file_and_instructions(sheet):
 
 
 def test_scans_of_a_sheet_give_a_model_a_loop_and_a_comparison(sheet, tmp_path, monkeypatch):
-    # One base is enough to test the steps, which are the same for every base.
+    # A base and a search that take little time are enough to test the steps.
     monkeypatch.setattr(read, "_BASE", "affine-mtf")
+    search_little(monkeypatch, ["vertical-shrinkage"])
     with pytest.raises(InputError, match=r"without.*none.*hologram-scans"):
         read_sheet(sheet, tmp_path / "answer")
     assert not (tmp_path / "answer").exists()

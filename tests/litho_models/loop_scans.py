@@ -6,17 +6,36 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_data.store import PrintedScan
+from litho_models.effects import get_effect
+from litho_models.loop import closing
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.model import Twin, Values
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.models import build_model
+from litho_models.scan_terms import measurement_fit
 from litho_models.simulator import Simulator
 
 PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 0.1, 13, 0.1
 FIELDS, BLUR_UM = 2, 0.25
+
+
+def search_little(
+    patch: pytest.MonkeyPatch,
+    causes: Sequence[str] = (),
+    laws: Sequence[str] = (),
+    tables: Sequence[str] = (),
+) -> None:
+    """Make a loop search only for these causes, laws and tables, and for one surface that all scans share.
+    The other candidates take time and have their own tests.
+    """
+    patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in causes])
+    patch.setattr(closing, "LAWS", {one: get_effect(one) for one in laws})
+    patch.setattr(closing, "TABLES", {one: get_effect(one) for one in tables})
+    patch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
 
 
 def blank_scan(number: int, size_px: int = 48, **facts: object) -> PrintedScan:

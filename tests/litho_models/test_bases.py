@@ -18,7 +18,6 @@ from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.frozen.card import ModelCard
-from litho_models.loop import closing
 from litho_models.loop.bases import bases_for, train_folds
 from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
@@ -36,6 +35,7 @@ from tests.litho_models.loop_scans import (
     PITCH_UM,
     base_model,
     planted,
+    search_little,
     study_of,
     with_heights,
 )
@@ -47,10 +47,7 @@ STRENGTH = {"strength": 0.04}
 
 @pytest.fixture(autouse=True)
 def no_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Switch off the search for causes and laws, which takes time and has its own tests."""
-    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
-    monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "TABLES", {})
+    search_little(monkeypatch)
 
 
 def chosen(base: str, scans: Sequence[PrintedScan], cache: Path) -> nn.Module:

@@ -33,10 +33,17 @@ from litho_models.loop.record import CloseLoop, Explained
 from litho_models.loop.report import said
 from litho_models.loop.results import _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, save_model
-from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_units
-from tests.litho_models.loop_scans import bare_state, base_model, blank_scan, planted, study_of, with_heights
+from tests.litho_models.loop_scans import (
+    bare_state,
+    base_model,
+    blank_scan,
+    planted,
+    search_little,
+    study_of,
+    with_heights,
+)
 from tests.litho_models.prints import make_scans, write_store
 
 # These tests draw the figures of the loop's report in full.
@@ -44,8 +51,6 @@ pytestmark = pytest.mark.pictures
 COUNT, SIZE_PX = 12, 48
 BASE = "affine-mtf"
 CAUSES = ("write-order-memory", "slope-thinning", "vertical-shrinkage")
-# Most surfaces that scans share have their own tests, so offer only one here.
-FEW_OFFERS = (("background", 2, False),)
 SOME_LAWS, TABLE = ("height-power-2", "height-times-slope-size-x"), "level-table"
 TABLES = ("errors", "candidates", "explained", "single_scans", "planted")
 
@@ -75,10 +80,7 @@ def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
     said: list[str] = []
     out = store.parent / "loop"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
-        patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
-        patch.setattr(closing, "TABLES", {TABLE: get_effect(TABLE)})
-        patch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
+        search_little(patch, CAUSES, SOME_LAWS, [TABLE])
         # Make each second of the first fits count as hours, so that the remaining time is announced.
         patch.setattr(closing, "_OVER_FIRST_FITS", 1e5)
         # The base has one blur and two fitted numbers.
@@ -348,11 +350,7 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Save time: search for no causes, laws or tables, and for only a few terms that scans share."""
-    for name in ("LAWS", "TABLES"):
-        monkeypatch.setattr(closing, name, {})
-    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
-    monkeypatch.setattr(measurement_fit, "_OFFERS", FEW_OFFERS)
+    search_little(monkeypatch)
 
 
 def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(quick: None, tmp_path: Path) -> None:

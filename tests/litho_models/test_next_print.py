@@ -34,7 +34,7 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
-from litho_models.loop import bases, closing
+from litho_models.loop import bases
 from litho_models.loop.fits import RULES, TwinProblem
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
@@ -67,10 +67,16 @@ from litho_models.planning.rounds import (
     with_decisions,
 )
 from litho_models.planning.run import next_print
-from litho_models.scan_terms import measurement_fit
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
-from tests.litho_models.loop_scans import base_model, blank_scans, planted, study_of, with_heights
+from tests.litho_models.loop_scans import (
+    base_model,
+    blank_scans,
+    planted,
+    search_little,
+    study_of,
+    with_heights,
+)
 from tests.litho_models.prints import write_store
 from tests.tables import require_tables_equal_record
 
@@ -466,11 +472,7 @@ def by_order() -> list[PrintedScan]:
 
 @pytest.fixture
 def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect("slope-thinning")])
-    monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "TABLES", {})
-    # Other terms that scans share have their own tests, so offer only a background.
-    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
+    search_little(monkeypatch, ["slope-thinning"])
 
 
 @pytest.mark.slow

@@ -12,10 +12,9 @@ import pytest
 from examples import own_effect
 from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, get_effect, register_effect
-from litho_models.loop import closing
 from litho_models.loop.record import CloseLoop
-from litho_models.scan_terms import SCAN_TERMS, measurement_fit
-from tests.litho_models.loop_scans import base_model, planted
+from litho_models.scan_terms import SCAN_TERMS
+from tests.litho_models.loop_scans import base_model, planted, search_little
 from tests.litho_models.prints import write_store
 
 
@@ -39,12 +38,7 @@ def test_the_example_finds_the_effects_that_it_registers(
         added = 0.03 * random.normal() * x**3 - 0.04 * np.exp(-scan.layout_um / own_effect.SINKING_DEPTH_UM)
         scans.append(replace(scan, height_um=(scan.height_um + added).astype(np.float32)))
     store, out = write_store(tmp_path / "s.zarr", scans), tmp_path / "loop"
-    # Use only two effects of the catalogue, because the others take time and have their own tests.
-    names = ("vignetting", "sinking-layers")
-    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: list(map(get_effect, names)))
-    monkeypatch.setattr(closing, "LAWS", {})
-    monkeypatch.setattr(closing, "TABLES", {})
-    monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False),))
+    search_little(monkeypatch, ["vignetting", "sinking-layers"])
     monkeypatch.setattr("litho_models.loop.bases.build_model", lambda *_, **__: base_model())
     monkeypatch.setattr("sys.argv", ["own_effect.py", str(store), "--out", str(out)])
     own_effect.main()
