@@ -107,7 +107,7 @@ def _prints(count: int, bias_px: float) -> list[PrintedScan]:
     scans = []
     for number in range(count):
         rng = np.random.default_rng([5, number])
-        smooth = gaussian_filter(rng.normal(size=(112, 112)), 6, mode="wrap")
+        smooth = gaussian_filter(rng.normal(size=(96, 96)), 6, mode="wrap")
         level = (16 * (smooth > 0)).astype(np.uint8)
         blank = PrintedScan(
             id=f"F{number:02}", print_id=f"F{number:02}", order=number, mask_level=level,
