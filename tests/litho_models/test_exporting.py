@@ -47,9 +47,9 @@ def frozen(name: str, folder: Path) -> FrozenSimulator:
     "name",
     [
         "zoo:physics",
-        "pbl",
         *CLOSED_FORM,
-        *(pytest.param(f"zoo:{n}", marks=pytest.mark.long) for n in ("pbl", "fno", "features")),
+        # An export to ONNX begins with the same program, and the test below makes it for PBL.
+        *(pytest.param(n, marks=pytest.mark.long) for n in ("pbl", "zoo:pbl", "zoo:fno", "zoo:features")),
     ],
 )
 def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> None:
