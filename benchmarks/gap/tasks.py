@@ -12,7 +12,7 @@ from benchmarks.gap.jobs import Job, design_command
 from benchmarks.gap.plan import ARMS, Effort, model
 from litho_data.foundation.errors import InputError
 
-ZOO_ARMS = ("none", "physics", "fno", "pbl")
+ZOO_ARMS = ("none", "physics", "fno", "pbl", "random-features")
 
 
 @dataclass(frozen=True)
