@@ -63,9 +63,9 @@ class ASMPropagator(KernelPropagator):
                 wanted=f"the source's pitch {source.pitch_um} µm",
                 hint="use RSPropagator for another pitch",
             )
-        axes = spectrum_axes(source, target, distance_um, wavelength_um)
-        kernel = torch.fft.ifft2(transfer_function(*axes, distance_um, wavelength_um))
-        super().__init__(source, target, kernel[axes[0].kept[:, None], axes[1].kept[None, :]], dtype)
+        y, x = spectrum_axes(source, target, distance_um, wavelength_um)
+        kernel = torch.fft.ifft(transfer_function(y, x, distance_um, wavelength_um))[:, x.kept]
+        super().__init__(source, target, torch.fft.ifft(kernel, dim=0)[y.kept], dtype)
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,17 @@ def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wave
     """Return the transfer function of free space, complex128 of shape (y, x). It is 0 at frequencies whose
     rays are too steep for the period of the field.
     """
-    fy, fx = y.frequency[:, None], x.frequency[None, :]
-    band = y.inside[:, None] & x.inside[None, :]
-    axial = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double()).sqrt()
+    # Most frequencies occur with both signs, and only the shift depends on the sign.
+    (fy, row), (fx, column) = (torch.unique(axis.frequency.abs(), return_inverse=True) for axis in (y, x))
+    squared = wavelength_um**-2 - fy[:, None] ** 2 - fx[None, :] ** 2
+    wave = torch.exp(2j * math.pi * distance_um * torch.complex(squared, torch.zeros(()).double()).sqrt())
     if distance_um < 0:
-        band = band & (axial.imag == 0)
-    shift = 2 * math.pi * (fy * y.start_um + fx * x.start_um)
-    return torch.exp(2j * math.pi * distance_um * axial + 1j * shift) * band
+        # Backwards, evanescent waves grow until they overflow.
+        wave = torch.where(squared >= 0, wave, 0)
+    along_y, along_x = (
+        torch.exp(2j * math.pi * axis.start_um * axis.frequency) * axis.inside for axis in (y, x)
+    )
+    return wave[row[:, None], column[None, :]].mul_(along_y[:, None]).mul_(along_x[None, :])
 
 
 def _axis_band(
