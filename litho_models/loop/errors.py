@@ -60,12 +60,15 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
             the measurement model is fitted only once.
     """
     stored = [scan.stored for scan in scans]
+    # A strength that only other scans have would keep the value that was fitted to them.
+    twin = twin.known_from(scans)
     maps = [*map(twin.height, scans)]
     measurement = learn_measurement(stored, maps, seed=seed)
     if refit and len(twin.vector):
         freed = [*map(measurement.freed, stored, maps)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        twin = twin.known_from(scans)
         maps = [*map(twin.height, scans)]
         measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
     return Fit(twin, measurement)
@@ -97,7 +100,7 @@ def error_rows(
         mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
         mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
         edges = [
-            edges_of_scan(scan, own, fit.residual_um).mean_nm or 0.0
+            edges_of_scan(scan, own, fit.residual_um).mean_nm
             for scan, own, fit in zip(scans, maps_um, fits, strict=True)
             if films
         ]
@@ -245,7 +248,7 @@ class HeldOut:
             heights = [twin.height(self.study.scans[i]) for i in rest]
             learned = learn_background([self.scans[i] for i in rest], heights)
             for i in own:
-                found[i] = Prediction.beside(learned, maps[i]).map_um
+                found[i] = Prediction.beside(learned, self.scans[i], maps[i]).map_um
         return found
 
 

@@ -32,6 +32,7 @@ from litho_models.loop.record import (
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
+from litho_models.scan_terms.grouped import label_of
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
 
@@ -151,13 +152,26 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
 
 def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """Return the fitted values of the parameters of an effect, keyed by the name of the parameter. Their
-    confidence intervals are computed from the scatter over prints, or over scans if there are too few prints.
+    confidence intervals are computed from the scatter over prints, or over scans if there are too few prints
+    or if only one print has this strength. A strength of a single scan has no interval.
     """
-    twin, units = closed.final.twin, independent(closed.study.scans)
-    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
-    reach = t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd
-    fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), reach[twin.own :].tolist(), strict=True)
-    numbers = [(one.parameter, one.label or "", *own) for one, *own in fitted if one.effect == name]
+    twin, scans = closed.final.twin, closed.study.scans
+    by = twin.effects[name].by
+    kinds = [independent(scans), [scan.id for scan in scans]]
+    reaches = [_reach(closed.final.linear, units)[twin.own :].tolist() for units in kinds]
+
+    def half_width(label: str | None, *reach: float) -> float:
+        # A fit makes the scores of a strength add up to zero, so a single unit would show no scatter.
+        own = [label in (None, label_of(scan.stored, by)) for scan in scans]
+        counts = [len({unit for unit, one in zip(units, own, strict=True) if one}) for units in kinds]
+        return next((one for one, count in zip(reach, counts, strict=True) if count > 1), 0.0)
+
+    fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), *reaches, strict=True)
+    numbers = [
+        (one.parameter, one.label or "", value, half_width(one.label, *reach))
+        for one, value, *reach in fitted
+        if one.effect == name
+    ]
     facts, values = get_effect(name).parameters, twin.values()[name]
     numbers += [(key, "", value, 0.0) for key, value in values.items() if facts[key].kind == "choice"]
     found = dict[str, list[Strength]]()
@@ -166,6 +180,14 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
         own = Strength(label=label, value=value, unit=facts[key].unit, ci95=ci95)
         found.setdefault(key, []).append(own)
     return found
+
+
+def _reach(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
+    """Return half the width of the 95 % confidence interval of each of the p fitted parameters, of shape
+    (p,). The arguments are those of ``clustered_covariance``.
+    """
+    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(linear, units)), 0.0))
+    return np.asarray(t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd)
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:
