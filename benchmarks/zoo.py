@@ -134,7 +134,7 @@ def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtoco
     """
     model = load_frozen(folder)
     learned = card_background(model, scans)
-    predictions = [Prediction.beside(learned, predict_frozen(model, scan)) for scan in scans]
+    predictions = [Prediction.beside(learned, scan, predict_frozen(model, scan)) for scan in scans]
     protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
     return protocol, score_model(model.name, scans, predictions, protocol)
 

@@ -80,7 +80,8 @@ def evaluate(
         ids = [scan.id for scan in scans]
         learned = card_background(frozen, scans) if background == "training" else None
         predictions = [
-            Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in progress(scans, "predicting")
+            Prediction.beside(learned, scan, predict_frozen(frozen, scan))
+            for scan in progress(scans, "predicting")
         ]
         protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
         result = Evaluation(

@@ -113,7 +113,7 @@ def expected(
         return Prediction(height_um)
     if background == "shared" and found.measurement is not None:
         return Prediction.seen(found.measurement, scan, height_um)
-    return Prediction.beside(found.background, height_um)
+    return Prediction.beside(found.background, scan, height_um)
 
 
 def fit_folder(cache: Path, name: str, key: str) -> Path:

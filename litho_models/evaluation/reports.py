@@ -43,7 +43,7 @@ def write_evaluation_report(
         page.note("Layouts with heights beyond the calibrated range were accepted (option extrapolate).")
     _errors(page, result, [scores], "Mean error over scans.", "headline.csv")
     page.paragraph(lock_box_text(result.split))
-    worst = int(np.nanargmax(list(scores.leading_of_scans_nm.values())))
+    worst = int(np.argmax(list(scores.leading_of_scans_nm.values())))
     _one_scan(page, "The worst scan", scans[worst], {scores.model: predictions_um[worst]}, result.nuisance)
     _numbers(page, result, [scores])
     return page.write(out)

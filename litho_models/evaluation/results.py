@@ -137,8 +137,8 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
     return {
         "first": first.model,
         "second": second.model,
-        "first_nm": first.mae_datum_free_nm,
-        "second_nm": second.mae_datum_free_nm,
+        "first_nm": first.leading_nm,
+        "second_nm": second.leading_nm,
         "difference_nm": paired.mean_nm,
         "low_nm": low,
         "high_nm": high,

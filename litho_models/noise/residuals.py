@@ -137,6 +137,7 @@ def _of_frozen(store: Store, folder: Path) -> tuple[str, dict[str, Array], Nuisa
     frozen.check_geometry(store.pitch_um, store.level_height_um)
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id not in store.locked_ids]
     learned = card_background(frozen, scans)
-    maps = {scan.id: Prediction.beside(learned, predict_frozen(frozen, scan)).map_um for scan in scans}
+    predictions = {scan.id: Prediction.beside(learned, scan, predict_frozen(frozen, scan)) for scan in scans}
+    maps = {scan: prediction.map_um for scan, prediction in predictions.items()}
     protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
     return frozen.name, maps, protocol, not trained_ids(frozen, store) & set(maps)

@@ -7,6 +7,7 @@ part of the printer and is not used in a design.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -57,6 +58,11 @@ def field_um(scan: PrintedScan) -> tuple[float, float]:
     return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um
 
 
+def usual_field_um(scans: Sequence[PrintedScan]) -> tuple[float, float]:
+    """Return the most frequent size (y, x) of the scans' fields, µm."""
+    return Counter(map(field_um, scans)).most_common(1)[0][0]
+
+
 def is_of_size(scan: PrintedScan, size_um: tuple[float, float]) -> bool:
     """Return whether a scan's field has the size (y, x) given in µm, within 1 %."""
     return bool(np.allclose(field_um(scan), size_um, rtol=_SAME_SIZE, atol=0))
@@ -66,18 +72,21 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
     """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
     All terms of policy ``full``, including offset and gain, are fitted to the valid pixels of each scan. The
-    background is the mean over the scans of the five smooth terms (tilt and bow).
+    background is the mean over the scans of the five smooth terms (tilt and bow). If the fields of the scans
+    differ in size, only the scans with the most frequent field size are used.
 
     Args:
-        scans: training scans, all of the same size.
+        scans: training scans.
         predictions_um: height that the model predicts for each scan, µm, as a map of shape (ny, nx). The maps
             are in the order of ``scans``.
     """
+    usual_um = usual_field_um(scans)
     coefficients = [
         fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]
         for scan, prediction in zip(scans, predictions_um, strict=True)
+        if is_of_size(scan, usual_um)
     ]
     x, y, xx, xy, yy = (NM_PER_UM * np.mean(coefficients, axis=0)[2:]).tolist()
     return Background(
-        x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=field_um(scans[0]), scans=len(scans)
+        x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=usual_um, scans=len(coefficients)
     )

@@ -7,14 +7,13 @@ chosen by cross-validation within the given scans.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
-from litho_models.scan_terms.background import field_um
+from litho_models.scan_terms.background import usual_field_um
 from litho_models.scan_terms.blocks import thinned
 from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import ALL, Block, Products, groupings
@@ -82,8 +81,7 @@ def learn_measurement(
         like: an earlier measurement model. If it is given, its levelling and parts are used, and only the
             coefficients of these parts are fitted again.
     """
-    usual_um = Counter(map(field_um, scans)).most_common(1)[0][0]
-    model = MeasurementModel(levelling="none", parts=[], field_um=usual_um, scans=0)
+    model = MeasurementModel(levelling="none", parts=[], field_um=usual_field_um(scans), scans=0)
     if scans[0].seen_by == "sem":
         return model
     pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]

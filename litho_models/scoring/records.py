@@ -4,7 +4,6 @@ two models.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -35,10 +34,13 @@ class Prediction(NamedTuple):
     background_um: Array | None = None
 
     @classmethod
-    def beside(cls, background: Background | None, height_um: Array) -> Prediction:
-        """Make a prediction from the height of a print and, if there is one, a learned background."""
-        ny, nx = height_um.shape
-        return cls(height_um, None if background is None else background.map_um((ny, nx)))
+    def beside(cls, background: Background | None, scan: PrintedScan, height_um: Array) -> Prediction:
+        """Make a prediction from the height of a print and, if there is one for fields of this size, a
+        learned background.
+        """
+        if background is None or not background.fits(scan):
+            return cls(height_um)
+        return cls(height_um, background.map_um(scan.shape))
 
     @classmethod
     def seen(cls, measurement: MeasurementModel, scan: PrintedScan, height_um: Array) -> Prediction:
@@ -146,11 +148,9 @@ class ModelScores(MetricValues, extra="ignore"):
     @property
     def leading_nm(self) -> float:
         """Return the leading error, by which models are ranked, nm. For films it is the mean shift of the
-        edges, which is infinite if there are no edges. For other scans it is the datum-free error of the
-        height.
+        edges. For other scans it is the datum-free error of the height.
         """
-        value = getattr(self, LEADING[self.seen_by])
-        return math.inf if value is None else float(value)
+        return float(getattr(self, LEADING[self.seen_by]))
 
     @property
     def leading_ci95_nm(self) -> Interval:
@@ -159,11 +159,8 @@ class ModelScores(MetricValues, extra="ignore"):
 
     @property
     def leading_of_scans_nm(self) -> dict[str, float]:
-        """Return the leading error of each scan, nm, keyed by scan id. The error is NaN if a film has no
-        edges.
-        """
-        values = {row.scan: getattr(row, LEADING[self.seen_by]) for row in self.scans}
-        return {scan: math.nan if value is None else value for scan, value in values.items()}
+        """Return the leading error of each scan, nm, keyed by scan id."""
+        return {row.scan: float(getattr(row, LEADING[self.seen_by])) for row in self.scans}
 
 
 class Paired(Record):

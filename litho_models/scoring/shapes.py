@@ -68,11 +68,21 @@ def similarity_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Arr
 def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> EdgePlacement:
     """Compare the measured edges of a scan with the predicted edges. The measured map without the per-scan
     terms is the prediction plus the residual.
+
+    If no edge of a film has a partner, the distances are the search distance, because the edges are at least
+    that far apart. They are 0 if neither map has an edge.
     """
-    heights, search_um = mid_step_heights_um(scan.levels, scan.level_height_um), SEARCH_UM
-    if scan.seen_by == "sem":
-        heights, search_um = np.array([film_edge_um(scan)]), FILM_SEARCH_PX * scan.pitch_um
-    return edge_placement(prediction_um + residual_um, prediction_um, heights, scan.pitch_um, search_um)
+    measured_um = prediction_um + residual_um
+    if scan.seen_by != "sem":
+        heights = mid_step_heights_um(scan.levels, scan.level_height_um)
+        return edge_placement(measured_um, prediction_um, heights, scan.pitch_um)
+    search_um = FILM_SEARCH_PX * scan.pitch_um
+    heights = np.array([film_edge_um(scan)])
+    found = edge_placement(measured_um, prediction_um, heights, scan.pitch_um, search_um)
+    if found.matched:
+        return found
+    missed_nm = NM_PER_UM * search_um if found.unmatched or found.unmatched_expected else 0.0
+    return found._replace(mean_nm=missed_nm, p95_nm=missed_nm)
 
 
 def structural_similarity(measured_um: Array, expected_um: Array) -> float | None:

@@ -68,6 +68,24 @@ def test_a_planted_bow_is_learned_whatever_each_scan_s_datum(scans):
     assert (learned.scans, learned.field_um) == (6, pytest.approx((12.8, 12.8)))
 
 
+def test_a_background_is_that_of_the_most_frequent_size(scans):
+    # The pieces have a part of the bow, which looks like another bow on their own size.
+    corner = (slice(0, 64), slice(0, 64))
+    pieces = [
+        replace(
+            one, mask_level=one.mask_level[corner], height_um=one.height_um[corner], valid=one.valid[corner]
+        )
+        for one in scans[:2]
+    ]
+    both = [*pieces, *scans]
+    assert learn_background(both, [truth(scan) for scan in both]) == learn_background(
+        scans, [truth(scan) for scan in scans]
+    )
+    learned = some_background()
+    assert Prediction.beside(learned, pieces[0], truth(pieces[0])).background_um is None
+    assert Prediction.beside(learned, scans[0], truth(scans[0])).background_um is not None
+
+
 def test_a_background_has_zero_mean_and_is_the_sum_of_its_terms():
     background = some_background()
     field = background.map_um((90, 110))

@@ -14,12 +14,13 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.store import PrintedScan
 from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.results import compare
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.models import build_model
 from litho_models.models.parts import etch, hill, illuminate, project
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.films import film_errors
-from litho_models.scoring.records import Prediction
+from litho_models.scoring.records import Prediction, paired_scores
 from litho_models.scoring.scores import score_model
 from tests.litho_models.prints import make_scans, write_store
 
@@ -50,6 +51,17 @@ def test_a_disc_that_is_too_large_is_off_by_the_difference_of_radii() -> None:
     assert scores.metrics["area_error_percent"] == pytest.approx(100 * (31.5**2 / 30**2 - 1), abs=0.8)
     assert scores.metrics["features_missing"] == scores.metrics["features_merged"] == 0
     assert scores.ssim is None
+
+
+def test_a_film_without_a_predicted_edge_is_off_by_the_search_distance() -> None:
+    scans, blank = [_scan(_disc(30), id="F1"), _scan(_disc(0), id="F2")], _disc(0)
+    policy = NuisanceProtocol.of_policy("none")
+    missed = score_model("blank", scans, [Prediction(blank)] * 2, policy)
+    found = score_model("disc", scans, [Prediction(_disc(30)), Prediction(blank)], policy)
+    # Edges are matched within 10 px of 4 nm. The second scan has no edge, in agreement with both models.
+    assert missed.leading_of_scans_nm == {"F1": pytest.approx(40), "F2": 0}
+    assert found.leading_nm == pytest.approx(0, abs=1e-3)
+    assert paired_scores(missed, found).mean_nm == pytest.approx(20, abs=1e-3)
 
 
 @pytest.mark.parametrize("instrument", ["afm", "profilometer", "confocal"])
@@ -153,6 +165,10 @@ def test_a_benchmark_of_films_is_led_by_their_edges(tmp_path: Path) -> None:
     assert blurred.edge_mean_nm is not None
     shift = identity.edge_mean_nm - blurred.edge_mean_nm
     assert result.paired[0].mean_nm == pytest.approx(shift)
+    table = compare(tmp_path / "out", tmp_path / "out")
+    assert (table["first_nm"] - table["second_nm"]).to_numpy() == pytest.approx(
+        table["difference_nm"].to_numpy()
+    )
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "mean error of the edges over" in page
     assert "features missing" in page
