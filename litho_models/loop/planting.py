@@ -61,7 +61,8 @@ def plant(
         freed = without_terms(scan.at_sample(added)[:, None], scan, here)
         squares.append(float(np.mean(freed**2)))
     again = close_again(changed)
-    cause = next((one for one in again.named.causes if effect.name in (one.name, *one.alike)), None)
+    causes = filter(again.needed_by_all, again.named.causes)
+    cause = next((one for one in causes if effect.name in (one.name, *one.alike)), None)
     named = [] if cause is None else [cause.name, *cause.alike]
     found = again.final.twin.values().get(effect.name, {}).get(amplitude)
     return Planted(

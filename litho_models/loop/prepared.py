@@ -23,6 +23,8 @@ from litho_models.scan_terms.blocks import thinned
 # If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan. The
 # quadrant is predicted with a margin.
 LARGE_PX = 400
+# A scan, or the part of it that is fitted, with fewer measured pixels says too little.
+FEWEST_PIXELS = 1024
 
 
 @dataclass(frozen=True)
@@ -138,13 +140,20 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
     """If a scan is large, choose the quadrant that fits and screening use. Successive scans use different
-    quadrants, so that together they cover the whole field.
+    quadrants, so that together they cover the whole field. A quadrant with few measured pixels is replaced by
+    the one that has most.
     """
     shape, pitch = scan.stored.shape, scan.stored.pitch_um
     if min(shape) < LARGE_PX:
         return scan
-    halves = zip(shape, (number % 2, number // 2 % 2), strict=True)
-    cut, own = zip(*[_half(size, bool(second)) for size, second in halves], strict=True)
+    usable = scan.usable & _inner(shape)
+    parts = [
+        tuple(_half(size, bool(second)) for size, second in zip(shape, (one % 2, one // 2), strict=True))
+        for one in range(4)
+    ]
+    counts = [np.count_nonzero(usable[tuple(own for _, own in part)]) for part in parts]
+    chosen = number % 4 if counts[number % 4] >= FEWEST_PIXELS else int(np.argmax(counts))
+    cut, own = zip(*parts[chosen], strict=True)
     mine = np.zeros(shape, bool)
     mine[own] = True
     sigma_um = scan.stored.height_sigma_um
@@ -152,7 +161,7 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
         scan.stored,
         mask_level=scan.stored.mask_level[cut],
         height_um=scan.stored.height_um[cut],
-        valid=(mine & scan.usable & _inner(shape))[cut],
+        valid=(mine & usable)[cut],
         height_sigma_um=None if sigma_um is None else sigma_um[cut],
     )
     y_um, x_um = (

@@ -48,8 +48,8 @@ class ErrorRow(Record):
             not scored.
         k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
-            not only the fits but also all choices (such as which effects to add) were made without the
-            held-out scans.
+            not only the fits but also all choices but that of the base model (such as which effects to add)
+            were made without the held-out scans.
         printer_numbers: number of fitted parameters of the printer model.
         measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
             number is largest.

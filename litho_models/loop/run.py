@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,8 +71,8 @@ def close_loop(
         base_settings: settings of a small base model, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds. Each scan is predicted by models that were fitted without the scans of its
             fold.
-        nested: ``folds`` (or ``prints``) to repeat all choices once without each fold (or print), and to
-            judge these choices on the fold (or print) that was left out.
+        nested: ``folds`` (or ``prints``) to repeat all choices but that of the base model once without each
+            fold (or print), and to judge these choices on the fold (or print) that was left out.
         inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to test
             whether the loop finds it.
         open_lock_box: whether to score the corrected model also on the locked scans.
@@ -113,16 +114,15 @@ def close_loop(
                 f"--nested with {base}", got="a base that is not refitted", wanted="the name of a small model"
             )
         closed = close(study, bases)
-        own = {closed.base_name: bases[closed.base_name]}
 
-        def close_again(scans: Sequence[PrintedScan]) -> Closed:
-            return close(Study.dealt(scans, folds, seed, places), own)
+        def close_again(scans: Sequence[PrintedScan], named: Collection[str] = bases.keys()) -> Closed:
+            return close(Study.dealt(scans, folds, seed, places), {name: bases[name] for name in named})
 
         models = HeldOut(closed)
         errors, left_out_nm = models.errors(), models.left_out_nm()
         planted = [plant(*one, closed, close_again) for one in wanted]
         if nested:
-            errors += _nested(study, nested, close_again)
+            errors += _nested(study, nested, partial(close_again, named=[closed.base_name]))
         if open_lock_box and locked:
             errors += errors_of_others([(models, locked)], locked, "locked", seed)
         alone: list[ScanFinding] = []
@@ -173,8 +173,8 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
-    """Repeat all choices once without each fold (or print), and judge these choices on the fold (or print)
-    that was left out. Return the errors on all scans.
+    """Repeat all choices but that of the base once without each fold (or print), and judge these choices on
+    the fold (or print) that was left out. Return the errors on all scans.
     """
     scans = study.stored
     ids = [scan.id for scan in scans]

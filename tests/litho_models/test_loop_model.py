@@ -248,6 +248,15 @@ def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(stud
     )
 
 
+def test_a_quadrant_without_measured_pixels_is_replaced() -> None:
+    stored = blank_scans(1, LARGE_PX)[0]
+    valid = np.ones(stored.shape, bool)
+    valid[: LARGE_PX // 2, : LARGE_PX // 2] = False
+    (scan,) = prepare_scans([replace(stored, valid=valid)])
+    assert scan.window.context.origin_px != (0, 0)
+    assert scan.window.sample.size > 5000
+
+
 def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
     scans = prepare_scans(blank_scans(4, LARGE_PX))
     assert len({scan.window.context.origin_px for scan in scans}) == 4

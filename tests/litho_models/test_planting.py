@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ def closed_on(scans: Sequence[PrintedScan]) -> Closed:
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
     found = search(base, [get_effect(LAW), get_effect("height-power-2")])
-    return SimpleNamespace(base=base, given=study, named=found, final=found.state)  # type: ignore[return-value]
+    return Closed("affine-mtf", {}, base, base, found, found, found, {}, {})
 
 
 def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they_were() -> None:
