@@ -35,6 +35,7 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
+_FEWEST_PX = 1024
 Nested = Literal["folds", "prints"]
 # A function that receives a closed loop and its record, and returns the record to write and a list of further
 # records to write.
@@ -159,15 +160,21 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
     Raises:
         InputError: there are fewer than two scans for development.
     """
-    scans = store.scans()
-    dropped = [scan.id for scan in scans if np.count_nonzero(scan.usable) < 1024]
-    usable = [scan for scan in scans if scan.id not in dropped]
+    usable, dropped = measured_scans(store)
     locked = [scan for scan in usable if scan.id in store.locked_ids]
     development = [scan for scan in usable if scan.id not in store.locked_ids]
     if len(development) < 2:
         got = f"{len(development)} that can be used and are not locked"
         raise InputError("scans to close the loop on", got=got, wanted="at least 2")
-    return development, locked, [f"{one}: fewer than 1024 measured pixels" for one in dropped]
+    return development, locked, dropped
+
+
+def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
+    """Return two lists: the scans with enough measured pixels, and texts that name the other scans."""
+    scans = store.scans()
+    few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < _FEWEST_PX]
+    usable = [scan for scan in scans if scan.id not in few]
+    return usable, [f"{one}: fewer than {_FEWEST_PX} measured pixels" for one in few]
 
 
 def _nested(

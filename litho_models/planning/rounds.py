@@ -71,25 +71,30 @@ def close_loop(
             printer, or if the orientation of a scan differs from the one that its dataset card states.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
-    new = [scan for one in further for scan in new_scans(first, one)]
+    checked = [new_scans(first, one) for one in further]
+    new = [scan for scans, _ in checked for scan in scans]
+    dropped = [text for _, texts in checked for text in texts]
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
         open_ = open_questions(closed, result)
         if new:
             result = with_decisions(result, open_, decide(closed, open_, new))
+            left_out = {"dropped": [*result.run.dropped, *dropped]}
+            result = result.model_copy(update={"run": result.run.model_copy(update=left_out)})
         return result, [open_]
 
     used = [one.sha256 for one in further]
     return run.close_loop(store, out, further=asked, decided_by=used, **settings)
 
 
-def new_scans(first: Store, store: Store) -> list[PrintedScan]:
-    """Return the scans of a further store, after two checks: the store must be of the same printer as the
-    first store, and the scans must have the orientation that the dataset card states.
+def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]:
+    """Return the scans of a further store that have enough measured pixels, and texts that name the other
+    scans. Before, check that the store is of the same printer as the first store, and that these scans have
+    the orientation that the dataset card states.
 
     Raises:
-        InputError: the store is of another printer, its prints were planned for another dataset, or a scan
-            has another orientation than the dataset card states.
+        InputError: the store is of another printer, its prints were planned for another dataset, none of its
+            scans has enough measured pixels, or a scan has another orientation than the dataset card states.
     """
     for name in ("pitch_um", "level_height_um", "levels"):
         if getattr(store, name) != getattr(first, name):
@@ -106,7 +111,11 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
             wanted=f"prints planned for {first.path}, {first.sha256[:12]}…",
             hint="the first store must be the dataset for which these prints were planned",
         )
-    scans = store.scans()
+    scans, dropped = run.measured_scans(store)
+    if not scans:
+        raise InputError(
+            f"scans of {store.path} to decide questions", got="none that can be used", wanted="at least 1"
+        )
     for scan in scans:
         stated = round((scan.turned_deg or 0.0) / 90)
         # Only odd multiples of 90° are compared. Registration shows whether a print was rotated by 90°, but
@@ -118,7 +127,7 @@ def new_scans(first: Store, store: Store) -> list[PrintedScan]:
                 wanted="the same rotation in the card",
                 hint="correct the column turned_deg of the card's table, and build the store again",
             )
-    return scans
+    return scans, dropped
 
 
 def decide(closed: Closed, open_: OpenQuestions, new: Sequence[PrintedScan]) -> list[Decision]:

@@ -455,6 +455,12 @@ def second_round(
     return scans
 
 
+def unmeasured(scan: PrintedScan) -> PrintedScan:
+    """Return a scan of another print, in which almost no pixel was measured."""
+    few = np.arange(scan.valid.size).reshape(scan.shape) < 1000
+    return replace(scan, id="N9F1", print_id="9", valid=few)
+
+
 def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Judge:
     """Return a judge that knows the new scans and four scans of the first round, which have these effects."""
     first = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=4, size_px=64)
@@ -483,7 +489,8 @@ def test_two_stores_become_a_result_a_model_and_a_plan(
     """Check two rounds of a loop. The strength of the effect is known to differ between groups of scans."""
     monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
     first = write_store(tmp_path / "first.zarr", by_order())
-    second = write_store(tmp_path / "second.zarr", second_round(5, SLOPE, "microscope"))
+    new = second_round(5, SLOPE, "microscope")
+    second = write_store(tmp_path / "second.zarr", [*new, unmeasured(new[0])])
     result = close_loop(first, tmp_path / "loop", new_prints=[second], base="affine-mtf", folds=3)
     assert CloseLoop.read(tmp_path / "loop") == result
     asked = OpenQuestions.read(tmp_path / "loop").questions
@@ -493,6 +500,7 @@ def test_two_stores_become_a_result_a_model_and_a_plan(
     # Multiples such as 0.75 and 1.25 would give a spread of half or more.
     assert question.spread < 0.2
     assert [one.left for one in result.decisions] == [[AS_MICROSCOPE]]
+    assert result.run.dropped == ["N9F1: fewer than 1024 measured pixels"]
     assert [(one.name, one.role) for one in result.effects] == [("slope-thinning", "measurement")]
     card = ModelCard.read(tmp_path / "loop" / "model")
     assert list(card.measurement_effects) == ["slope-thinning"]
@@ -745,6 +753,20 @@ def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: 
     store.__dict__["manifest"] = {"card": {"plan": {"dataset_sha256": "a" * 64}}}
     with pytest.raises(InputError, match="planned for dataset aaaaaaaaaaaa"):
         new_scans(first, store)
+
+
+def test_new_scans_that_show_almost_nothing_are_left_out_and_named(tmp_path: Path) -> None:
+    from litho_data.store import open_store
+
+    first = open_store(write_store(tmp_path / "first.zarr", blank_scans(2, 64)))
+    new = blank_scans(3, 64)
+    store = open_store(write_store(tmp_path / "second.zarr", [*new, unmeasured(new[0])]))
+    scans, left_out = new_scans(first, store)
+    assert [scan.id for scan in scans] == [scan.id for scan in new]
+    assert left_out == ["N9F1: fewer than 1024 measured pixels"]
+    empty = open_store(write_store(tmp_path / "empty.zarr", [unmeasured(new[0])]))
+    with pytest.raises(InputError, match=r"scans of .*empty\.zarr.*none that can be used"):
+        new_scans(first, empty)
 
 
 def test_a_question_is_put_in_words() -> None:
