@@ -292,20 +292,22 @@ def _compare(
     """Compare the squared errors of two rivals (competing explanations) on the new scans.
 
     The squared errors are summed over blocks of pixels. Their difference is compared with its spread over the
-    blocks of a print and with its spread between prints.
+    blocks of a print and with its spread between prints. Blocks of scans of different sizes do not
+    correspond, so these scans are treated separately.
     """
-    by_print: dict[str, np.ndarray] = {}
+    by_print: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
     pixels, difference = 0, 0.0
     for scan, first, second in zip(new, *(left_nm[name] for name in pair), strict=True):
         pixels += int(np.isfinite(first).sum())
         difference += float(np.nansum((second - first) ** 2))
-        name = scan.stored.print_id
-        by_print[name] = by_print.get(name, 0.0) + _block_sums(second**2 - first**2)
+        key = scan.stored.print_id, first.shape
+        by_print[key] = by_print.get(key, 0.0) + _block_sums(second**2 - first**2)
     total = float(sum(sums.sum() for sums in by_print.values()))
     # The mean over the blocks of a print counts as the result of this print. The scatter of the blocks about
     # this mean counts as noise.
     noise = sum(sums.size * float(sums.var(ddof=1)) for sums in by_print.values())
-    sd = float(np.sqrt(noise + (question.spread * total) ** 2 / len(by_print)))
+    prints = len({name for name, _ in by_print})
+    sd = float(np.sqrt(noise + (question.spread * total) ** 2 / prints))
     form = pixels * (question.form_nm or 0.0) ** 2
     return Comparison(
         better=pair[total < 0],

@@ -71,6 +71,7 @@ from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import (
     base_model,
+    blank_scan,
     blank_scans,
     planted,
     search_little,
@@ -621,6 +622,24 @@ def test_an_error_of_the_form_decides_nothing_below_its_bound() -> None:
     assert judged(4.5, 40.0, 4.5).left == ["a"]
     without = [[one.z for one in judged(form_nm, 5.0, 0.0).comparisons] for form_nm in (None, 0.0)]
     assert without[0] == without[1]
+
+
+def test_scans_of_one_print_may_differ_in_size() -> None:
+    """Check a print that was scanned in two sizes. Its scans have the noise of two prints, but the spread
+    between prints is that of one print.
+    """
+    random = np.random.default_rng(5)
+    scans = [blank_scan(number, size_px) for number, size_px in ((0, 128), (1, 96), (2, 96))]
+    left = {name: [random.normal(0, sd, scan.shape) for scan in scans] for name, sd in (("a", 4), ("b", 8))}
+
+    def z_of(prints: str, spread: float) -> float:
+        own = [replace(scan, print_id=name) for scan, name in zip(scans, prints, strict=True)]
+        [found] = compared(slope_question(spread=spread), prepare_scans(own), left).comparisons
+        assert found.better == "a"
+        return found.z
+
+    assert z_of("111", 0.0) == pytest.approx(z_of("122", 0.0))
+    assert z_of("111", 1.0) < z_of("122", 1.0) < z_of("122", 0.0)
 
 
 def test_a_gain_counts_only_beyond_what_an_error_of_the_form_can_cause() -> None:
