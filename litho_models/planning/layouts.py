@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.layouts.patterns import checkerboard, line_space_sweep
 from litho_data.layouts.random_layout import quantise, random_layout
@@ -79,10 +80,20 @@ class Limits:
         """Derive the limits from earlier prints. The lowest and the highest allowed level are those that
         still cover at least a thousandth of the area of these prints. Structures must not be finer than those
         in these prints.
+
+        Raises:
+            InputError: every earlier layout has only one level, or nearly all of their area has the same one.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
         known = levels[share >= _RARE].tolist()
+        if not open_.cutoff_per_um or known[0] == known[-1]:
+            raise InputError(
+                "layouts of the earlier prints",
+                got="a single level in each of them",
+                wanted="layouts in which the level varies",
+                hint="print random layouts, and close the loop on these prints",
+            )
         mean = float(share @ levels)
         sd = float(np.sqrt(share @ (levels - mean) ** 2))
         return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)

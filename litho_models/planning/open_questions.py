@@ -73,9 +73,13 @@ def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
 
 
 def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
-    """Return the frequency, cycles/µm, below which 95 % of the spectral power of the layouts lies."""
-    first, layouts = scans[0], [scan.mask_level for scan in scans]
-    if min(first.shape) < _SMALLEST_PX:
+    """Return the frequency, cycles/µm, below which 95 % of the spectral power of the layouts lies. Layouts
+    of a single level have no power. If all layouts are of this kind, return 0.
+    """
+    first, layouts = scans[0], [scan.mask_level for scan in scans if np.ptp(scan.mask_level)]
+    if not layouts:
+        return 0.0
+    if min(min(level.shape) for level in layouts) < _SMALLEST_PX:
         return 0.05 / first.pitch_um
     known = layout_statistics(layouts, levels=first.levels, pitch_um=first.pitch_um)
     return known.frequency_per_um[int(np.searchsorted(np.cumsum(known.power_share), _POWER_KNOWN))]

@@ -175,7 +175,8 @@ class OpenQuestions(Result):
     which limits how well these questions can be decided.
 
     ``level_share`` contains, for each level, the fraction of earlier layouts that it covers.
-    ``cutoff_per_um`` is the spatial frequency of the finest structures in these layouts, cycles/µm.
+    ``cutoff_per_um`` is the spatial frequency of the finest structures in these layouts, cycles/µm, or 0 if
+    every layout has only one level.
     ``write_field_um`` is the width of the write field, or None if it is unknown.
     """
 

@@ -110,8 +110,8 @@ def next_print(
         report: function that receives the progress messages.
 
     Raises:
-        InputError: ``loop`` contains no closed loop, there is no print or the prints are too small, or
-            ``out`` contains a plan with other settings.
+        InputError: ``loop`` contains no closed loop, the layouts of the earlier prints have only one level,
+            there is no print or the prints are too small, or ``out`` contains a plan with other settings.
     """
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():

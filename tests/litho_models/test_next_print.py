@@ -43,7 +43,7 @@ from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
-from litho_models.planning.open_questions import _Asking, _owners, _question
+from litho_models.planning.open_questions import _Asking, _cutoff_per_um, _owners, _question
 from litho_models.planning.questions import (
     NoiseSpectrum,
     OpenQuestions,
@@ -311,6 +311,20 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
 def test_a_small_print_can_start_from_layouts_as_coarse_as_the_prints_so_far() -> None:
     coarse = replace(Limits.of(opened([]), 0.1), cutoff_per_um=0.25)
     assert all(np.ptp(level) > 0 for _, level in starts(64, coarse, 0))
+
+
+def test_layouts_of_a_single_level_have_no_structure_and_no_plan(tmp_path: Path) -> None:
+    varied = blank_scans(2, 64)
+    flat = [replace(scan, mask_level=np.full_like(scan.mask_level, 6)) for scan in blank_scans(2, 32)]
+    assert _cutoff_per_um([*flat, *varied]) == _cutoff_per_um(varied) > 0
+    assert _cutoff_per_um([*varied, *blank_scans(2, 32)]) == _cutoff_per_um(blank_scans(2, 32))
+    assert _cutoff_per_um(flat) == 0
+    one_level = [float(level == 6) for level in range(13)]
+    for number, facts in enumerate(({"cutoff_per_um": 0.0}, {"level_share": one_level})):
+        loop = closed_loop(tmp_path / str(number), [slope_question()])
+        opened([slope_question()]).model_copy(update=facts).write(loop)
+        with pytest.raises(InputError, match="layouts of the earlier prints, got a single level in each"):
+            next_print(loop, tmp_path / "plan", prints=2, field_um=6.4, steps=1)
 
 
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
