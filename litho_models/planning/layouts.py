@@ -33,8 +33,8 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# A level that covers less than this fraction of earlier prints counts as unknown to the models. Planned
-# prints use only the range between the lowest and the highest known level.
+# The lowest and the highest levels that together cover less than this fraction of earlier prints count as
+# unknown to the models. Planned prints use only the levels between them.
 _RARE = 1e-3
 # The mean and the standard deviation of the levels may differ from those of earlier prints. There is no
 # penalty as long as the sum of these two differences, in levels, does not exceed this value.
@@ -77,17 +77,18 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Derive the limits from earlier prints. The lowest and the highest allowed level are those that
-        still cover at least a thousandth of the area of these prints. Structures must not be finer than those
-        in these prints.
+        """Derive the limits from earlier prints. The lowest allowed level and all levels below it cover at
+        least a thousandth of the area of these prints, and so do the highest allowed level and all levels
+        above it. Structures must not be finer than those in these prints.
 
         Raises:
             InputError: every earlier layout has only one level, or nearly all of their area has the same one.
         """
         share = np.array(open_.level_share)
         levels = np.arange(len(share))
-        known = levels[share >= _RARE].tolist()
-        if not open_.cutoff_per_um or known[0] == known[-1]:
+        lowest = int(np.argmax(np.cumsum(share) >= _RARE))
+        highest = len(share) - 1 - int(np.argmax(np.cumsum(share[::-1]) >= _RARE))
+        if not open_.cutoff_per_um or lowest == highest:
             raise InputError(
                 "layouts of the earlier prints",
                 got="a single level in each of them",
@@ -96,7 +97,7 @@ class Limits:
             )
         mean = float(share @ levels)
         sd = float(np.sqrt(share @ (levels - mean) ** 2))
-        return cls(known[0], known[-1], open_.cutoff_per_um, pitch_um, mean, sd)
+        return cls(lowest, highest, open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
         """Low-pass filter unrestricted values and clip them to the range of the levels. The result contains

@@ -327,6 +327,19 @@ def test_layouts_of_a_single_level_have_no_structure_and_no_plan(tmp_path: Path)
             next_print(loop, tmp_path / "plan", prints=2, field_um=6.4, steps=1)
 
 
+@pytest.mark.parametrize("finer", [1, 3, 400])
+def test_finer_levels_leave_the_range_of_heights(finer: int) -> None:
+    """Check prints that use the lowest and the highest of 13 levels too rarely, each divided into finer
+    levels.
+    """
+    share = np.array([0.0005, *[0.999 / 11] * 11, 0.0005])
+    fine = np.repeat(share / finer, finer).tolist()
+    found = Limits.of(opened([]).model_copy(update={"level_share": fine}), 0.1)
+    # The range starts inside the second level from either end, where the sum of the shares reaches 0.001.
+    assert finer <= found.lowest <= finer + 0.006 * finer
+    assert found.highest == 13 * finer - 1 - found.lowest
+
+
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
     start = first_layout(limits)
     soft = climb(rivalry, start, TURNED, limits, steps=10)
