@@ -20,9 +20,15 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# If the ratio of the smallest to the largest eigenvalue of the normal matrix is below this limit, noise and
-# rounding in double precision prevent the separation of background and structure.
+# Rounding in double precision leaves a direction of the fit undetermined if the ratio of its eigenvalue to
+# the largest eigenvalue of the normal matrix is below this limit. The background may still be well
+# determined: for example, if all pixels near two knots have the same level, only the response at these knots
+# is undetermined.
 _SINGULAR = 1e-9
+# The background is refused if noise shifts it by this many times more than it would without a layout.
+_MOST_LOSS = 1000.0
+# The response has one knot per level, but not more than this number of intervals between knots.
+_MOST_INTERVALS = 64
 _ROWS_AT_ONCE = 64
 _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _LEAST_INSIDE = 0.25
@@ -42,10 +48,11 @@ def level_layout_aware(
     """Fit the background and the printed structure together, and subtract only the background.
 
     The least-squares model is z = sum_pq c_pq x^p y^q + g(blurred level), where g, the height as a function
-    of the level, is a piecewise linear function with one freely fitted value per level. A polynomial fit
-    without g would treat the slope of the printed structure as background. The datum (the unknown zero height
-    of the scan) is part of g. The subtracted polynomial therefore has no free constant term, and its mean
-    over the fitted pixels is zero.
+    of the level, is a piecewise linear function with one freely fitted value per level. If there are more
+    than 65 levels, 65 values at evenly spaced levels are fitted. A polynomial fit without g would treat the
+    slope of the printed structure as background. The datum (the unknown zero height of the scan) is part of
+    g. The subtracted polynomial therefore has no free constant term, and its mean over the fitted pixels is
+    zero.
 
     Args:
         z: heights in any unit, shape (ny, nx).
@@ -123,6 +130,24 @@ def layout_in_scan_frame(
     return levels.reshape(scan_shape)
 
 
+def level_hats(level: Array, top: int) -> Array:
+    """Return the hat functions whose weighted sums are the piecewise linear functions of the level.
+
+    Each hat is 1 at its own knot and 0 at all others. There is one knot per level from 0 to ``top``, or 65
+    evenly spaced knots if there are more levels.
+
+    Args:
+        level: levels, which need not be integers, shape (n,).
+        top: highest knot; it is not below the highest level.
+
+    Returns:
+        An array of shape (knots, n).
+    """
+    step = max(1.0, top / _MOST_INTERVALS)
+    knots = step * np.arange(min(top, _MOST_INTERVALS) + 1)
+    return np.stack([np.clip(1 - np.abs(level - knot) / step, 0.0, None) for knot in knots])
+
+
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
     """Fit background and structure together. Return the Legendre coefficients of the background, and the sum
     of squares that the fit explains with a minus sign, so that the best fit has the lowest value.
@@ -132,10 +157,12 @@ def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[A
     normal, right = normal[np.ix_(used, used)], right[used]
     scale = 1 / np.sqrt(np.diag(normal))
     values, directions = np.linalg.eigh(normal * np.outer(scale, scale))
-    if values[0] < _SINGULAR * values[-1]:
+    values = np.maximum(values, _SINGULAR * values[-1])
+    loss = np.sqrt((directions[: len(terms)] ** 2 / values).sum(axis=1).max())
+    if loss > _MOST_LOSS:
         raise InputError(
             "the layout cannot be told from the background",
-            got=f"condition {values[-1] / max(values[0], np.finfo(float).tiny):.1g}",
+            got=f"an error {loss:.1g} times that without a layout",
             wanted="a lower degree or a layout with independent structure",
         )
     solution = scale * (directions @ ((directions.T @ (scale * right)) / values))
@@ -153,15 +180,14 @@ def _normal_equations(z: Array, blurred: Array, fitted: Array, terms: Terms) -> 
     basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))
     basis_y = np.polynomial.legendre.legvander(y, max(q for _, q in terms))
     top = max(int(np.ceil(np.nanmax(blurred))), 0)
-    size = len(terms) + top + 1
+    size = len(terms) + len(level_hats(np.zeros(1), top))
     normal, right = np.zeros((size, size)), np.zeros(size)
     for start in range(0, z.shape[0], _ROWS_AT_ONCE):
         strip = slice(start, start + _ROWS_AT_ONCE)
         inside = fitted[strip]
         columns = [np.multiply.outer(basis_y[strip, q], basis_x[:, p])[inside] for p, q in terms]
         level = blurred[strip][inside]
-        columns += [np.clip(1 - np.abs(level - knot), 0.0, None) for knot in range(top + 1)]
-        design = np.stack(columns)
+        design = np.concatenate([np.stack(columns), level_hats(level, top)])
         normal += design @ design.T
         right += design @ z[strip][inside]
     return normal, right

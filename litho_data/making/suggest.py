@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from litho_data.cards.listing import list_fields
 from litho_data.foundation import Array, InputError, atomic_file
+from litho_data.level.layout_aware import level_hats
 from litho_data.level.recipe import Recipe
 from litho_data.making.jobs import FieldJob, field_jobs
 from litho_data.making.operations import load_recipe
@@ -182,8 +183,7 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
     level = ndimage.gaussian_filter(np.where(known, layout, 0.0), _BLUR_PX)
     y, x = np.indices(layout.shape) // _BLOCK_PX
     fitted = inner & ((y + x) % 2 == 0)
-    knots = np.arange(int(level[inner].max()) + 2)
-    design = np.clip(1 - np.abs(level[inner][:, None] - knots), 0, None)
+    design = level_hats(level[inner], int(level[inner].max()) + 1).T
     response, *_ = np.linalg.lstsq(design[fitted[inner]], height_um[fitted], rcond=None)
     off = (height_um[inner] - design @ response)[~fitted[inner]]
     return float(np.sqrt(np.mean(off**2)))

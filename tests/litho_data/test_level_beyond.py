@@ -141,6 +141,27 @@ def test_layout_aware_levelling_works_for_a_response_that_is_not_linear() -> Non
     assert slope_error(aware.removed, tilt) < SLOPE_TOLERANCE
 
 
+def test_the_background_is_found_equally_well_for_any_number_of_levels() -> None:
+    # The print depends on the random levels only, not on the number of steps into which they are divided.
+    smooth, _ = printed(12)
+    noise, tilt = tilted_substrate(13)
+    errors = []
+    for levels in (64, 256, 65_536):
+        fine = np.round((levels - 1) * ndimage.gaussian_filter(smooth, 1.0) / 12)
+        z = noise + 1.2 / (levels - 1) * ndimage.gaussian_filter(fine, 2.0)
+        errors.append(slope_error(level_layout_aware(z, layout_level=fine, blur_px=2.0).removed, tilt))
+    assert max(errors) < SLOPE_TOLERANCE
+    assert max(errors) == pytest.approx(min(errors), rel=0.1)
+
+
+def test_levels_between_which_there_are_no_pixels_do_not_prevent_levelling() -> None:
+    # Straight edges along y blur to a few levels only. The response between the other levels is unknown.
+    noise, tilt = tilted_substrate(14)
+    stripes = np.broadcast_to(12.0 * (np.arange(SHAPE[1]) // 16 % 2), SHAPE)
+    z = noise + 0.1 * ndimage.gaussian_filter(stripes, 2.0)
+    assert slope_error(level_layout_aware(z, layout_level=stripes).removed, tilt) < SLOPE_TOLERANCE
+
+
 def test_layout_aware_levelling_with_gaps_and_mask() -> None:
     level, structure = printed(9)
     noise, tilt = tilted_substrate(10)
@@ -161,6 +182,9 @@ def test_a_layout_that_is_a_ramp_cannot_be_told_from_tilt() -> None:
     ramp = np.broadcast_to(np.arange(SHAPE[1]) / 20.0, SHAPE)
     with pytest.raises(InputError, match="the layout cannot be told from the background"):
         level_layout_aware(z, layout_level=ramp, blur_px=0.0)
+    # Whole levels differ from the ramp by their rounding, which is less and less as their number grows.
+    with pytest.raises(InputError, match=r"an error \de\+03 times that without a layout"):
+        level_layout_aware(z, layout_level=np.round(40 * ramp), blur_px=2.0)
     for wrong, message in ((np.zeros((3, 3)), "shape"), (np.full(SHAPE, np.nan), "covers no measured pixel")):
         with pytest.raises(InputError, match=message):
             level_layout_aware(z, layout_level=wrong)
