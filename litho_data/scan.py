@@ -28,6 +28,8 @@ class Scan:
         header: all other entries of the file's header, as strings.
         source: path of the file.
         format: name of the reader that read the file.
+        sized_by_file: whether the file states the size. If not, the pitch follows from a size that the caller
+            stated.
         notes: warnings about the heights, which everyone who uses them should know.
 
     Raises:
@@ -45,6 +47,7 @@ class Scan:
     header: dict[str, str] = field(default_factory=dict)
     source: str = ""
     format: str = ""
+    sized_by_file: bool = False
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from litho_data.cards.card import Card, with_tip
+from litho_data.cards.card import with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.commands.progress import progress, say
 from litho_data.foundation import Facts, InputError
@@ -143,7 +143,7 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
                 partial.discard()
             raise
         try:
-            for scan_id, reason in _odd_pixels(records, source.card).items():
+            for scan_id, reason in _odd_pixels(records, source.jobs).items():
                 _leave_out(scan_id, reason, records, skipped, partial)
             prints = prints_of(records_of_use(list(records.values())), partial.samples)
             for scan_id, reason in odd_heights(prints).items():
@@ -229,18 +229,19 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
     return named
 
 
-def _odd_pixels(records: Mapping[str, Facts], card: Card) -> dict[str, str]:
+def _odd_pixels(records: Mapping[str, Facts], jobs: Sequence[Job]) -> dict[str, str]:
     """Find the scans whose pixels have another aspect ratio than the pixels of most scans. The result maps
-    the ids of these scans to the reason for leaving them out. It is empty if the card does not state the size
-    of the scans.
+    the ids of these scans to the reason for leaving them out. Only scans of the dataset whose size neither
+    their file nor the card's table states are compared.
 
     A text file that lacks its last rows can still be read as a matrix. However, the pixels then seem too long
     along y, because the side length that the card states is divided by too few rows.
     """
-    if card.scan.size_um is None:
-        return {}
+    sized_by_card = {job.id for job in jobs if isinstance(job, FieldJob) and "size_um" not in job.field.read}
     aspects = {
-        key: record["read"]["pitch_um"][0] / record["read"]["pitch_um"][1] for key, record in records.items()
+        record["id"]: record["read"]["pitch_um"][0] / record["read"]["pitch_um"][1]
+        for record in records_of_use(list(records.values()))
+        if record["id"] in sized_by_card and not record["read"]["sized_by_file"]
     }
     ordered = sorted(aspects.values())
     most = ordered[len(ordered) // 2] if ordered else 1.0

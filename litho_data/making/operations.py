@@ -93,6 +93,7 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     return arrays, {
         **notes,
         "pitch_um": list(scan.require_pitch()),
+        "sized_by_file": scan.sized_by_file,
         "reader": scan.format,
         "unit": scan.unit,
         "channel": scan.channel,
@@ -109,8 +110,8 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
     if grey.dtype.kind != "u" or grey.dtype.itemsize > 2:
         raise InputError(f"micrograph {files[0]}", got=str(grey.dtype), wanted="grey values of 8 or 16 bits")
     pitch_um = [size / length for size, length in zip(params["size_um"], grey.shape, strict=True)]
-    facts = {"pitch_um": pitch_um, "reader": "picture", "unit": "", "channel": "", "fast_axis": None}
-    return {"micrograph": grey.astype(np.uint16)}, {**facts, "header": {}}
+    facts = {"pitch_um": pitch_um, "sized_by_file": False, "reader": "picture", "unit": "", "channel": ""}
+    return {"micrograph": grey.astype(np.uint16)}, {**facts, "fast_axis": None, "header": {}}
 
 
 @_operation("find-edges", "micrograph", "making/contour.py")

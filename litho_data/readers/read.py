@@ -89,10 +89,11 @@ def read_scan(
         height = _to_um(values, factor)
         finite = height[np.isfinite(height)]
         ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
+        stated_size = chosen.size_um or _size_of_extent(chosen, stated_unit)
         HEIGHT_UM.require(f"heights in µm, converted from unit {stated_unit!r}", ends_um)
         return Scan(
             height_um=height,
-            pitch_um=_settle_pitch(chosen, size_um, stated_unit),
+            pitch_um=_settle_pitch(chosen, size_um, stated_size),
             name=file.stem,
             channel=chosen.name,
             unit=stated_unit,
@@ -101,6 +102,7 @@ def read_scan(
             header=chosen.header,
             source=str(path),
             format=reader.name,
+            sized_by_file=stated_size is not None,
             notes=(*notes, *filter(None, [extreme_note(values)])),
         )
 
@@ -204,8 +206,7 @@ def _to_um(values: Array, factor: float) -> Array:
     return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
 
 
-def _settle_pitch(channel: Channel, size_um: YX | None, unit: str) -> YX | None:
-    stated = channel.size_um or _size_of_extent(channel, unit)
+def _settle_pitch(channel: Channel, size_um: YX | None, stated: YX | None) -> YX | None:
     if size_um is not None:
         if np.shape(size_um) != (2,) or not all(np.isfinite(size) and size > 0 for size in size_um):
             raise InputError("size_um", got=size_um, wanted="two positive numbers (y, x) in µm")

@@ -19,6 +19,7 @@ from litho_data.making.operations import no_recipe
 from litho_data.making.result import BuildResult, report_folder
 from litho_data.provenance.history import read_steps, replay
 from litho_data.provenance.verify import verify
+from litho_data.readers.gsf import gsf_bytes
 from litho_data.store import open_store
 from litho_data.store.access import values_of
 from litho_data.store.partial import PartialStore, Piece, partial_store
@@ -120,6 +121,32 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     with pytest.raises(InputError, match="7 ids cannot be used"):
         build_dataset(card, tmp_path / "strict.zarr", strict=True)
     assert not [path for path in tmp_path.iterdir() if "strict" in path.name]
+
+
+def test_scans_that_state_their_own_size_may_have_pixels_of_another_shape(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=5)
+    card.write_text(
+        card.read_text().replace("{id}.txt", "{id}.*").replace('format = "text-matrix"', "")
+        + 'table = "table.csv"\n'
+    )
+    # Half as many lines over the same field: they are missing unless the file or the table states the size.
+    for scan_id in ("P12", "P21", "P22", "P31"):
+        text = tmp_path / "scans" / f"{scan_id}.txt"
+        lines = np.loadtxt(text).reshape(64, 2, 128).mean(axis=1)
+        if scan_id == "P12":
+            text.unlink()
+            text.with_suffix(".gsf").write_bytes(gsf_bytes(1e6 * lines, (0.2, 0.1)))
+        else:
+            np.savetxt(text, lines, delimiter="\t")
+    (tmp_path / "table.csv").write_text("id,use,size_um\nP21,,12.8\nP22,flat,\n")
+    for scan_id in ("P13", "P14"):  # two whole scans more, so that P31 differs from most
+        shutil.copy(tmp_path / "layouts" / "P11.tif", tmp_path / "layouts" / f"{scan_id}.tif")
+        shutil.copy(tmp_path / "scans" / "P11.txt", tmp_path / "scans" / f"{scan_id}.txt")
+
+    result = build_dataset(card, tmp_path / "prints.zarr")
+    assert (result.n_scans, result.n_references) == (5, 1)
+    assert [*result.skipped] == ["P31"]
+    assert "rows or columns are missing" in result.skipped["P31"]
 
 
 def test_the_manifest_does_not_depend_on_where_the_raw_files_lie(
