@@ -117,6 +117,7 @@ FilePatterns = Annotated[str | tuple[str, ...], AfterValidator(_file_patterns)]
 KnownFormat = Annotated[str, AfterValidator(_known_format)]
 KnownUnit = Annotated[str, AfterValidator(_known_unit)]
 InsidePath = Annotated[str, AfterValidator(_inside)]
+MissingMarks = tuple[Annotated[float, Field(strict=True)] | str, ...]
 
 
 class LayoutFiles(Record):
@@ -166,7 +167,7 @@ class ScanFiles(Record):
     fast_axis: Literal["x", "y"] | None = None
     full_scale_file: InsidePath | None = None
     levelled: bool = False
-    missing: tuple[Annotated[float, Field(strict=True)] | str, ...] | None = None
+    missing: MissingMarks | None = None
     instrument: Instrument = "afm"
 
     @model_validator(mode="after")
@@ -205,7 +206,8 @@ class Ids(Record):
 
 class Standard(Record):
     """A scan of a calibration standard, whose size is known. Options for reading the file that are not given
-    here are taken from the card's ``scan`` table.
+    here are taken from the card's ``scan`` table. As for scans, a unit or size from that table is used only
+    if the file states none.
     """
 
     file: InsidePath
@@ -214,6 +216,7 @@ class Standard(Record):
     unit: KnownUnit | None = None
     size_um: tuple[Length, Length] | None = None
     channel: str | None = None
+    missing: MissingMarks | None = None
 
 
 class Grating(Standard):

@@ -90,6 +90,8 @@ def standards_of(listing: Listing) -> Standards:
             )
         files.setdefault(listing.relative(path), path)
         size = one.size_um or card.scan.size_um
+        missing = card.scan.missing if one.missing is None else one.missing
+        defaults = {"defaults": True} if one.unit is None and one.size_um is None else {}
         standards.append(
             {
                 "scale": scale,
@@ -102,6 +104,8 @@ def standards_of(listing: Listing) -> Standards:
                     "unit": one.unit or card.scan.unit,
                     "size_um": list(size) if size else None,
                     "channel": one.channel or card.scan.channel,
+                    **({} if missing is None else {"missing": list(missing)}),
+                    **defaults,
                 },
             }
         )

@@ -18,6 +18,7 @@ from litho_data.making.day_tip import tip_of
 from litho_data.making.jobs import field_jobs
 from litho_data.making.operations import no_recipe
 from litho_data.provenance.history import history, replay
+from litho_data.readers.gsf import gsf_bytes
 from litho_data.roughness import axis_scales, find_step, find_wave
 from litho_data.tip.radius import peak_radius
 from tests.litho_data.campaigns import MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
@@ -129,6 +130,35 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "card.toml").write_text(card)
     build_dataset(folder / "card.toml", folder / "prints.zarr")
     return folder
+
+
+def test_a_standard_is_read_as_the_scans_are(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1, unit='"nm"')
+    plain = card.read_text()
+    grating = _grating(np.random.default_rng(6), "x", SCALE["x"], SCALE["y"], 1.0)
+    marked = grating.copy()
+    marked[3, 5] = marked[90, 100] = -9999.0
+    write_scan(tmp_path / "x.txt", grating)
+    np.savetxt(tmp_path / "marked.txt", marked, delimiter="\t")
+    (tmp_path / "x.gsf").write_bytes(gsf_bytes(grating, (PITCH_UM, PITCH_UM)))
+
+    def scale(name: str, of_scans: str = "", own: str = "") -> float:
+        known = f'file = "{name}"\nperiod_um = {PERIOD_UM}\nuncertainty_um = 0.0015\n'
+        scans = plain.replace("levelled = true", f"levelled = true\n{of_scans}")
+        card.write_text(f"{scans}[calibration.x]\n{known}{own}")
+        return calibrate(card)["x"].factor
+
+    own = 'size_um = [19.2, 19.2]\nunit = "m"\n'
+    true = scale("x.txt", own=own)
+    assert true == pytest.approx(SCALE["x"], rel=0.01)
+    # The file states another unit and size than the card does for the scans.
+    assert scale("x.gsf", own='format = "gsf"\n') == pytest.approx(true, rel=1e-4)
+    # It must agree with what the card states for this standard.
+    with pytest.raises(InputError, match="size_um"):
+        scale("x.gsf", own='format = "gsf"\nsize_um = [12.8, 12.8]\n')
+    marks, own = "missing = [-9999]\n", own.replace('"m"', '"um"')
+    assert scale("marked.txt", marks, own) == pytest.approx(true, rel=1e-3)
+    assert scale("marked.txt", "missing = []\n", own + marks) == scale("marked.txt", marks, own)
 
 
 def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Path) -> None:
