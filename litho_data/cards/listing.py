@@ -16,6 +16,7 @@ from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
 from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
 from litho_data.foundation import Facts, InputError
+from litho_data.readers.exported import sidecar_of
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
 # Time limit for the separate process that matches a card's regular expression against the ids.
@@ -89,7 +90,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     file = Path(card_path)
     card = load_card(file)
     folder = _data_folder(card, file, data_dir)
-    layouts = files_by_id(folder, card.layout.files)
+    layouts, sidecars = _without_sidecars(files_by_id(folder, card.layout.files))
     scans = files_by_id(folder, card.scan.files)
     table = _table(card, folder, file.parent)
     scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
@@ -104,7 +105,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         row = table.get(scan_id, {})
         use: Use = row.get("use", "dataset")
         files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
-        every[scan_id] = tuple(one for found in files for one in found)
+        every[scan_id] = (*layouts.get(scan_id, ()), *sidecars.get(scan_id, ()), *scans.get(scan_id, ()))
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
@@ -186,6 +187,20 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
             if hit and path.is_file() and path not in found.setdefault(hit["id"], []):
                 found[hit["id"]].append(path)
     return {scan_id: paths for scan_id, paths in found.items() if paths}
+
+
+def _without_sidecars(
+    layouts: Mapping[str, list[Path]],
+) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
+    """Separate the layouts from the sidecars of exported layouts, which a pattern such as ``{id}.*`` finds as
+    well. Return the paths of the layouts and those of their sidecars, each keyed by the layout's id.
+    """
+    sidecars = {
+        scan_id: [path for path in map(sidecar_of, paths) if path] for scan_id, paths in layouts.items()
+    }
+    known = {path for paths in sidecars.values() for path in paths}
+    left = {scan_id: [path for path in paths if path not in known] for scan_id, paths in layouts.items()}
+    return {scan_id: paths for scan_id, paths in left.items() if paths}, sidecars
 
 
 def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, Facts], card: Card) -> str:

@@ -5,6 +5,7 @@ Jobs are sent to other processes and computers, so they contain only paths and p
 """
 
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +16,7 @@ from litho_data.foundation import Array, Facts, InputError, file_sha256, record_
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.making.chain import Chain
 from litho_data.making.operations import OPERATIONS
+from litho_data.readers.exported import sidecar_of
 from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
@@ -86,8 +88,8 @@ class FieldJob:
         """Return the hash of everything that determines the result: files, parameters and code."""
         described = {**asdict(self.field), "scan": self.scan_name, "layout": self.layout_name}
         plan = [described, self.recipe, self.seed, self.card.model_dump(mode="json")]
-        own = (self.field.scan, self.field.layout, *self.standards.files.values())
-        files = [file_sha256(path) for path in own if path is not None]
+        own = (self.field.scan, *self._layout_files.values(), *self.standards.files.values())
+        files = [file_sha256(path) for path in own]
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
         return record_sha256([*plan, files, code])
 
@@ -203,7 +205,7 @@ class FieldJob:
         return {**grid, "edge_px": BORDER_PX} if self._surround in ("continues", "unknown") else grid
 
     def _read_layout(self, chain: Chain) -> None:
-        if self.field.layout is None or self.layout_name is None:
+        if not (files := self._layout_files):
             return
         params: dict[str, Any] = {"levels": self.card.layout.levels}
         for name in ("grey_per_level", "average_px"):
@@ -211,7 +213,18 @@ class FieldJob:
                 params[name] = value
         if self._surround == "substrate":
             params["bare_px"] = _BARE_PX
-        chain.run("read-layout", params, {self.layout_name: self.field.layout})
+        chain.run("read-layout", params, files)
+
+    @property
+    def _layout_files(self) -> dict[str, Path]:
+        """The files from which the levels follow, keyed by their recorded names. They are the layout and, if
+        the design package exported it, its sidecar.
+        """
+        if self.field.layout is None or self.layout_name is None:
+            return {}
+        sidecar = sidecar_of(self.field.layout)
+        beside = {f"{self.layout_name}.json": sidecar} if sidecar else {}
+        return {self.layout_name: self.field.layout, **beside}
 
     @property
     def _is_micrograph(self) -> bool:

@@ -28,20 +28,32 @@ def export_of(file: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is not the one that the sidecar describes, because its SHA-256 differs.
     """
-    path = file.with_name(f"{file.name}.json")
-    try:
-        says = json.loads(read_text(path))
-    except (OSError, ValueError):
-        return {}
-    if not isinstance(says, dict) or not str(says.get("schema")).startswith(_SCHEMA):
-        return {}
-    if says.get("file_sha256") != file_sha256(file):
+    says = _said(path := _beside(file))
+    if says and says.get("file_sha256") != file_sha256(file):
         raise InputError(
             f"layout {file}",
             got="a file that its sidecar does not describe",
             wanted=f"the file that {path} describes",
         )
     return says
+
+
+def sidecar_of(file: Path) -> Path | None:
+    """Return the path of the sidecar from which ``export_of`` reads, or None if the file has no sidecar."""
+    return path if _said(path := _beside(file)) else None
+
+
+def _beside(file: Path) -> Path:
+    return file.with_name(f"{file.name}.json")
+
+
+def _said(path: Path) -> dict[str, Any]:
+    """Return the content of a sidecar. The result is empty if the file is missing or is not a sidecar."""
+    try:
+        says = json.loads(read_text(path))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return says if isinstance(says, dict) and str(says.get("schema")).startswith(_SCHEMA) else {}
 
 
 def exported_levels(path: Path, says: Facts) -> Array:

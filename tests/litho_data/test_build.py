@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import errno
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
 
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
 from litho_data.making.build import build_dataset
 from litho_data.making.jobs import field_jobs, finish
 from litho_data.making.operations import no_recipe
@@ -337,6 +340,33 @@ def test_a_changed_card_changes_the_key_of_a_piece(campaign: Path) -> None:
     ]
     assert len({one.key() for one in (job, *changed)}) == 5
     assert replace(job).key() == job.key()
+
+
+def test_the_sidecar_of_an_exported_layout_is_a_raw_file(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1)
+    card.write_text(card.read_text().replace("layouts/{id}.tif", "layouts/{id}.*"))
+    layout, sidecar = (tmp_path / "layouts" / f"P11.png{end}" for end in ("", ".json"))
+    (tmp_path / "layouts" / "P11.tif").unlink()
+    cv2.imwrite(str(layout), layout_of(0) + 20)
+    says = {"schema": "litho-design/export/2", "file_sha256": file_sha256(layout), "format": "png"}
+    says |= {"shape_px": [112, 112], "pitch_um": 0.1, "level_height_um": 0.1, "greys": [*range(20, 33)]}
+    keys, steps = set(), set()
+    for element in ([0, 112, 0, 100], [0, 112, 0, 112]):
+        sidecar.write_text(json.dumps({**says, "marks": {"element_px": element}}))
+        (job,) = field_jobs(list_fields(card), no_recipe())
+        chain = job.begin()
+        assert chain.arrays["mask_level"].shape == (112, element[3])
+        keys.add(job.key())
+        steps.add(chain.steps[0].id)
+    assert len(keys) == len(steps) == 2
+
+    out = tmp_path / "prints.zarr"
+    assert build_dataset(card, out, strict=True).unpaired == {}
+    paths = [row["path"] for row in open_store(out).manifest["files"]]
+    assert paths == ["layouts/P11.png", "layouts/P11.png.json", "scans/P11.txt"]
+    assert verify(out).findings == ()
+    sidecar.write_text(json.dumps(says))
+    assert [one.where for one in verify(out).findings] == ["raw file layouts/P11.png.json"]
 
 
 def test_another_build_or_a_foreign_folder_is_left_alone(campaign: Path, tmp_path: Path) -> None:
