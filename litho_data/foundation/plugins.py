@@ -6,14 +6,19 @@ command and every worker loads all plug-ins before its work begins.
 """
 
 import importlib.util
+import inspect
+import linecache
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.hashes import file_sha256, record_sha256, source_sha256
 
+_PACKAGE = Path(__file__).parents[1]
 GROUP, OPTION = "litholoop.plugins", "--plugin"
 # Maps the name of each loaded plug-in to its version, or the file of the plug-in to the beginning of the
 # file's hash.
@@ -46,6 +51,22 @@ def plugin_versions() -> dict[str, str]:
     file.
     """
     return {f"plug-in {Path(name).name}": version for name, version in _LOADED.items()}
+
+
+def foreign_sha256(function: Callable[..., Any]) -> str:
+    """Return the hash of the source that defines a function, which is a file, a package or the cell of a
+    notebook. The result is empty for functions of this package and for compiled functions.
+    """
+    code = inspect.unwrap(function.func if isinstance(function, partial) else function)
+    try:
+        source = Path(inspect.getfile(code if inspect.isroutine(code) else type(code)))
+    except TypeError:
+        return ""
+    while (source.parent / "__init__.py").is_file():
+        source = source.parent
+    if source == _PACKAGE:
+        return ""
+    return source_sha256(source) if source.exists() else record_sha256(linecache.getlines(str(source)))
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:

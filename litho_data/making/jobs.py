@@ -15,8 +15,9 @@ from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.making.chain import Chain
-from litho_data.making.operations import OPERATIONS
+from litho_data.making.operations import OPERATIONS, READER_SHA256
 from litho_data.readers.exported import sidecar_of
+from litho_data.readers.read import own_reader_sha256
 from litho_data.register.refine import BORDER_PX
 from litho_data.store.partial import PartialStore, Piece
 
@@ -91,7 +92,7 @@ class FieldJob:
         own = (self.field.scan, *self._layout_files.values(), *self.standards.files.values())
         files = [file_sha256(path) for path in own]
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
-        return record_sha256([*plan, files, code])
+        return record_sha256([*plan, self._read_params, self._standards_read, files, code])
 
     def layout(self) -> Array | None:
         """Return the levels of the field's layout, or None if the field has no readable layout."""
@@ -117,8 +118,7 @@ class FieldJob:
         else:
             chain.run("read-scan", self._read_params, file)
         if self.standards.described:
-            described = {"standards": [dict(one) for one in self.standards.described]}
-            chain.run("calibrate", described, self.standards.files)
+            chain.run("calibrate", {"standards": self._standards_read}, self.standards.files)
         return chain
 
     def register_params(self, chain: Chain) -> dict[str, Any]:
@@ -245,7 +245,24 @@ class FieldJob:
         # If the card's table states unit or size for a scan, the scan's file must agree with it. If only the
         # card itself states them, they are used only for files that do not state their own unit or size.
         defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
-        return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
+        own = {} if self._is_micrograph else _own_reader(self.field.scan, stated["format"])
+        return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um, **own}
+
+    @property
+    def _standards_read(self) -> list[dict[str, Any]]:
+        files = list(self.standards.files.values())
+        return [
+            {**one, **_own_reader(files[one["file"]], one["read"]["format"])}
+            for one in self.standards.described
+        ]
+
+
+def _own_reader(scan: Path, format: str) -> dict[str, str]:
+    """Return the parameter that identifies the user's own reader of a scan. There is none if a reader of this
+    package reads the scan.
+    """
+    sha256 = own_reader_sha256(scan, format)
+    return {READER_SHA256: sha256} if sha256 else {}
 
 
 def field_jobs(listing: Listing, recipe: Facts, seed: int = 0) -> list[FieldJob]:

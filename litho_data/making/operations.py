@@ -30,6 +30,10 @@ _OBLONG = 0.01
 OPERATIONS: dict[str, Operation] = {}
 READERS = ("read-scan", "read-micrograph")
 """The names of the operations that read the microscope's files."""
+READER_SHA256 = "reader_sha256"
+"""The parameter that states the hash of the source of a user's own reader. The operation does not use it, but
+steps with different readers get different ids.
+"""
 
 
 def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
@@ -85,7 +89,8 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_scan
 
     size = params["size_um"]
-    scan = read_scan(files[0], **{**params, "size_um": tuple(size) if size else None})
+    stated = {name: value for name, value in params.items() if name != READER_SHA256}
+    scan = read_scan(files[0], **{**stated, "size_um": tuple(size) if size else None})
     arrays = {"raw_height_um": scan.height_um.astype(np.float32)}
     if scan.mask is not None:
         arrays["vendor_mask"] = scan.mask

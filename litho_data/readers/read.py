@@ -21,7 +21,7 @@ from litho_data.readers.reader import (
     Reader,
     with_unique_names,
 )
-from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
+from litho_data.readers.registry import PICTURE, detect_format, reader_of, registered, require_file
 from litho_data.scan import Axis, Scan
 
 _NAMED_UNIT = re.compile(r"[_\[( ]([nuµp]m|mm)[\])]?$")
@@ -118,6 +118,20 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
         channels = _read_channels(_settle_format(file, format), file)
     # The temporary unpacked file is deleted before a channel is loaded, so loading must unpack it again.
     return [replace(one, load=partial(_load, given, format, one.name)) for one in channels]
+
+
+def own_reader_sha256(path: str | Path, format: str = "auto") -> str:
+    """Return the hash of the source of the registered reader with which ``read_scan`` reads a file. The
+    result is empty if a reader of this package reads the file.
+
+    Raises:
+        InputError: a reader has been registered, and the file is unreadable or has an unknown format.
+    """
+    if not (own := registered()):
+        return ""
+    given = require_file(path)
+    with about(str(given)), unpacked(given) as file:
+        return own.get(_settle_format(file, format).name, "")
 
 
 def _load(path: Path, format: str, name: str) -> Loaded:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from litho_data.foundation import InputError, unknown_name
+from litho_data.foundation.plugins import foreign_sha256
 from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, text_matrix, tiff, vendor, wyko
 from litho_data.readers.reader import Reader, unknown_content
 
@@ -22,6 +23,8 @@ _READERS = [
     tiff.READER,
     text_matrix.READER,
 ]
+# Maps the name of each registered reader to the hash of its source.
+_REGISTERED: dict[str, str] = {}
 PICTURE = "image"
 _PICTURE_MAGIC = (b"\x89PNG\r\n\x1a\n", b"BM")
 _HEAD_BYTES = 1 << 16
@@ -44,7 +47,13 @@ def register_reader(reader: Reader) -> Reader:
     if reader.name in ("auto", PICTURE, *formats()):
         raise InputError("reader to register", got=f"{reader.name!r}, which exists", wanted="another name")
     _READERS.insert(0, reader)
+    _REGISTERED[reader.name] = foreign_sha256(reader.read_channels)
     return reader
+
+
+def registered() -> dict[str, str]:
+    """Return a dict that maps the name of each registered reader to the hash of its source."""
+    return dict(_REGISTERED)
 
 
 def reader_of(format: str) -> Reader:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -10,24 +12,34 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from litho_data.cards.listing import list_fields
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.plugins import foreign_sha256
 from litho_data.making.build import build_dataset
+from litho_data.making.jobs import field_jobs
+from litho_data.making.operations import no_recipe
 from litho_data.readers import Reader, formats, read_scan, register_reader, registry
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "own_reader.py"
 
 
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Load `examples/own_reader.py`, whose reader is registered for the duration of one test."""
-    path = Path(__file__).parents[2] / "examples" / "own_reader.py"
+    return register_file(EXAMPLE, monkeypatch)
+
+
+def register_file(path: Path, patch: pytest.MonkeyPatch) -> ModuleType:
     spec = importlib.util.spec_from_file_location("own_reader", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    monkeypatch.setattr(registry, "_READERS", [*registry._READERS])
+    patch.setattr(registry, "_READERS", [*registry._READERS])
+    patch.setattr(registry, "_REGISTERED", {**registry._REGISTERED})
     register_reader(module.TOY)
     return module
 
@@ -70,3 +82,46 @@ def test_an_own_reader_is_asked_before_the_built_in_readers(example: ModuleType,
 def test_an_own_reader_with_a_used_name_is_refused(example: ModuleType, name: str) -> None:
     with pytest.raises(InputError, match="another name"):
         register_reader(Reader(name, lambda path, head: True, example.read_channels))
+
+
+def test_a_changed_own_reader_changes_the_key_and_the_step_of_its_scans_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Check that a resumed build keeps no scan that an older version of the reader has read."""
+    card = write_campaign(tmp_path, count=2)
+    card.write_text(card.read_text().replace("{id}.txt", "{id}.*").replace("text-matrix", "auto"))
+    (tmp_path / "scans" / "P11.txt").unlink()
+    reader = tmp_path / "lab" / "own_reader.py"
+    reader.parent.mkdir()
+    own: list[tuple[str, str, bool]] = []
+    text: list[tuple[str, str, bool]] = []
+    for version in (EXAMPLE.read_text(), EXAMPLE.read_text(), EXAMPLE.read_text().replace("nm", "um")):
+        reader.write_text(version)
+        with monkeypatch.context() as patch:
+            example = register_file(reader, patch)
+            example.write_toy(tmp_path / "scans" / "P11.toy", np.eye(8), (12.8, 12.8))
+            for job, found in zip(field_jobs(list_fields(card), no_recipe()), (own, text), strict=True):
+                step = job.begin().steps[-1]
+                found.append((job.key(), step.id, "reader_sha256" in step.params))
+    assert own[0] == own[1]
+    assert all(before != after for before, after in zip(own[0][:2], own[2][:2], strict=True))
+    assert [one[2] for one in own] == [True] * 3
+    assert text == [(*text[0][:2], False)] * 3
+
+
+def test_the_source_of_a_reader_is_its_whole_package(tmp_path: Path) -> None:
+    (tmp_path / "lab" / "afm").mkdir(parents=True)
+    for name, text in {
+        "__init__": "",
+        "scale": "UM = 1",
+        "afm/__init__": "",
+        "afm/toy": "def f(): 0",
+    }.items():
+        (tmp_path / "lab" / f"{name}.py").write_text(text)
+    path = tmp_path / "lab" / "afm" / "toy.py"
+    names: dict[str, Callable[[], int]] = {}
+    exec(compile(path.read_text(), path, "exec"), names)
+    before = foreign_sha256(partial(names["f"]))
+    (tmp_path / "lab" / "scale.py").write_text("UM = 2")
+    assert "" != before != foreign_sha256(names["f"]) != ""
+    assert foreign_sha256(read_scan) == ""
