@@ -4,6 +4,7 @@ card's table.
 
 import glob
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
 from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
 from litho_data.foundation import Facts, InputError
+from litho_data.foundation.names import is_plain_name
 from litho_data.readers.exported import sidecar_of
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
@@ -173,6 +175,9 @@ def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
 def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
     """Find the files that match one or several patterns, and return lists of their paths keyed by id. In a
     pattern, ``{id}`` stands for the id, and ``*`` for any part of a name.
+
+    Raises:
+        InputError: the name of a file is not UTF-8, so no record could state it.
     """
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):
@@ -186,7 +191,16 @@ def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path
             hit, path = match.fullmatch(name.replace("\\", "/")), folder / name
             if hit and path.is_file() and path not in found.setdefault(hit["id"], []):
                 found[hit["id"]].append(path)
+                _require_decoded(name)
     return {scan_id: paths for scan_id, paths in found.items() if paths}
+
+
+def _require_decoded(name: str) -> None:
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:
+        got = repr(os.fsencode(name))
+        raise InputError("name of a file", got=got, wanted="UTF-8", hint="rename the file") from error
 
 
 def _without_sidecars(
@@ -209,6 +223,9 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
     """
     if not SAFE_ID.fullmatch(scan_id):
         return "an id may contain only letters, digits, spaces and ._+-"
+    for what, name in (("id", scan_id), ("name of the print", print_id or scan_id)):
+        if not is_plain_name(name):
+            return f"the first or last character of the {what} {name[:80]!r}, or its length, is not allowed"
     if print_id is None and use == "dataset":
         return f"id does not match [ids] print = {card.ids.print!r}"
     if scan_id not in table and any("order" in row for row in table.values()):

@@ -5,6 +5,7 @@ refused.
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,25 @@ def test_an_id_of_another_form_is_refused_with_a_reason(tmp_path: Path) -> None:
     listing = list_fields(folder_with(tmp_path, [*PAIRS, "layouts/Q1.tif", "scans/Q1.txt"]))
     assert not listing.unpaired
     assert "does not match" in listing.refused["Q1"]
+
+
+@pytest.mark.parametrize("end", [" ", "."])
+def test_a_name_that_no_store_accepts_is_refused_with_a_reason(tmp_path: Path, end: str) -> None:
+    files = [f"{kind}/{name}.{suffix}" for kind, suffix in (("layouts", "tif"), ("scans", "txt"))
+             for name in ("P11", f"P11{end}", f"P0{end}1")]  # fmt: skip
+    card = folder_with(tmp_path, files)
+    card.write_text(card.read_text().replace(r"P(?P<print>\d)\d", "P(?P<print>..?)1.?"))
+    listing = list_fields(card)
+    assert [one.id for one in listing.fields] == ["P11"]
+    assert "of the id" in listing.refused[f"P11{end}"]
+    assert f"of the name of the print '0{end}'" in listing.refused[f"P0{end}1"]
+
+
+def test_a_file_name_that_is_not_utf8_is_one_line(tmp_path: Path) -> None:
+    card = folder_with(tmp_path, PAIRS)
+    (tmp_path / "scans" / os.fsdecode(b"Pr\xfcfung.txt")).touch()
+    with pytest.raises(InputError, match=r"scans/Pr\\xfcfung.txt.*UTF-8.*rename"):
+        list_fields(card)
 
 
 def test_a_link_that_leads_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
