@@ -345,15 +345,16 @@ def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | Non
 
 def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
     """Return the dark level at which the darkest pixels have the expected brightness, and its standard
-    deviation.
+    deviation. Only pixels that lie on the photograph count.
     """
     import cv2
 
-    way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
+    way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     seen = cv2.warpPerspective(cv2.blur(photo, (3, 3)), fit.window_to_photo, wanted.shape, **way)
     blurred = cv2.GaussianBlur(wanted, (0, 0), max(fit.blur_px, 0.5))
+    inside = _inside(fit.window_to_photo, photo.shape, len(wanted))
     shares = [1, 3, 10]
-    found, expected = (np.percentile(one, shares) for one in (seen, blurred))
+    found, expected = (np.percentile(one[inside], shares) for one in (seen, blurred))
     levels = found - fit.gain * expected
     return float(levels[1]), float(np.ptp(levels)) / 2 + 0.3 * fit.gain * float(expected[1])
 

@@ -15,7 +15,14 @@ from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import estimated
-from litho_design.images.photograph import CameraRecord, Photograph, _saturated, photographed_image
+from litho_design.images.photograph import (
+    CameraRecord,
+    Photograph,
+    _dark_level,
+    _Fit,
+    _saturated,
+    photographed_image,
+)
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
@@ -251,6 +258,18 @@ def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
         0.046, abs=0.01
     )
     assert _saturated((light * 0.8).astype(np.uint16)) == 0.0
+
+
+def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_whole_one():
+    """Check a ramp along y. All columns are equal, so columns that are missing change nothing."""
+    light = np.repeat(np.linspace(0.02, 1, 64, dtype=np.float32)[:, None], 64, axis=1)
+    photo = (800 + 20000 * light).astype(np.float32)
+    whole, cut = (
+        _dark_level(one, light, _Fit(np.eye(3), 1.0, gain=20000.0)) for one in (photo, photo[:, :60])
+    )
+    assert cut == pytest.approx(whole)
+    # One row of the ramp is 310 counts, and blurs differ in the outermost row.
+    assert whole[0] == pytest.approx(800, abs=310)
 
 
 class Power(Record):
