@@ -130,7 +130,7 @@ def judge_design(
     """Score the layout of a design by the predictions of models, a measured print and a photograph.
 
     Args:
-        judges: printers. A printer with the same weights as the model of the design is marked as not
+        judges: printers. A printer with the same weights as a model that the search used is marked as not
             independent.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
@@ -192,10 +192,11 @@ def _print_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, he
     in_rings = loaded.record.in_rings
     area = loaded.bench.propagator.ring_area_um2.to(off) if in_rings else torch.ones_like(off)
     share = area / area.sum()
+    searched = {loaded.record.printer.sha256, *loaded.record.ensemble_sha256}
     return JudgedScore(
         kind="scan" if measured else "model",
         judge=judge,
-        independent=measured or judge.sha256 != loaded.record.printer.sha256,
+        independent=measured or judge.sha256 not in searched,
         mean_height_difference_um=float((off * share).sum()),
         rms_height_difference_um=float((off.square() * share).sum().sqrt()),
         figures=figures,

@@ -75,7 +75,8 @@ def _verdict(result: ScoreResult) -> str:
     expected = f"The design expects {headline(result.designed)}. "
     if not any(score.independent for score in result.scores):
         return expected + (
-            "No judge is independent of the design, so these scores only repeat its own model's prediction."
+            "No judge is independent of the design, so these scores only repeat predictions of models that "
+            "its search used."
         )
     told = [
         f"{called(score.judge.name)}: {headline(score.figures, score.uncertainty)}"

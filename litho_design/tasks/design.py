@@ -74,7 +74,9 @@ class Findings(Record):
 
 
 class Design(Findings, Result):
-    """The contents of design.json."""
+    """The contents of design.json. ``ensemble_sha256`` contains the SHA-256 of the weights of each further
+    model that the search used; it is empty if the search used only ``printer``.
+    """
 
     SCHEMA: ClassVar[str] = "litho-design/design/1"
     FILE_NAME: ClassVar[str] = "design.json"
@@ -89,6 +91,7 @@ class Design(Findings, Result):
     optics: Optics
     target: TargetRecord | None = None
     printer: PrinterRecord
+    ensemble_sha256: list[str] = Field(default_factory=list)
     stroke: Stroke
     notes: list[str] = Field(default_factory=list)
     iterations: int

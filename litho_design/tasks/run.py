@@ -114,6 +114,7 @@ def _make(
         layout=layout,
         optics=settings.optics,
         printer=task.printer.record(),
+        ensemble_sha256=list(weights_sha256[1:]),
         stroke=measure_stroke(heights, wave_um, level_height_um=layout.level_height_um),
         notes=task.notes,
         iterations=found.state.iteration,

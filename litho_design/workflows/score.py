@@ -39,9 +39,9 @@ def score(
         design: the folder of a design, or a design from ``load_design``.
         out: folder of the score.
         judges: loaded printers, or texts of the form NAME=MODEL, MODEL or ``none``; MODEL may be the folder
-            ``truth`` of a virtual fab. Judges with the same weights as the model of the design are marked as
-            not independent. If there is no judge, scan or photograph, the judges are the zoo's models that
-            were trained on the same prints as the model of the design.
+            ``truth`` of a virtual fab. Judges with the same weights as a model that the search used are
+            marked as not independent. If there is no judge, scan or photograph, the judges are the zoo's
+            models that were trained on the same prints as the model of the design.
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens. If
             ``scan`` is also given, the photograph of an object is deconvolved with the PSF of the measured

@@ -10,6 +10,8 @@ import torch
 
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.judging.score import judge_design
 from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.settings import LensView, lens_settings
 from litho_design.optics import Optics
@@ -113,6 +115,10 @@ def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
     )
     assert design.width.searched_with == 2
     assert design.width.disagreement > 0
+    # Both models of the search know the layout. Only the third model is independent of it.
+    judges = [make_printer(layout), other, make_printer(layout, sigma_um=0.4, name="third")]
+    scores = judge_design(LoadedDesign(tmp_path), judges).scores
+    assert [one.independent for one in scores] == [False, False, True]
     assert (tmp_path / "window.csv").exists()
 
 
