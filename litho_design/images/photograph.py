@@ -132,6 +132,7 @@ class Photograph:
         side_px: side of the window, in window pixels.
         pitch_um: side length of a window pixel.
         finest_per_um: the highest spatial frequency that the image can have, in cycles/µm.
+        averaged_um: side of the pixels over which the image stays averaged, µm (see ``photographed_image``).
         record: source and processing of the photograph.
         expected: expected counts, shape (m, m), which replace pixels that lie beyond the photograph.
         other_warps: for each independent fitted movement of the camera, the two maps after a movement by plus
@@ -146,6 +147,7 @@ class Photograph:
     side_px: int
     pitch_um: float
     finest_per_um: float
+    averaged_um: float
     record: CameraRecord
     expected: np.ndarray
     other_warps: list[list[np.ndarray]]
@@ -211,15 +213,20 @@ class Photograph:
         found = found * (self._camera_pixels(warp) / self._camera_pixels(self.window_to_photo))
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
         # Detail finer than the light from the element can form is noise. The remaining detail is corrected
-        # for the averaging over a pixel.
+        # for the difference between the averaging over a camera pixel and that in the expected image.
         frequency = np.arange(side) / (2 * side * self.pitch_um)
-        sharp = (frequency <= self.finest_per_um) / np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
+        camera = np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
+        sharp = (frequency <= self.finest_per_um) * np.sinc(frequency * self.averaged_um) / camera
         kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(sharp, sharp), norm="ortho")
         return kept
 
 
 def photographed_image(
-    wanted: np.ndarray, wanted_pitch_um: float, source: PhotoSource, finest_per_um: float
+    wanted: np.ndarray,
+    wanted_pitch_um: float,
+    source: PhotoSource,
+    finest_per_um: float,
+    averaged_um: float = 0.0,
 ) -> Photograph:
     """Register a photograph to the image that the design expects.
 
@@ -236,6 +243,8 @@ def photographed_image(
         source: greyscale image of any bit depth whose counts are proportional to the light. If the dark level
             is unknown, it is chosen so that the darkest pixels have the expected brightness.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; finer detail is removed.
+        averaged_um: side of the pixels over which the expected image is averaged, µm, so that the photograph
+            is averaged as much; 0 if the image contains values at points.
 
     Raises:
         InputError: the file is not an image, the pitch is not positive, or the orientation is unknown. The
@@ -311,8 +320,9 @@ def photographed_image(
     )
     side = len(wanted)
     where, lit = fit.window_to_photo, fit.gain * wanted
+    warps, tilts = fit.other_warps, fit.other_tilts
     return Photograph(
-        counts, where, side, wanted_pitch_um, finest_per_um, record, lit, fit.other_warps, fit.other_tilts
+        counts, where, side, wanted_pitch_um, finest_per_um, averaged_um, record, lit, warps, tilts
     )
 
 

@@ -126,11 +126,17 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)
 
 
-def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
+def _registered(
+    loaded: LoadedDesign,
+    wanted: np.ndarray,
+    pitch_um: float,
+    source: PhotoSource,
+    averaged_um: float = 0.0,
+) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
     # The finest fringes in the image are formed by rays from two opposite sides of the element.
     finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
-    return photographed_image(wanted, pitch_um, source, finest_per_um)
+    return photographed_image(wanted, pitch_um, source, finest_per_um, averaged_um)
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
@@ -172,7 +178,8 @@ def score_lens_photo(
     kernels = {name: sensor_psf(loaded.bench(um), settings.pixel_px) for name, um in heights.items()}
     expected = Blur(kernels["design"], (settings.object_px, settings.object_px)).forward(wanted)
     pixel_um = settings.pixel_px * loaded.record.layout.pitch_um
-    photo = _registered(loaded, expected.cpu().numpy(), pixel_um, source)
+    # The PSFs are summed over sensor pixels, so the photograph has to be averaged over such pixels.
+    photo = _registered(loaded, expected.cpu().numpy(), pixel_um, source, averaged_um=pixel_um)
 
     def estimates(image: np.ndarray) -> dict[str, Tensor]:
         seen = torch.from_numpy(image).to(expected).clamp(min=0)
