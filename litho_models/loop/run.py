@@ -27,6 +27,7 @@ from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
+from litho_models.loop.prepared import FEWEST_PIXELS
 from litho_models.loop.record import CloseLoop, ErrorRow, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
@@ -35,7 +36,6 @@ from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
-_FEWEST_PX = 1024
 Nested = Literal["folds", "prints"]
 # A function that receives a closed loop and its record, and returns the record to write and a list of further
 # records to write.
@@ -172,9 +172,9 @@ def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], l
 def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
     """Return two lists: the scans with enough measured pixels, and texts that name the other scans."""
     scans = store.scans()
-    few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < _FEWEST_PX]
+    few = [scan.id for scan in scans if np.count_nonzero(scan.usable) < FEWEST_PIXELS]
     usable = [scan for scan in scans if scan.id not in few]
-    return usable, [f"{one}: fewer than {_FEWEST_PX} measured pixels" for one in few]
+    return usable, [f"{one}: fewer than {FEWEST_PIXELS} measured pixels" for one in few]
 
 
 def _nested(
