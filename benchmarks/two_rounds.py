@@ -34,7 +34,7 @@ from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
 from litho_models.loop.closing import Closed
-from litho_models.loop.record import CloseLoop, Decision
+from litho_models.loop.record import Decision, ScanFinding
 from litho_models.loop.run import close_loop
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions
@@ -146,9 +146,13 @@ def run_trial(
     build_dataset(card, folder / "first.zarr")
     asked: list[tuple[Closed, OpenQuestions]] = []
 
-    def ask(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[OpenQuestions]]:
-        asked.append((closed, open_questions(closed, result)))
-        return result, [asked[-1][1]]
+    dataset = open_store(folder / "first.zarr").dataset_id
+
+    def ask(
+        closed: Closed, single_scans: Sequence[ScanFinding]
+    ) -> tuple[Closed, list[Decision], list[OpenQuestions]]:
+        asked.append((closed, open_questions(closed, dataset, single_scans)))
+        return closed, [], [asked[-1][1]]
 
     result = close_loop(folder / "first.zarr", folder / "loop", base=BASE, further=ask)
     answers: dict[str, Any] = {}

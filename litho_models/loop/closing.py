@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 from torch import nn
 
@@ -29,6 +30,7 @@ from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
+from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.measurement_fit import learn_measurement
 
 # Assumed ratio of the duration of a loop to that of its first fits. For four datasets of heights, this ratio
@@ -137,14 +139,8 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         searches[name] = search(state, candidates, seed=next(iter(searches.values()), None))
     chosen = _simplest(searches)
     start, named = starts[chosen], searches.pop(chosen)
-    learner = Learner(freed, start.maps_um(freed.scans))
-
-    @cache
-    def rest(state: State) -> Rest:
-        return learner.rest(state.maps_um(freed.scans))
-
+    rest = _rest_beside(start)
     lawful, described = _checked(start, named, rest)
-    stages = {"base": start, "causes": named.state, "laws": lawful.state, "tables": described.state}
     return Closed(
         base_name=chosen,
         rivals=searches,
@@ -153,14 +149,72 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         named=named,
         lawful=lawful,
         described=described,
-        # A stage that changes nothing has the same model as the stage before it and is not listed.
-        rests={
-            name: rest(state)
-            for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
-            if state is not before
-        },
+        rests=_rests(start, named, lawful, described, rest),
         untestable=excluded,
     )
+
+
+def with_answer(
+    closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
+) -> Closed:
+    """Return the result of a loop in which a cause or law is replaced by the effect that remains after later
+    prints were compared. The models with the cause are fitted again with this effect instead.
+
+    Args:
+        closed: the result.
+        cause: the cause or law to replace, or None if the effect is added as a further cause.
+        name: name of the effect, which may be the cause itself.
+        values: parameter values of the effect from which its fits start.
+        known: the fields ``alike``, ``excluded`` and ``role`` of the effect.
+    """
+    if cause and cause.name == name:
+        fitted, answer = (lambda state: state), replace(cause, **known)
+    else:
+
+        @cache
+        def fitted(state: State) -> State:
+            if cause and cause.name not in state.twin.names:
+                return state
+            twin = state.twin.without(cause.name) if cause else state.twin
+            return fit_state(twin.with_effect(name, ALL, {"": values}), state.study)
+
+        final = fitted(closed.final)
+        judgement = judge_states(final.without(name), final)
+        first = {**closed.lawful.first, **closed.named.first}[name]
+        answer = Cause(name, ALL, judgement=judgement, family_p=first.family_p, group_p=None, **known)
+
+    def replaced(found: Found) -> Found:
+        causes = [answer if one is cause else one for one in found.causes]
+        return replace(found, state=fitted(found.state), causes=causes)
+
+    named, lawful, described = map(replaced, (closed.named, closed.lawful, closed.described))
+    if cause is None:
+        named.causes.append(answer)
+    rests = closed.rests
+    if described.state is not closed.final:
+        rests = _rests(closed.base, named, lawful, described, _rest_beside(closed.base))
+    return replace(closed, named=named, lawful=lawful, described=described, rests=rests)
+
+
+def _rest_beside(start: State) -> Callable[[State], Rest]:
+    """Return a function that computes the part of a model's residual that features of the layout and of the
+    position can still explain. ``start`` is the fitted base model.
+    """
+    scans = start.study.scans
+    learner = Learner(start.study, start.maps_um(scans))
+    return cache(lambda state: learner.rest(state.maps_um(scans)))
+
+
+def _rests(
+    start: State, named: Found, lawful: Found, described: Found, rest: Callable[[State], Rest]
+) -> dict[str, Rest]:
+    stages = {"base": start, "causes": named.state, "laws": lawful.state, "tables": described.state}
+    # A stage that changes nothing has the same model as the stage before it and is not listed.
+    return {
+        name: rest(state)
+        for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
+        if state is not before
+    }
 
 
 def freed_scans(state: State) -> list[PrintedScan]:
@@ -186,7 +240,7 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
     """Return the names of the base models with which the search has found the cause, or an effect that looks
     the same. ``searches`` contains the results of the searches, keyed by model name.
     """
-    alike = {cause.name, *cause.alike}
+    alike = {cause.name, *cause.alike, *cause.excluded}
     return [
         name
         for name, found in searches.items()

@@ -125,15 +125,17 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
     # If the search with another base does not find a cause, the cause may only correct an error of the chosen
     # base.
-    corrects = effect.knowledge == "cause" and not closed.needed_by_all(cause)
+    unsure = effect.knowledge == "cause" and cause.role is None
+    corrects = unsure and not closed.needed_by_all(cause)
     knowledge: Knowledge = "description" if corrects else effect.knowledge
+    unnamed: EffectVerdict = "confusable" if cause.alike else "explained"
     return FoundEffect(
         name=cause.name,
         title=effect.title,
         knowledge=knowledge,
-        role=effect.role if len(roles) == 1 else "undetermined",
+        role=cause.role or (effect.role if len(roles) == 1 else "undetermined"),
         stage=effect.stage,
-        verdict=verdicts.get(knowledge, "confusable" if cause.alike else "explained"),
+        verdict="explained" if cause.role else verdicts.get(knowledge, unnamed),
         by=cause.by,
         strengths=_strengths(closed, cause.name),
         confusable_with=list(cause.alike),
@@ -243,6 +245,7 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
     """
     named, films, count = closed.named, closed.study.of_films, len(closed.study.scans)
     sets = {other: one.name for one in added for other in one.confusable_with}
+    excluded = {other: one.name for one in closed.traced for other in one.excluded}
     untestable = {} if films else {**UNTESTABLE, **closed.untestable}
     tried = [one.name for one in CATALOGUE.values() if not one.per_scan and one.of_films == films]
     told = {*seen, *(one.name for one in added)}
@@ -251,6 +254,8 @@ def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[s
         last, reason = named.last.get(name), named.refused.get(name, "")
         if name in untestable:
             return "not-testable", untestable[name]
+        if name in excluded:
+            return "contradicted", f"later prints exclude it: {excluded[name]} fits them better"
         if name in sets:
             return "confusable", f"cannot be distinguished from {sets[name]}, which was added"
         if any(one.name == name for one in named.failed):

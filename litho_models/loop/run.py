@@ -28,7 +28,7 @@ from litho_models.loop.marks import marks, rounding_step_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.prepared import FEWEST_PIXELS
-from litho_models.loop.record import CloseLoop, ErrorRow, ScanFinding
+from litho_models.loop.record import CloseLoop, Decision, ErrorRow, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record
 from litho_models.loop.single_scans import SingleScans
@@ -37,9 +37,9 @@ from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
 MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
 Nested = Literal["folds", "prints"]
-# A function that receives a closed loop and its record, and returns the record to write and a list of further
-# records to write.
-Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
+# A function that receives a closed loop and its findings about per-scan terms. It returns the loop, which it
+# may have changed, the decisions on open questions, and a list of further records to write.
+Further = Callable[[Closed, Sequence[ScanFinding]], tuple[Closed, list[Decision], Sequence[Result]]]
 
 
 def close_loop(
@@ -59,6 +59,7 @@ def close_loop(
     dask: str | None = None,
     further: Further | None = None,
     decided_by: Sequence[str] = (),
+    left_out: Sequence[str] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store: find the effects that a base model lacks, and write the corrected
@@ -83,10 +84,11 @@ def close_loop(
         seed: seed of the folds, the calibration blocks and the permutations.
         workers: number of local processes.
         dask: address of a Dask scheduler to use instead of local processes.
-        further: function that receives the closed loop and its record before anything is written. It returns
-            the record to write, which it may have changed, and further records to write.
+        further: function that receives the closed loop and its findings about per-scan terms. It returns the
+            loop to record, which it may have changed, decisions on open questions, and further records.
         decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
             settings.
+        left_out: texts that name the scans of these stores that are left out, with the reason.
         report: function that receives the progress messages.
 
     Raises:
@@ -120,31 +122,35 @@ def close_loop(
             return close(Study.dealt(scans, folds, seed, places), {name: bases[name] for name in named})
 
         models = HeldOut(closed)
-        errors, left_out_nm = models.errors(), models.left_out_nm()
-        planted = [plant(*one, closed, close_again) for one in wanted]
-        if nested:
-            errors += _nested(study, nested, partial(close_again, named=[closed.base_name]))
-        if open_lock_box and locked:
-            errors += errors_of_others([(models, locked)], locked, "locked", seed)
         alone: list[ScanFinding] = []
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, study.scans, maps).findings()
             alone = with_marks(terms, marks(study.scans, maps, _rounding_um(opened, development)))
+        before = closed.final
+        closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
+        if closed.final is not before:
+            models = HeldOut(closed)
+        errors, left_out_nm = models.errors(), models.left_out_nm()
+        planted = [plant(*one, closed, close_again) for one in wanted]
+        if nested:
+            errors += _nested(study, nested, partial(close_again, named=[closed.base_name]))
+        if open_lock_box and locked:
+            errors += errors_of_others([(models, locked)], locked, "locked", seed)
         result = record(
             closed,
             errors,
             single_scans=alone,
             left_out_nm=left_out_nm,
-            run=run_info([seed], len(development), dropped),
+            run=run_info([seed], len(development), [*dropped, *left_out]),
             dataset=opened.dataset_id,
             measurement=models.fit(closed.final).measurement,
             planted=planted,
+            decisions=decisions,
             settings=settings,
             split=Split(kind="grouped", folds=len(study.folds), lock_box=opened.locked_ids),
         )  # fmt: skip
-        result, beside = further(closed, result) if further else (result, ())
         for written in (result, *beside):
             written.write(folder)
         write_report(result, models.residuals(), folder)

@@ -16,6 +16,7 @@ import numpy as np
 
 from litho_data.sharing.workers import run_jobs
 from litho_models.effects import CATALOGUE, Effect, get_effect
+from litho_models.effects.effect import Role
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import GROUPED_P, Judgement, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
@@ -44,6 +45,8 @@ class Cause:
             added to the model, divided by the gain of the effect itself.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
+        excluded: effects that look the same in these scans, but that later prints exclude.
+        role: role of the effect that later prints decided on; None if they did not decide on it.
     """
 
     name: str
@@ -56,6 +59,8 @@ class Cause:
     reshaped_share: float | None = None
     reason: str = ""
     corrects: bool = False
+    excluded: tuple[str, ...] = ()
+    role: Role | None = None
 
 
 @dataclass

@@ -17,6 +17,7 @@ import numpy as np
 
 from litho_data.layouts.statistics import layout_statistics
 from litho_data.store import PrintedScan
+from litho_data.store.schema import DatasetId
 from litho_models.effects import get_effect
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
@@ -25,7 +26,7 @@ from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES
 from litho_models.loop.learner import Learner
 from litho_models.loop.model import Twin
-from litho_models.loop.record import CloseLoop
+from litho_models.loop.record import ScanFinding
 from litho_models.loop.results import clustered_covariance, independent
 from litho_models.loop.screening import WORTH_FITTING, Screened
 from litho_models.loop.search import Cause, separating
@@ -51,22 +52,27 @@ _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
-def open_questions(closed: Closed, result: CloseLoop) -> OpenQuestions:
+def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[ScanFinding]) -> OpenQuestions:
     """Return all open questions with their fitted rivals, in this order: questions about causes and laws that
     were found, about unconfirmed effects, about per-scan terms, and about missing facts.
+
+    Args:
+        closed: the loop that left these questions.
+        dataset: the dataset on which the loop was closed.
+        single_scans: findings of this loop about per-scan terms.
     """
     asking = _Asking(closed)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = closed.study.stored
     return OpenQuestions(
-        dataset=result.dataset,
+        dataset=dataset,
         noise=asking.noise,
         level_share=level_share(stored),
         cutoff_per_um=_cutoff_per_um(stored),
         write_field_um=(stored[0].write or {}).get("field_um"),
         questions=[
             *(one for one in (*found, asking.of_suspects()) if one is not None),
-            *_of_single_scans(result),
+            *_of_single_scans(single_scans),
             *(_question("fact", [one], text=why) for one, why in _missing_facts(closed).items()),
         ],
     )
@@ -203,7 +209,7 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
 
 
-def _of_single_scans(result: CloseLoop) -> list[Question]:
+def _of_single_scans(single_scans: Sequence[ScanFinding]) -> list[Question]:
     """Return the questions about line offsets and per-scan terms for which it is unknown whether the printer
     or the microscope causes them.
     """
@@ -213,7 +219,7 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
             [one.name],
             sizes={parameter: spread.value for parameter, spread in one.spread.items()},
         )
-        for one in result.single_scans
+        for one in single_scans
         if one.seen and terms_of_effect(one.name) and (one.role == "undetermined" or one.confusable_with)
     ]
 

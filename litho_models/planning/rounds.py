@@ -28,16 +28,16 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
 from litho_models.effects.effect import Role
 from litho_models.loop import run
-from litho_models.loop.closing import Closed
+from litho_models.loop.closing import Closed, with_answer
 from litho_models.loop.fits import Study
 from litho_models.loop.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
-from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision
+from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision, ScanFinding
 from litho_models.loop.single_scans import SingleScans
 from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.open_questions import open_questions
-from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
+from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals, left_nm
 from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
@@ -75,16 +75,15 @@ def close_loop(
     new = [scan for scans, _ in checked for scan in scans]
     dropped = [text for _, texts in checked for text in texts]
 
-    def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
-        open_ = open_questions(closed, result)
-        if new:
-            result = with_decisions(result, open_, decide(closed, open_, new))
-            left_out = {"dropped": [*result.run.dropped, *dropped]}
-            result = result.model_copy(update={"run": result.run.model_copy(update=left_out)})
-        return result, [open_]
+    def asked(
+        closed: Closed, single_scans: Sequence[ScanFinding]
+    ) -> tuple[Closed, list[Decision], list[Result]]:
+        open_ = open_questions(closed, first.dataset_id, single_scans)
+        decisions = decide(closed, open_, new) if new else []
+        return with_decisions(closed, open_, decisions), decisions, [open_]
 
     used = [one.sha256 for one in further]
-    return run.close_loop(store, out, further=asked, decided_by=used, **settings)
+    return run.close_loop(store, out, further=asked, decided_by=used, left_out=dropped, **settings)
 
 
 def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]:
@@ -226,25 +225,43 @@ class Judge:
         return _decision(question, turned, _left(z >= Z_DECIDED, z <= -Z_DECIDED), told)
 
 
-def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
-    """Add the decisions to the result. If a decision leaves one effect as the only possible answer, the
-    verdict on this effect becomes ``explained``. Its role becomes ``process`` if the printer causes it and
-    ``measurement`` if the microscope causes it.
+def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Decision]) -> Closed:
+    """Return the loop with the causes that the decisions leave. If new prints exclude a cause, an effect that
+    remains replaces it. If only one answer remains, its effect is named as the cause, and the role of this
+    effect becomes ``process`` if the printer causes it and ``measurement`` if the microscope causes it.
     """
-    decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
-    roles = {
-        rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
-        for question in open_.questions
-        for rival in question.rivals
-        if (question.name, rival.name) in decided
-    }
-    effects = [
-        one.model_copy(update={"verdict": "explained", "confusable_with": [], "role": roles[one.name]})
-        if one.name in roles
-        else one
-        for one in result.effects
-    ]
-    return result.model_copy(update={"decisions": decisions, "effects": effects})
+    questions = {one.name: one for one in open_.questions}
+    for decision in decisions:
+        rivals = questions[decision.question].rivals
+        left = [one for one in rivals if one.name in decision.left]
+        if left and decision.verdict != NONE:
+            closed = _answered(closed, decision.question, rivals, left)
+    return closed
+
+
+def _answered(closed: Closed, name: str, rivals: Sequence[Rival], left: Sequence[Rival]) -> Closed:
+    """Return the loop if only the rivals ``left`` of the question about the effect ``name`` remain."""
+    cause = next((one for one in closed.traced if one.name == name), None)
+    if cause is None and len(left) > 1:
+        return closed
+    # The cause keeps its name if it remains.
+    best = min(left, key=lambda one: one.effect != name)
+    if best.effect != name and best.effect in closed.final.twin.names:
+        return closed
+    remain = {one.effect for one in left}
+    excluded = dict.fromkeys(one.effect for one in rivals if one.effect not in remain)
+    role, alike = None, (name, *cause.alike) if cause else ()
+    if len(left) == 1:
+        role, alike = _ROLES.get(best.owner, get_effect(best.effect).role), ()
+    return with_answer(
+        closed,
+        cause,
+        best.effect,
+        best.effects[best.effect],
+        alike=tuple(one for one in alike if one not in {best.effect, *excluded}),
+        excluded=tuple(excluded),
+        role=role,
+    )
 
 
 def compared(

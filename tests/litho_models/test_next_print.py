@@ -35,10 +35,14 @@ from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
 from litho_models.loop import bases
-from litho_models.loop.fits import RULES, TwinProblem
+from litho_models.loop.closing import Closed
+from litho_models.loop.fits import RULES, TwinProblem, fit_state
+from litho_models.loop.judging import judge_states
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
-from litho_models.loop.record import CloseLoop, Decision, FoundEffect
+from litho_models.loop.record import CloseLoop, Decision
+from litho_models.loop.results import _candidates, _found
+from litho_models.loop.search import Cause, Found
 from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
@@ -70,6 +74,7 @@ from litho_models.planning.run import next_print
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scan_terms.term import row_index
 from tests.litho_models.loop_scans import (
+    bare_state,
     base_model,
     blank_scan,
     blank_scans,
@@ -763,26 +768,80 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     assert known[1] == pytest.approx(known[0], rel=0.1)
 
 
-def test_what_is_decided_gets_its_owner_in_the_result() -> None:
-    effect = FoundEffect.model_construct(
-        name="slope-thinning", role="undetermined", verdict="confusable", confusable_with=["elsewhere"]
+def looped(effects: dict[str, dict[str, float]], cause: str, alike: Sequence[str]) -> Closed:
+    """Return a loop that named ``cause``, or one of the effects ``alike``, in scans with these effects."""
+    bare = bare_state(study_of(planted([(name, ALL, {"": own}) for name, own in effects.items()], count=8)))
+    state = fit_state(model({cause: SLOPE.get(cause, {})}), bare.study)
+    found = Cause(cause, ALL, tuple(alike), judge_states(bare, state), 0.01, None)
+    screened = {name: cast(Any, SimpleNamespace(family_p=0.02)) for name in alike}
+    named, lawful, described = Found(state, [found], screened), Found(state), Found(state)
+    return Closed("affine-mtf", {}, bare, bare, named, lawful, described, {}, {})
+
+
+def decided_for(*left: str, among: Sequence[Rival]) -> tuple[OpenQuestions, list[Decision]]:
+    """Return the question among these rivals, and the decision that leaves some of them."""
+    question = slope_question(kind="set", rivals=list(among))
+    decision = Decision(
+        question=question.name,
+        kind=question.kind,
+        declared=[one.name for one in among],
+        left=list(left),
+        verdict="decided" if len(left) == 1 else "still open",
+        evidence="",
+        prints=2,
+        scans=4,
     )
-    result = CloseLoop.model_construct(effects=[effect])
+    return opened([question]), [decision]
+
+
+def test_what_is_decided_gets_its_owner_in_the_result() -> None:
+    before = looped(SLOPE, "slope-thinning", ["layer-stacking"])
+    rivals = slope_question().rivals
     for left, role in ((AS_PRINTER, "process"), (AS_MICROSCOPE, "measurement")):
-        decision = Decision(
-            question="slope-thinning",
-            kind="role",
-            declared=[AS_PRINTER, AS_MICROSCOPE],
-            left=[left],
-            verdict="decided",
-            evidence="",
-            prints=2,
-            scans=4,
-        )
-        [decided] = with_decisions(result, opened([slope_question()]), [decision]).effects
-        assert (decided.role, decided.verdict, decided.confusable_with) == (role, "explained", [])
-        open_still = decision.model_copy(update={"verdict": "still open"})
-        assert with_decisions(result, opened([slope_question()]), [open_still]).effects == [effect]
+        after = with_decisions(before, *decided_for(left, among=rivals))
+        found = _found(after, after.named.causes[0], 0.0)
+        assert (found.role, found.verdict, found.confusable_with) == (role, "explained", [])
+        assert after.final is before.final
+    after = with_decisions(before, *decided_for(AS_PRINTER, AS_MICROSCOPE, among=rivals))
+    assert vars(after.named.causes[0]) == vars(before.named.causes[0])
+
+
+STACKING = {"layer-stacking": {"share": 0.3, "threshold": 0.5, "steepness": 6.0}}
+
+
+def test_an_excluded_cause_makes_way_for_the_one_that_remains() -> None:
+    """Check scans of one effect in which the loop named another. New prints decide for the true one."""
+    before = looped(STACKING, "slope-thinning", ["layer-stacking", "diffusion-blur"])
+    blur = {"diffusion-blur": {"variance_um2": 0.01}}
+    start = {"layer-stacking": {**STACKING["layer-stacking"], "share": 0.2}}
+    rivals = [rival(name, one) for one in (SLOPE, start, blur) for name in one]
+    after = with_decisions(before, *decided_for("layer-stacking", among=rivals))
+    assert after.final.twin.names == after.named.state.twin.names == ("layer-stacking",)
+    assert before.final.twin.names == ("slope-thinning",)
+    [found] = [_found(after, one, 0.0) for one in after.found]
+    assert (found.name, found.role, found.verdict) == ("layer-stacking", "process", "explained")
+    assert found.confusable_with == []
+    # The fitted value is that of these scans and not that of the rival.
+    assert found.strengths["share"][0].value == pytest.approx(0.3, abs=0.03)
+    told = {one.name: one for one in _candidates(after, [found], ())}
+    assert "layer-stacking" not in told
+    for name in ("slope-thinning", "diffusion-blur"):
+        assert told[name].verdict == "contradicted"
+        assert told[name].reason == "later prints exclude it: layer-stacking fits them better"
+    # Two effects remain.
+    after = with_decisions(before, *decided_for("layer-stacking", "diffusion-blur", among=rivals))
+    [found] = [_found(after, one, 0.0) for one in after.found]
+    assert (found.name, found.verdict) == ("layer-stacking", "confusable")
+    assert found.confusable_with == ["diffusion-blur"]
+    assert after.final.twin.names == ("layer-stacking",)
+    # An effect that was not confirmed before is added.
+    suspects = opened([slope_question(name="a or b", kind="suspects", rivals=rivals[1:])])
+    decisions = [
+        one.model_copy(update={"question": "a or b"}) for one in decided_for("layer-stacking", among=[])[1]
+    ]
+    after = with_decisions(before, suspects, decisions)
+    assert [one.name for one in after.found] == ["slope-thinning", "layer-stacking"]
+    assert set(after.final.twin.names) == {"slope-thinning", "layer-stacking"}
 
 
 def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: Path) -> None:
