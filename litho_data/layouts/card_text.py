@@ -10,6 +10,7 @@ from typing import Any
 
 from litho_data.cards.card import check_card
 from litho_data.foundation import YX, Array, Facts
+from litho_data.store.schema import Instrument
 
 CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"
@@ -26,6 +27,7 @@ def write_card(
     scan_size_um: YX,
     scan_format: str = "text-matrix",
     levelled: bool = False,
+    instrument: Instrument = "afm",
     **tables: Facts,
 ) -> Path:
     """Write a dataset card for layouts in the subfolder ``layouts`` and their scans in the subfolder
@@ -43,6 +45,7 @@ def write_card(
         scan_size_um: extent of a scan along y and along x, µm.
         scan_format: format of the microscope's files.
         levelled: whether the scan files will contain levelled heights, which a build uses as they are.
+        instrument: kind of instrument that makes the scans.
         tables: further tables of the card, such as ``ids`` and ``write``; values that are None are omitted.
 
     Raises:
@@ -56,6 +59,7 @@ def write_card(
         "size_um": [round(side, 9) for side in scan_size_um] if plain else None,
         "fast_axis": "x",
         "levelled": levelled or None,
+        "instrument": None if instrument == "afm" else instrument,
     }
     layout = {
         "files": "layouts/{id}.tif",

@@ -64,12 +64,16 @@ def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[Sc
     asking = _Asking(closed)
     found = [asking.of_cause(one) for one in closed.traced]
     stored = closed.study.stored
+    write = stored[0].write or {}
     return OpenQuestions(
         dataset=dataset,
         noise=asking.noise,
         level_share=level_share(stored),
         cutoff_per_um=_cutoff_per_um(stored),
-        write_field_um=(stored[0].write or {}).get("field_um"),
+        write_field_um=write.get("field_um"),
+        slow_axis=closed.study.scans[0].context.slow_axis,
+        surround=write.get("surround"),
+        instrument=stored[0].seen_by,
         questions=[
             *(one for one in (*found, asking.of_suspects()) if one is not None),
             *_of_single_scans(single_scans),

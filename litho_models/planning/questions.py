@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.store.schema import DatasetId
+from litho_data.store.schema import DatasetId, Instrument, Surround
 from litho_models.effects.chain import Frame
 from litho_models.fitting.least_squares import LeastSquaresFit, eliminated_sum, fit_least_squares
 from litho_models.loop.fits import ALL_FREE, RULES, TwinProblem
@@ -177,7 +177,9 @@ class OpenQuestions(Result):
     ``level_share`` contains, for each level, the fraction of earlier layouts that it covers.
     ``cutoff_per_um`` is the spatial frequency of the finest structures in these layouts, cycles/µm, or 0 if
     every layout has only one level.
-    ``write_field_um`` is the width of the write field, or None if it is unknown.
+    ``write_field_um`` is the width of the write field, or None if it is unknown. ``slow_axis`` is the axis
+    perpendicular to the written lines, ``surround`` is what the dataset card says about the surroundings of a
+    print, and ``instrument`` is the kind of instrument that made the scans.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/open-questions/3"
@@ -188,6 +190,9 @@ class OpenQuestions(Result):
     level_share: list[float]
     cutoff_per_um: float
     write_field_um: float | None
+    slow_axis: Literal["y", "x"] = "y"
+    surround: Surround | None = None
+    instrument: Instrument = "afm"
     questions: list[Question]
 
 

@@ -75,13 +75,15 @@ class PlannedPrint:
 @dataclass(frozen=True)
 class Printing:
     """The settings that all planned prints share: the lateral pitch, the height of a level, the highest
-    level, and the width of the write field (None if it is unknown). Lengths are in µm.
+    level, the width of the write field (None if it is unknown), and the axis perpendicular to the written
+    lines. Lengths are in µm.
     """
 
     pitch_um: float
     level_height_um: float
     highest: int
     write_field_um: float | None = None
+    slow_axis: Literal["y", "x"] = "y"
 
     def reach_um(self, printed: PlannedPrint) -> float:
         """Return the distance from the centre of the write field to the centre of a print, µm. The distance
@@ -102,6 +104,7 @@ class Printing:
             self.level_height_um,
             (reach_um, reach_um),
             None if self.write_field_um is None else self.write_field_um / 2,
+            self.slow_axis,
             order=printed.order,
             quarter_turns=way.turned_deg // 90,
             backward=way.direction < 0,

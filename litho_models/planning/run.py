@@ -110,8 +110,9 @@ def next_print(
         report: function that receives the progress messages.
 
     Raises:
-        InputError: ``loop`` contains no closed loop, the layouts of the earlier prints have only one level,
-            there is no print or the prints are too small, or ``out`` contains a plan with other settings.
+        InputError: ``loop`` contains no closed loop on scans of heights, the layouts of the earlier prints
+            have only one level, there is no print or the prints are too small, or ``out`` contains a plan
+            with other settings.
     """
     folder = Path(loop)
     if not (folder / OpenQuestions.FILE_NAME).is_file():
@@ -123,6 +124,10 @@ def next_print(
     open_ = OpenQuestions.read(folder)
     if not open_.questions:
         return None
+    if open_.instrument == "sem":
+        raise InputError(
+            f"closed loop in {loop}", got="electron micrographs of films", wanted="scans of heights"
+        )
     asked = {"prints": prints, "field_um": field_um, "seed": seed, "steps": steps, "layouts": layouts}
     facts = {"dataset": open_.dataset.model_dump(mode="json"), "settings": asked}
     card = ModelCard.read(folder / MODEL_FOLDER)
@@ -136,7 +141,8 @@ def next_print(
     with whole_folder(out, *HOLDS, record=NextPrint.FILE_NAME, facts=facts) as target:
         base = load_simulator(folder / MODEL_FOLDER, card)
         limits = Limits.of(open_, card.pitch_um)
-        printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
+        written = open_.write_field_um, open_.slow_axis
+        printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, *written)
         rivalries = [Rivalry(one, base, printing, open_.noise) for one in open_.questions if one.rivals]
         tile_px = min(TILE_PX, size_px)
         can_move = open_.write_field_um is not None and open_.write_field_um > field_um
@@ -192,7 +198,7 @@ def next_print(
             scans=scans,
             questions=questions,
         )
-        write_plan(target, plan, maps, printing)
+        write_plan(target, plan, maps, printing, open_)
         write_report(target, plan, rivalries, planned)
     shutil.rmtree(cache, ignore_errors=True)
     return plan
@@ -243,7 +249,9 @@ def schedule(
     return scans, [level for _, _, _, level, *_ in rows]
 
 
-def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing) -> None:
+def write_plan(
+    folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], printing: Printing, open_: OpenQuestions
+) -> None:
     """Write the files of a plan: the dataset card, the table of scans, the layouts, the record, and the
     sheets for printer and microscope.
 
@@ -261,13 +269,19 @@ def write_plan(folder: Path, plan: NextPrint, layouts: Sequence[np.ndarray], pri
         levels=printing.highest + 1,
         scan_size_um=(plan.field_um, plan.field_um),
         ids={"print": PRINT_PATTERN, "table": TABLE_NAME},
-        write={"slow_axis": "y", "field_um": printing.write_field_um},
+        instrument=open_.instrument,
+        write={
+            "slow_axis": open_.slow_axis,
+            "field_um": open_.write_field_um,
+            "surround": open_.surround,
+        },
         plan={"dataset_sha256": plan.dataset.sha256},
         grating={"period_um": _grating_um(plan)},
     )
     plan.write(folder)
     for name in (PRINTER_SHEET, MICROSCOPE_SHEET):
-        sheet = filled(_TEMPLATES / f"{name}.jinja", plan=plan, uses=_USES, grating_um=_grating_um(plan))
+        known = {"plan": plan, "uses": _USES, "grating_um": _grating_um(plan), "slow_axis": open_.slow_axis}
+        sheet = filled(_TEMPLATES / f"{name}.jinja", **known)
         with atomic_file(folder / name) as temporary:
             temporary.write_text(sheet, encoding="utf-8")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ from litho_models.models import build_model
 from litho_models.planning import answers
 from litho_models.planning.answers import Z_DECIDED, _pairs, of_rivals, surely_better
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
-from litho_models.planning.open_questions import _Asking, _cutoff_per_um, _owners, _question
+from litho_models.planning.open_questions import _Asking, _cutoff_per_um, _owners, _question, open_questions
 from litho_models.planning.questions import (
     NoiseSpectrum,
     OpenQuestions,
@@ -441,6 +441,38 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     assert rows["N0F1"]["use"] == "substrate"
 
 
+def test_a_plan_keeps_what_the_first_card_says(tmp_path: Path) -> None:
+    write = {"slow_axis": "x", "field_um": 200.0, "surround": "substrate"}
+    closed = looped(SLOPE, "slope-thinning", write=write, seen_by="confocal")
+    open_ = open_questions(closed, opened([]).dataset, [])
+    loop = closed_loop(tmp_path / "loop", [])
+    open_.write(loop)
+    next_print(loop, tmp_path / "plan", prints=2, field_um=6.4, steps=0, layouts="random")
+    card = load_card(tmp_path / "plan" / "card.toml")
+    assert card.write is not None
+    assert card.write.model_dump() == write
+    assert card.scan.instrument == "confocal"
+    sheet = (tmp_path / "plan" / "printer.md").read_text("utf-8")
+    assert "Write the lines along y, each line to the right of the previous one." in sheet
+    open_.model_copy(update={"instrument": "sem"}).write(loop)
+    with pytest.raises(InputError, match="got electron micrographs of films, wanted scans of heights"):
+        next_print(loop, tmp_path / "other")
+
+
+@pytest.mark.parametrize("slow_axis", ["x", "y"])
+def test_written_lines_run_in_a_plan_as_in_the_loop(slow_axis: Literal["x", "y"]) -> None:
+    """Check an effect of the written lines on a planned print and on the same print in the loop."""
+    scan = blank_scan(0, write={"slow_axis": slow_axis})
+    twin = model({"galvo-lag": get_effect("galvo-lag").trials[0]})
+    printed = PlannedPrint(as_tensor(scan.mask_level), (Way(),))
+    with torch.no_grad():
+        planned = Printing(0.1, 0.1, 12, slow_axis=slow_axis).predict(twin.chain(), printed, Way())
+    seen = twin.height(*prepare_scans([scan]))
+    assert np.abs(planned.numpy() - seen).max() < 1e-6
+    other = twin.height(*prepare_scans([replace(scan, write={"slow_axis": "xy"[slow_axis == "x"]})]))
+    assert np.abs(other - seen).max() > 1e-3
+
+
 def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
     loop = closed_loop(tmp_path / "loop", [])
     assert next_print(loop, tmp_path / "plan") is None
@@ -768,14 +800,20 @@ def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_th
     assert known[1] == pytest.approx(known[0], rel=0.1)
 
 
-def looped(effects: dict[str, dict[str, float]], cause: str, alike: Sequence[str]) -> Closed:
-    """Return a loop that named ``cause``, or one of the effects ``alike``, in scans with these effects."""
-    bare = bare_state(study_of(planted([(name, ALL, {"": own}) for name, own in effects.items()], count=8)))
+def looped(
+    effects: dict[str, dict[str, float]], cause: str, alike: Sequence[str] = (), **facts: Any
+) -> Closed:
+    """Return a loop that named ``cause``, or one of the effects ``alike``, in scans with these effects and
+    facts.
+    """
+    made = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=8)
+    bare = bare_state(study_of([replace(scan, **facts) for scan in made]))
     state = fit_state(model({cause: SLOPE.get(cause, {})}), bare.study)
     found = Cause(cause, ALL, tuple(alike), judge_states(bare, state), 0.01, None)
     screened = {name: cast(Any, SimpleNamespace(family_p=0.02)) for name in alike}
     named, lawful, described = Found(state, [found], screened), Found(state), Found(state)
-    return Closed("affine-mtf", {}, bare, bare, named, lawful, described, {}, {})
+    rests = {"base": cast(Any, SimpleNamespace(most_nm=1.0))}
+    return Closed("affine-mtf", {}, bare, bare, named, lawful, described, rests, {})
 
 
 def decided_for(*left: str, among: Sequence[Rival]) -> tuple[OpenQuestions, list[Decision]]:
