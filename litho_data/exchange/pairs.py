@@ -33,6 +33,7 @@ from litho_data.store.read import open_store
 
 _QUADRANTS = (1, 2, 3, 4)
 SCALES_FILE = "src_max_dict.txt"
+_BAD_NAME = "a name may contain only letters, digits, spaces and ._+-, and begins with a letter or digit"
 _AUTHORS_IDS = r"FOV(?P<print>\d)(?P<field>\d)\d?"
 
 
@@ -64,8 +65,8 @@ def import_pairs(
         strict: if true, nothing is built if any field cannot be used; if false, such fields are skipped.
 
     Raises:
-        InputError: the folder has no ``src_max_dict.txt`` or no complete pair, or the pitch or the level
-            height is not positive.
+        InputError: the folder has no ``src_max_dict.txt`` or no complete pair, the name of a file cannot be
+            printed, or the pitch or the level height is not positive.
     """
     root = Path(folder).resolve()
     scales = read_full_scales(root / SCALES_FILE)
@@ -73,7 +74,7 @@ def import_pairs(
     if not fields:
         raise InputError(
             f"complete pairs in {folder}",
-            got="none",
+            got=next((f"none; {name}: {reason}" for name, reason in unpaired.items()), "none"),
             wanted=f"files with the same name in mask/ and afm/, and this name in {SCALES_FILE}",
         )
     card = _card(
@@ -162,10 +163,16 @@ def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int
     reason.
     """
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
+    if unprintable := [name for name in sorted(masks | heights) if not name.isprintable()]:
+        raise InputError(
+            f"file name in {root}", got=ascii(unprintable[0]), wanted="a name of printable characters"
+        )
     unpaired = {f"mask/{name}": "no height file of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout file of this name" for name in sorted(heights - masks)}
     unpaired |= {f"afm/{name}": f"not in {SCALES_FILE}" for name in sorted((masks & heights) - set(scales))}
-    complete = sorted(name for name in masks & heights & set(scales) if SAFE_ID.fullmatch(name))
+    paired = masks & heights & set(scales)
+    complete = sorted(name for name in paired if SAFE_ID.fullmatch(name))
+    unpaired |= {f"afm/{name}": _BAD_NAME for name in sorted(paired.difference(complete))}
     cut: dict[str, dict[int, str]] = {}
     for name in complete:
         stem = Path(name).stem

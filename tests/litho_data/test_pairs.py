@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.exchange.pairs import export_pairs, import_pairs
+from litho_data.exchange.pairs import SCALES_FILE, export_pairs, import_pairs
 from litho_data.foundation.errors import InputError
 from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
@@ -101,6 +101,30 @@ def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
     result = import_pairs(pairs, tmp_path / "back.zarr")
     assert open_store(tmp_path / "back.zarr").ids == ["P11", "P12", "P211", "P212", "P214"]
     assert result.unpaired == {"mask/P213.tif": "no height file of this name"}
+
+
+@pytest.mark.parametrize("name", ["Prüf 1.tif", "-x.tif"])
+def test_pairs_whose_name_cannot_be_an_id_are_listed(campaign: Path, tmp_path: Path, name: str) -> None:
+    pairs = tmp_path / "pairs"
+    export_pairs(campaign / "prints.zarr", pairs)
+    for folder in ("mask", "afm"):
+        (pairs / folder / "P111.tif").rename(pairs / folder / name)
+    scales = (pairs / SCALES_FILE).read_text()
+    (pairs / SCALES_FILE).write_text(scales.replace("P111.tif", name))
+    result = import_pairs(pairs, tmp_path / "back.zarr")
+    assert open_store(tmp_path / "back.zarr").ids == ["P112", "P113", "P114", "P12", "P21"]
+    assert [*result.unpaired] == [f"afm/{name}"]
+    assert "only letters, digits" in result.unpaired[f"afm/{name}"]
+    with pytest.raises(InputError, match="1 ids cannot be used"):
+        import_pairs(pairs, tmp_path / "strict.zarr", strict=True)
+    for folder in ("mask", "afm"):
+        for one in (pairs / folder).glob("P[12]*"):
+            one.unlink()
+    with pytest.raises(InputError, match="only letters, digits"):
+        import_pairs(pairs, tmp_path / "none.zarr")
+    (pairs / "afm" / name).rename(pairs / "afm" / "Pr\n.tif")
+    with pytest.raises(InputError, match=r"Pr\\n\.tif', wanted a name of printable characters"):
+        import_pairs(pairs, tmp_path / "none.zarr")
 
 
 def test_a_folder_that_is_not_in_the_pair_format_is_refused(tmp_path: Path) -> None:
