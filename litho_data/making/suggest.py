@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -59,8 +59,8 @@ _SCANS = 3
 # recipe's residual.
 _BETTER = 0.95
 _BLOCK_PX, _BORDER_PX, _BLUR_PX = 16, 6, 1.5
-_LEVEL_LINE = re.compile(r"^\s*level\s*=.*$\n?", re.MULTILINE)
-_PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
+_LEVEL_LINE = re.compile(r"^[ \t]*(process[ \t]*\.[ \t]*)?level[ \t]*=.*$\n?", re.MULTILINE)
+_PROCESS = re.compile(r"^[ \t]*\[[ \t]*process[ \t]*\][ \t]*(#.*)?$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,8 @@ def suggest_recipe(
         data_dir: folder of the raw files, as for ``build_dataset``.
 
     Raises:
-        InputError: the card is bad or describes micrographs, no scan can be read and registered, or no recipe
-            can be applied.
+        InputError: the card is bad or describes micrographs, no scan can be read and registered, no recipe
+            can be applied, or the card has no line where the recipe can be named.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
@@ -192,18 +192,41 @@ def left_by_layout(height_um: Array, layout: Array) -> float:
 def _write_card(card: Path, best: str) -> Path:
     """Write the recipe, and a copy of the card in which ``process.level`` names this recipe. The other text
     of the card stays unchanged. Return the path of the copy.
+
+    Raises:
+        InputError: there is no line in the card where the recipe can be named, as in an inline table.
     """
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
-    text = _LEVEL_LINE.sub("", card.read_text(encoding="utf-8"))
-    line = f'level = "{recipe.name}"'
-    if _PROCESS.search(text):
-        text = _PROCESS.sub(f"[process]\n{line}", text)
+    before = card.read_text(encoding="utf-8")
+    wanted = tomllib.loads(before)
+    text, line = _LEVEL_LINE.sub("", before), f'level = "{recipe.name}"'
+    if heading := _PROCESS.search(text):
+        text = f"{text[: heading.end()]}\n{line}{text[heading.end() :]}"
+    elif "process" in wanted:
+        # The table consists of lines such as ``process.tip = 0.01``, which stand before all headings.
+        text = f"process.{line}\n{text}"
     else:
         text = f"{text.rstrip()}\n\n[process]\n{line}\n"
+    wanted["process"] = {**wanted.get("process", {}), "level": recipe.name}
+    if not _says(text, wanted):
+        raise InputError(
+            f"card {card}: table process",
+            got="no line where the recipe can be named",
+            wanted="a heading [process], and one line for each key",
+            hint=f"the best recipe is {best!r}",
+        )
     for path, content in ((recipe, f'name = "{best}"\n\n{RECIPES[best]}'), (target, text)):
         with atomic_file(path) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return target
+
+
+def _says(text: str, content: Mapping[str, Any]) -> bool:
+    """Return whether a text is TOML with this content."""
+    try:
+        return tomllib.loads(text) == content
+    except tomllib.TOMLDecodeError:
+        return False
 
 
 def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:

@@ -136,20 +136,45 @@ def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
     assert not list(card.parent.glob("*.zarr"))
 
 
-@pytest.mark.parametrize("text", ["", "[process]\nregistration = 'affine'\n", BOW])
-def test_a_suggested_card_keeps_all_other_entries(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    ("first", "last"),
+    [
+        ("", ""),
+        ("", "[process]\nregistration = 'ladder'\n"),
+        ("", "[ process ]   # how\ntip = 0.01\nlevel = 'old.toml'\n\n[ids]\nprint = '(?P<print>.)1'\n"),
+        ("process.registration = 'ladder'\n", ""),
+        ("process.level = 'old.toml'\nprocess.tip = 0.01  # µm\n", ""),
+        ("", BOW),
+    ],
+)
+def test_a_suggested_card_keeps_all_other_entries(tmp_path: Path, first: str, last: str) -> None:
     from litho_data.making.suggest import _write_card
 
     card = tmp_path / "card.toml"
     card.write_text(
-        'name = "p"\n[layout]\nfiles = "l/{id}.tif"\npitch_um = 0.1\nlevel_height_um = 0.1\nlevels = 5\n'
-        f'[scan]\nfiles = "s/{{id}}.gwy"\n{text}'
+        f'name = "p"\n{first}'
+        '[layout]\nfiles = "l/{id}.tif"\npitch_um = 0.1\nlevel_height_um = 0.1\nlevels = 5\n'
+        f'[scan]\nfiles = "s/{{id}}.gwy"\n{last}',
+        encoding="utf-8",
     )
     before, after = load_card(card), load_card(_write_card(card, "plane"))
     assert after.process.level == "card.recipe.toml"
     assert Recipe.from_toml(tmp_path / "card.recipe.toml").step[0].op == "layout-aware"
-    same = after.model_copy(update={"process": before.process})
-    assert same == before
+    level = {"level": after.process.level}
+    assert after == before.model_copy(update={"process": before.process.model_copy(update=level)})
+
+
+@pytest.mark.parametrize(
+    "text", ["process = {registration = 'affine'}\n", 'citation = """\nlevel = 1\n[process]\n"""\n']
+)
+def test_a_suggested_card_that_would_say_something_else_is_not_written(tmp_path: Path, text: str) -> None:
+    from litho_data.making.suggest import _write_card
+
+    card = tmp_path / "card.toml"
+    card.write_text(text)
+    with pytest.raises(InputError, match=r"table process, got no line.* the best recipe is 'plane'"):
+        _write_card(card, "plane")
+    assert [*tmp_path.iterdir()] == [card]
 
 
 def test_the_residual_of_the_layout_is_noise_tilt_and_lost_print() -> None:
