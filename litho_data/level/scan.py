@@ -61,17 +61,22 @@ def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
         out: a ``.gsf`` or ``.npy`` file.
 
     Raises:
-        InputError: a step cannot be applied, or ``out`` has another suffix.
+        InputError: a step cannot be applied, ``out`` has another suffix, or the scan's own file would be
+            overwritten.
     """
-    levelled, removed = recipe.apply(scan)
     target = Path(out)
     removed_file = target.with_name(f"{target.stem}.removed{target.suffix}")
+    for file in (target, removed_file):
+        if file.exists() and file.samefile(scan.source):
+            raise InputError("output", got=f"{file}, which is the scan itself", wanted="another file")
+    levelled, removed = recipe.apply(scan)
+    source_sha256 = file_sha256(scan.source)
     write_heights(target, levelled, pitch_um=scan.pitch_um, title=f"{scan.name} levelled")
     write_heights(removed_file, removed, pitch_um=scan.pitch_um, title=f"{scan.name} removed")
     record = LevelRecord(
         **run_facts(),
         source=scan.source,
-        source_sha256=file_sha256(scan.source),
+        source_sha256=source_sha256,
         channel=scan.channel,
         pitch_um=scan.pitch_um,
         recipe=recipe.canonical(),

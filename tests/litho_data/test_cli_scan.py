@@ -188,6 +188,16 @@ def test_a_full_disk_is_one_line_and_exit_code_2(app, scan_file: Path, monkeypat
     assert "cannot use somewhere, got no space left on device; make room" in line
 
 
+@pytest.mark.parametrize("name", ["a.gsf", "a.removed.gsf"])
+def test_the_levelled_scan_never_replaces_its_source(tmp_path: Path, name: str) -> None:
+    source = write_heights(tmp_path / name, HEIGHT_UM, pitch_um=(0.1, 0.1))
+    before = source.read_bytes()
+    with pytest.raises(InputError, match="which is the scan itself"):
+        write_levelled(read_scan(source), Recipe.from_dict({"step": [{"op": "plane"}]}), tmp_path / "a.gsf")
+    assert source.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [source]
+
+
 def test_a_step_that_fails_writes_nothing(tmp_path: Path) -> None:
     scan = Scan(height_um=HEIGHT_UM, pitch_um=None, source="scan")
     with pytest.raises(InputError, match="pixel pitch"):
