@@ -194,9 +194,11 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
 def _relative(folder: Path, start: Path) -> str:
     """Return the path of a folder relative to the folder ``start``. A relative path stays valid if raw files
     and store are moved together.
+
+    Links in both paths are followed first, because ``..`` leads out of the folder to which a link points.
     """
     try:
-        return Path(os.path.relpath(folder, start)).as_posix()
+        return Path(os.path.relpath(folder.resolve(), start.resolve())).as_posix()
     except ValueError:  # on Windows, the folders may be on different drives
         return str(folder)
 

@@ -105,7 +105,7 @@ def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
     if data_dir is not None:
         return require_folder(data_dir)
     names = [row["path"] for row in store.manifest["files"] if row["status"] == "ok"]
-    recorded = store.path.parent / store.manifest["build"]["data_dir"]
+    recorded = store.path.resolve().parent / store.manifest["build"]["data_dir"]
     for folder in (recorded, *known_folders(store.name)):
         if any((folder / name).is_file() for name in names):
             return folder.resolve()

@@ -16,11 +16,11 @@ import tifffile
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
-from litho_data.making.build import build_dataset
+from litho_data.making.build import _relative, build_dataset
 from litho_data.making.jobs import field_jobs, finish
 from litho_data.making.operations import no_recipe
 from litho_data.making.result import BuildResult, report_folder
-from litho_data.provenance.history import read_steps, replay
+from litho_data.provenance.history import raw_folder, read_steps, replay
 from litho_data.provenance.verify import verify
 from litho_data.readers.gsf import gsf_bytes
 from litho_data.store import open_store
@@ -170,6 +170,17 @@ def test_the_manifest_does_not_depend_on_where_the_raw_files_lie(
         ]
     assert len(hashes) == 1
     assert str(tmp_path) not in capsys.readouterr().err
+
+
+def test_the_raw_files_are_found_through_links(own_campaign: Path) -> None:
+    deep, link = own_campaign / "a" / "b", own_campaign / "link"
+    deep.mkdir(parents=True)
+    link.symlink_to(deep)
+    for start in (own_campaign, deep, link):
+        assert (start / _relative(own_campaign, start)).samefile(own_campaign)
+        assert _relative(start, own_campaign) == _relative(start.resolve(), own_campaign)
+    (link / "latest.zarr").symlink_to(own_campaign / "prints.zarr")
+    assert raw_folder(open_store(link / "latest.zarr")) == own_campaign.resolve()
 
 
 def test_isolated_gaps_are_not_valid(tmp_path: Path) -> None:
