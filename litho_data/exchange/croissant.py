@@ -16,13 +16,15 @@ _CONTEXT = json.loads(Path(__file__).with_name("croissant.json").read_text(encod
 _TYPES = {"i": "sc:Integer", "f": "sc:Float", "b": "sc:Boolean"}
 
 
-def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any]:
+def croissant(root: Facts, files: Sequence[Facts], file: str, table: pd.DataFrame) -> dict[str, Any]:
     """Return the Croissant description of a release as JSON-LD.
 
     Args:
         root: the entry that describes the dataset in the RO-Crate.
         files: the entries that describe the files of the release in the RO-Crate.
-        table: CSV file with one row per scan; the description lists its columns.
+        file: name of the CSV file that contains the table.
+        table: the table, with one row per scan; the description lists its columns. The types of the columns
+            are not read from the CSV file, in which an id such as 01 looks like a number.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}
     said |= {"license": root["license"]["@id"]} if "license" in root else {}
@@ -33,9 +35,9 @@ def croissant(root: Facts, files: Sequence[Facts], table: Path) -> dict[str, Any
             "@id": f"scans/{name}",
             "name": name,
             "dataType": _TYPES.get(column.dtype.kind, "sc:Text"),
-            "source": {"fileObject": {"@id": table.name}, "extract": {"column": name}},
+            "source": {"fileObject": {"@id": file}, "extract": {"column": name}},
         }
-        for name, column in pd.read_csv(table).items()
+        for name, column in table.items()
     ]
     return {
         "@context": _CONTEXT,

@@ -12,10 +12,17 @@ from litho_data.exchange.croissant import croissant
 from litho_data.foundation import InputError, atomic_file, file_sha256
 from litho_data.foundation.begun import whole_folder
 from litho_data.store.read import Store, open_store
+from litho_data.store.schema import Instrument
 
 # A zip archive states a time for every file. A fixed time makes the archives of the same store identical.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE, _CROISSANT_FILE = "ro-crate-metadata.json", "croissant.json"
+_MEASURED_BY: dict[Instrument, str] = {
+    "afm": "AFM",
+    "profilometer": "profilometry",
+    "confocal": "confocal microscopy",
+    "sem": "SEM",
+}
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
 
 
@@ -62,7 +69,7 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
             _file(table, "text/csv", "Quality of each scan: registration, levelling and noise"),
         ]
         root = _root(store)
-        _write(folder / _CROISSANT_FILE, croissant(root, files, table))
+        _write(folder / _CROISSANT_FILE, croissant(root, files, table.name, store.quality))
         files.append(_file(folder / _CROISSANT_FILE, "application/ld+json", "Description in Croissant"))
         content = {"@context": f"{_CRATE_VERSION}/context", "@graph": _graph(store, root, files)}
         _write(folder / _CRATE_FILE, content)
@@ -77,12 +84,13 @@ def _root(store: Store) -> dict[str, Any]:
     """Return the entry that describes the dataset in the RO-Crate."""
     manifest = store.manifest
     card = manifest["card"]
+    by = _MEASURED_BY[store.instrument]
     root: dict[str, Any] = {
         "@id": "./",
         "@type": "Dataset",
         "name": card.get("title") or store.name,
         "identifier": f"sha256:{store.sha256}",
-        "description": f"{len(store)} printed fields measured by AFM and registered onto their layouts, "
+        "description": f"{len(store)} printed fields measured by {by} and registered onto their layouts, "
         f"{store.pitch_um} µm per pixel, levels of {store.level_height_um} µm",
         "datePublished": manifest["build"]["started"][:10],
     }

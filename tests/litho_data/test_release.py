@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from typing import get_args
 
+import numpy as np
+import pandas as pd
 import pytest
 
+from litho_data.exchange.croissant import croissant
 from litho_data.exchange.pairs import export_pairs
-from litho_data.exchange.release import export_ro_crate, export_zip
+from litho_data.exchange.release import _root, export_ro_crate, export_zip
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
+from litho_data.store.schema import Instrument
 
 
 def test_one_file_reads_as_the_folder_does(campaign: Path, tmp_path: Path) -> None:
@@ -56,6 +61,22 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
     assert action["startTime"] < action["endTime"]
     # RO-Crate 1.1 requires these entries of every root dataset.
     assert {"name", "description", "datePublished"} <= set(root)
+
+
+@pytest.mark.parametrize("instrument", get_args(Instrument))
+def test_the_crate_names_the_instrument(instrument: Instrument, campaign: Path) -> None:
+    store = open_store(campaign / "prints.zarr")
+    store.instrument = instrument
+    assert (" AFM " in _root(store)["description"]) == (instrument == "afm")
+
+
+def test_words_are_words_for_croissant() -> None:
+    """Check a column whose ids look like numbers and one that is empty for all scans."""
+    table = pd.DataFrame({"scan": ["01", "02"], "reason": ["", ""], "passed": [True, False], "px": [1, 2]})
+    root = dict.fromkeys(("name", "description", "datePublished"), "")
+    fields = croissant(root, [], "quality.csv", table.assign(error=[0.5, np.nan]))["recordSet"][0]["field"]
+    types = [one["dataType"].removeprefix("sc:") for one in fields]
+    assert types == ["Text", "Text", "Boolean", "Integer", "Float"]
 
 
 @pytest.mark.parametrize(
