@@ -21,6 +21,8 @@ from litho_design.images.noise import DRAWS, noise_of_light
 from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
+# Above this number of periods of the finest fringes per camera pixel, real spots are as narrow as hot pixels.
+_COARSE = 0.25
 _SMALLEST_CORRELATION = 0.45
 # Largest allowed share of pixels clipped at the bright or dark end. A larger share would change the
 # similarity.
@@ -247,14 +249,23 @@ def photographed_image(
             is averaged as much; 0 if the image contains values at points.
 
     Raises:
-        InputError: the file is not an image, the pitch is not positive, or the orientation is unknown. The
-            error is also raised if the photograph is overexposed, not linear, unlike the expected image,
-            mirrored or rotated.
+        InputError: the file is not an image, the pitch is not positive or too coarse for the light, or the
+            orientation is unknown. The error is also raised if the photograph is overexposed, not linear,
+            unlike the expected image, mirrored or rotated.
     """
     photo_file, pitch_um, pitch_sd = source.path, source.pitch_um, source.pitch_sd
     dark_level, orientation = source.dark_level, source.orientation
     if not pitch_um > 0 or not pitch_sd >= 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm ± {pitch_sd}", wanted="a positive number")
+    # The finest fringes need two pixels per period. The limit is rounded down to whole nanometres.
+    coarsest_um = math.floor(500 / finest_per_um) / 1000
+    if pitch_um > coarsest_um:
+        raise InputError(
+            "camera pitch",
+            got=f"{pitch_um:g} µm, too coarse for the finest detail of the light",
+            wanted=f"at most {coarsest_um:g} µm",
+            hint="use a higher magnification",
+        )
     require_known("camera orientation", orientation, ORIENTATIONS)
     raw, notes = read_grey(photo_file, "photograph")
     photo = raw.astype(np.float32)
@@ -267,7 +278,7 @@ def photographed_image(
             wanted=f"at most {100 * _LARGEST_SATURATED:g} %",
             hint="use a shorter exposure" if saturated > cut_off else "raise the black level above the noise",
         )
-    cleaned, replaced = _replace_outliers(photo)
+    cleaned, replaced = _replace_outliers(photo, pitch_um * finest_per_um)
     if source.flat is not None:
         cleaned = _flattened(cleaned, source.flat, dark_level)
     wanted, scale = wanted.astype(np.float32) / wanted.max(), pitch_um / wanted_pitch_um
@@ -414,9 +425,10 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
     )
 
 
-def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
+def _replace_outliers(photo: np.ndarray, finest_per_px: float) -> tuple[np.ndarray, int]:
     """Replace outliers by the median of their 3 x 3 neighbourhood. Outliers deviate from this median by much
-    more than most pixels.
+    more than most pixels. If the light has detail that is not much wider than a pixel (``finest_per_px``,
+    cycles/px), outliers also lie as far beyond all of their neighbours.
     """
     import cv2
 
@@ -426,7 +438,11 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
     spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
     # The brightest value is taken from the median-filtered image, so that a hot pixel cannot determine it.
     bright = float(median.max())
-    outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
+    limit = np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
+    outliers = np.abs(difference) > limit
+    if finest_per_px > _COARSE:
+        ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+        outliers &= (lit - cv2.dilate(lit, ring) > limit) | (cv2.erode(lit, ring) - lit > limit)
     return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())
 
 

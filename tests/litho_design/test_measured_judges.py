@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.special import erf
+from scipy.special import erf, j1
 
 from benchmarks.coverage import Camera
 from litho_data.foundation.errors import InputError
@@ -21,6 +21,7 @@ from litho_design.images.photograph import (
     Photograph,
     _dark_level,
     _Fit,
+    _replace_outliers,
     _saturated,
     photographed_image,
 )
@@ -273,6 +274,26 @@ def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_wh
     assert whole[0] == pytest.approx(800, abs=310)
 
 
+@pytest.mark.parametrize("middle", [20.0, 20.5])
+def test_the_finest_spot_of_the_light_is_not_replaced_as_a_hot_pixel(middle):
+    """Check an Airy spot with 0.4 periods of its finest detail per pixel, in the middle of a pixel and
+    between two pixels.
+    """
+    y, x = np.mgrid[:41, :41]
+    v = np.pi * 0.4 * np.hypot(y - 20, x - middle) + 1e-9
+    spot = (300 + 30000 * np.square(2 * j1(v) / v)).astype(np.float32)
+    cleaned, replaced = _replace_outliers(spot, 0.4)
+    assert replaced == 0
+    assert np.array_equal(cleaned, spot)
+    hot = spot.copy()
+    hot[8, 30] = 65535
+    assert _replace_outliers(hot, 0.4)[1] == 1
+    # If the light has no such fine detail, two hot pixels beside each other are found too.
+    wide = cv2.GaussianBlur(spot, (0, 0), 3.0)
+    wide[8, 30:32] = 65535
+    assert _replace_outliers(wide, 0.1)[1] == 2
+
+
 class Power(Record):
     """Hold two scores: one is linear in the measured values, the other is not."""
 
@@ -394,7 +415,7 @@ def test_the_scale_of_a_photograph_is_as_uncertain_as_its_pitch_or_the_print(
     light, pitch_um = loaded.image(loaded.expected_um), loaded.record.layout.pitch_um
     cv2.imwrite(str(tmp_path / "photo.png"), Camera(turn_deg=1.0, noise=1e-3).counts(light, pitch_um, 0))
     source = PhotoSource(tmp_path / "photo.png", 0.15, pitch_sd=pitch_sd, dark_level=DARK)
-    photo = photographed_image(light, pitch_um, source, 4.0)
+    photo = photographed_image(light, pitch_um, source, 2.0)
     assert (len(photo.other_warps), len(photo.other_tilts)) == (movements, 2)
     area = np.linalg.det(photo.window_to_photo)
     scales = [np.sqrt(np.linalg.det(one) / area) - 1 for one, _ in photo.other_warps]
@@ -466,7 +487,9 @@ def test_a_photograph_of_something_else_is_refused(tmp_path, printed_design):
     named = PhotoSource(tmp_path / "flat.png", 0.2, imaged="text")
     with pytest.raises(InputError, match=r"hologram.*--camera-object"):
         score_design(printed_design, tmp_path / "s", judges=[], camera=named)
-    with pytest.raises(InputError, match="pitch"):
-        score_design(
-            printed_design, tmp_path / "s", judges=[], camera=PhotoSource(tmp_path / "flat.png", 0.0)
-        )
+    # The light has 0.66 periods per µm, so pixels of 1 µm are too coarse for it.
+    for pitch_um, complaint in ((0.0, "pitch"), (1.0, r"got 1 µm, .* at most 0\.\d+ µm")):
+        with pytest.raises(InputError, match=complaint):
+            score_design(
+                printed_design, tmp_path / "s", judges=[], camera=PhotoSource(tmp_path / "flat.png", pitch_um)
+            )
