@@ -91,7 +91,8 @@ def light_figures(share: Tensor, target: Tensor) -> dict[str, float]:
     shape (m, m).
     """
     lit, dark = share[target > 0.5], share[target <= 0.5]
-    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
+    # torch.quantile accepts at most 16 million values.
+    low, high = np.quantile(lit.detach().cpu().numpy(), (0.05, 0.95)).tolist()
     return {
         "eff_signal": float(lit.sum()),
         "eff_window": float(share.sum()),

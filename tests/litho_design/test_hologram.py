@@ -108,6 +108,14 @@ def test_the_light_of_four_pixels():
     assert light_figures(share, target) == pytest.approx(wanted)
 
 
+def test_the_uniformity_of_more_than_16_million_pixels():
+    """Check evenly spaced values from 0 to 1, whose percentiles are 0.05 and 0.95."""
+    share = torch.linspace(0, 1, 2**24 + 2)
+    target = torch.ones_like(share)
+    target[0] = 0
+    assert light_figures(share, target)["uniformity"] == pytest.approx(0.1, abs=1e-5)
+
+
 def test_si_psnr_ignores_scale():
     generator = torch.Generator().manual_seed(0)
     image, target = (torch.rand(32, 32, generator=generator).double() for _ in range(2))
