@@ -30,7 +30,11 @@ def wave_through_relief(
         height_um: heights of 0 or more, µm, shape (..., ny, nx).
         index: refractive index of the resist. The medium above the relief is air.
     """
+    transmission = math.sqrt(1 - ((index - 1) / (index + 1)) ** 2)
     highest_um = float(height_um.detach().max())
+    if highest_um == 0:
+        # A flat surface has no slices.
+        return field * transmission
     count = max(1, math.ceil(highest_um * _SLICES_PER_WAVELENGTH / wavelength_um))
     thick_um = highest_um / count
     ny, nx = field.shape[-2:]
@@ -51,4 +55,4 @@ def wave_through_relief(
         resist, air = (torch.fft.ifft2(spectrum * transfer) for transfer in (in_resist, in_air))
         field = share * resist + (1 - share) * air
     back = torch.fft.ifft2(torch.fft.fft2(field) * carried(1.0, -highest_um))
-    return back * math.sqrt(1 - ((index - 1) / (index + 1)) ** 2)
+    return back * transmission

@@ -51,6 +51,15 @@ def test_a_smooth_and_low_relief_is_a_thin_element_but_for_its_reflection():
     assert (ratio / ratio.mean() - 1).abs().max() < 2e-3
 
 
+@pytest.mark.parametrize("height_um", [0.0, 0.7])
+def test_a_flat_relief_only_reflects(height_um):
+    grid = centred_grid((32, 32), 0.1)
+    field = element_field(torch.full((32, 32), height_um), grid, Optics(element="thick"))
+    # The reflected share is (0.548 / 2.548)^2, and the height of a plate does not change the wave.
+    amplitude = math.sqrt(1 - (0.548 / 2.548) ** 2) / 3.2
+    torch.testing.assert_close(field, torch.full_like(field, amplitude))
+
+
 def test_an_element_is_thick_if_its_optics_state_it():
     grid = centred_grid((64, 64), 0.1)
     height = 0.8 * torch.rand(64, 64, generator=torch.Generator().manual_seed(0))
