@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableMapping
 from typing import Literal
 
+import torch
 from torch import Tensor, nn
 
 from litho_models.effects.effect import ActsOn, FieldContext
@@ -59,15 +60,19 @@ class EffectChain(nn.Module):
         known: Fields | None = None,
         base_key: object = None,
     ) -> Tensor:
-        """Return the predicted height, µm, of shape (b, 1, ny, nx). If no context is given, the layout is
+        """Return the predicted height, µm, of shape (b, 1, ny, nx). If no context is given, each layout is
         assumed to fill the whole write field.
 
         Args:
+            context: facts about the scan to predict. The layout must then be a single one.
             known: cache of intermediate fields that this chain or other chains have already computed for the
                 same scan: the output of the base and that of each effect. Newly computed fields are added to
                 this cache.
             base_key: value that identifies the base if chains with different bases share the cache ``known``.
         """
+        if context is None and len(layout_um) > 1:
+            # A context describes a single field, and so do the formulas of many effects.
+            return torch.cat([self(one) for one in layout_um.split(1)])
         if context is None:
             assert isinstance(self.base, Simulator)
             geometry = self.base.config

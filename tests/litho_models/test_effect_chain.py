@@ -8,12 +8,14 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE
 from litho_models.effects.chain import EffectChain
+from litho_models.effects.films import FILM_LAWS
 from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
 pytestmark = pytest.mark.numerics
 
 LAYOUT = (torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(0)) * 12).floor() / 10
+_MODELLED = {one.name: one for one in (*CATALOGUE.values(), *FILM_LAWS.values()) if not one.per_scan}
 MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement" and not e.per_scan]
 
 
@@ -55,6 +57,18 @@ def test_a_corrected_model_freezes_and_loads_to_the_same_heights(tmp_path) -> No
     save_frozen(chain.base, tmp_path / "model", process_effects=chain.values)
     loaded = load_frozen(tmp_path / "model")
     assert torch.equal(loaded(LAYOUT), chain(LAYOUT).detach())
+
+
+@pytest.mark.parametrize("name", [*_MODELLED])
+def test_a_batch_of_two_layouts_gives_the_two_single_prints(name) -> None:
+    typical = {key: p.typical for key, p in _MODELLED[name].parameters.items()}
+    chain = EffectChain(build_model("affine"), {name: typical})
+    two = torch.cat([LAYOUT, LAYOUT.flip(-1) / 2]).requires_grad_()
+    heights = chain(two)
+    assert torch.equal(heights, torch.cat([chain(two[:1]), chain(two[1:])]))
+    slopes = torch.autograd.grad(heights[1].sum(), two)[0]
+    assert not slopes[0].any()
+    assert slopes[1].any()
 
 
 def _context():
