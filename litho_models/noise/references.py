@@ -134,13 +134,18 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
     variance of the noise is half the variance of the difference between two such prints. Return None if there
     are no repeated prints.
 
+    Scans that may show the same printed field count once, because their difference does not contain the
+    noise of the print. Only the first of them is used.
+
     The mean absolute value of the noise is the mean absolute difference divided by √2. This relation is exact
     for Gaussian noise, and correct within a few percent for other distributions of the noise (see
     ``estimated_floor``).
     """
     groups: dict[tuple[object, ...], list[PrintedScan]] = {}
     for scan in scans:
-        groups.setdefault((scan.shape, scan.dose, scan.mask_level.tobytes()), []).append(scan)
+        group = groups.setdefault((scan.shape, scan.dose, scan.mask_level.tobytes()), [])
+        if all(_different_fields(scan, other) for other in group):
+            group.append(scan)
     sigmas, absolute, members = [], [], set()
     for first, second in (pair for group in groups.values() for pair in combinations(group, 2)):
         difference = np.where(first.valid & second.valid, first.height_um - second.height_um, np.nan)
@@ -159,3 +164,12 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
         mae_nm=float(np.mean(absolute)),
         scans=len(members),
     )
+
+
+def _different_fields(first: PrintedScan, second: PrintedScan) -> bool:
+    """Return True if two scans show different printed fields: those of two prints, or two fields of one print
+    whose positions are both stated.
+    """
+    places = [(scan.field_x_um, scan.field_y_um) for scan in (first, second)]
+    stated = all(None not in place for place in places)
+    return first.print_id != second.print_id or (stated and places[0] != places[1])

@@ -326,6 +326,7 @@ def test_repeated_prints_give_their_noise():
         replace(
             first,
             id=f"R{n}",
+            print_id=f"R{n}",
             height_um=(first.height_um + rough((128, 128), 0.012, n) + 0.05 * n).astype(np.float32),
         )
         for n in range(3)
@@ -339,7 +340,35 @@ def test_repeated_prints_give_their_noise():
 
 def test_other_doses_are_no_repeats():
     first = make_scans(1, size_px=64)[0]
-    assert repeated_prints([replace(first, id=f"D{dose}", dose=dose) for dose in (0.9, 1.1)]) is None
+    doses = [replace(first, id=f"D{dose}", print_id=f"D{dose}", dose=dose) for dose in (0.9, 1.1)]
+    assert repeated_prints(doses) is None
+
+
+@pytest.mark.parametrize("places", [(None, None), (0.0, 30.0)])
+def test_two_scans_of_one_field_are_no_repeats(places):
+    """Check two fields that are each scanned twice. The roughness of a field is the same in both scans."""
+    first = make_scans(1, size_px=128, noise_um=0.0)[0]
+    scans = [
+        replace(
+            first,
+            id=f"F{field}S{scan}",
+            print_id="one" if places[field] is not None else f"P{field}",
+            field_x_um=places[field],
+            field_y_um=places[field],
+            direction=(1.0, -1.0)[scan],
+            height_um=first.height_um
+            + rough((128, 128), 0.016, field).astype(np.float32)
+            + rough((128, 128), 0.002, 10 + 2 * field + scan).astype(np.float32),
+        )
+        for field in range(2)
+        for scan in range(2)
+    ]
+    assert repeated_prints(scans[:2]) is None
+    found = repeated_prints(scans)
+    assert found.scans == 2
+    assert found.sigma_nm == pytest.approx(np.hypot(16, 2), rel=0.03)
+    # Without a stated position, two scans of one print may show the same field.
+    assert repeated_prints([replace(scan, print_id="one", field_y_um=None) for scan in scans]) is None
 
 
 # --- the budget ---------------------------------------------------------------------------------
