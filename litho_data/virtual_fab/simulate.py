@@ -128,7 +128,7 @@ def simulate(
             scans.append(_scan_truth(scan))
         _write_table(raw, rows)
         in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
-        tables: dict[str, dict[str, Any]] = {
+        tables: dict[str, Any] = {
             "ids": {"print": print_pattern if in_prints else None, "table": TABLE_NAME},
             "write": {"slow_axis": "y", "field_um": job.write_field_um},
         }
