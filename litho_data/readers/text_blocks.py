@@ -25,7 +25,8 @@ _FEWEST_NULS = 0.8
 # A line with at least this many equal words is a row of missing pixels.
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
-_QUOTED = re.compile(r'"([^",\n]*)"')
+# Cells that contain a comma are matched too. Otherwise, their closing mark would count as an opening mark.
+_QUOTED = re.compile(r'"([^",\n]*)"|("[^"\n]*")')
 # Keys are compared only by their letters and digits.
 _NO_LETTER = re.compile(r"[\W_]+")
 WORDS = table_beside(__file__, "words.toml")
@@ -174,7 +175,7 @@ def read_text(path: Path) -> str:
 
 def without_quotes(text: str) -> str:
     """Remove the quotation marks around the cells of a text, except around cells that contain a comma."""
-    return _QUOTED.sub(r"\1", text)
+    return _QUOTED.sub(r"\1\2", text)
 
 
 def blocks_of(text: str) -> list[Block]:

@@ -12,6 +12,7 @@ import pytest
 
 from litho_data.cards import listing
 from litho_data.cards.listing import list_fields
+from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
 from tests.litho_data.campaigns import card_text
 
@@ -205,6 +206,18 @@ def test_a_table_as_spreadsheets_of_any_language_write_it(tmp_path: Path, separa
     says = {"unit": "nm", "size_um": (27.5, 27.5), "format": "auto", "channel": "Höhe", "fast_axis": "y"}
     assert one.read == says
     assert (other.columns, other.read) == ({"dose": 0.75}, {"size_um": (54.0, 27.5)})
+
+
+@pytest.mark.parametrize("row", ["P11;1,5;2;b", "P11;2;1,5;b", "P11;1,5;0,5;a, b", "P11;;1,5;"])
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_quotation_marks_around_all_cells_change_no_table(tmp_path: Path, separator: str, row: str) -> None:
+    cells = [line.split(";") for line in ("id;dose;field_x_um;instrument", row)]
+    tables = []
+    for mark in ("", '"'):
+        lines = (separator.join(f"{mark}{cell}{mark}" for cell in line) for line in cells)
+        (tmp_path / "scans.csv").write_text("\n".join(lines))
+        tables.append(read_table(tmp_path / "scans.csv"))
+    assert tables[0] == tables[1] != {}
 
 
 @pytest.mark.parametrize(
