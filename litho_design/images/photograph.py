@@ -62,13 +62,14 @@ class CameraRecord(Record):
     photographed object.
 
     ``orientation`` is the operation that brings the photograph into the orientation of the image;
-    ``ambiguous`` lists other operations that fit equally well. ``noise_counts`` is the standard deviation of
-    the noise in the dark, and ``noise_share`` is that of the additional noise, relative to the light.
-    ``position_sd_um`` is the standard deviation of the fitted position along one axis, and ``scale_sd`` is
-    the relative standard deviation of the fitted scale. ``vignetting_sd`` is the standard deviation of the
-    possible loss of light in the camera's corners. ``blur_um`` is the standard deviation (radius) of the
-    fitted blur that is added to the expected image. The counts are proportional to a power of the light, and
-    ``gamma`` is the fitted exponent.
+    ``ambiguous`` lists other operations that fit equally well. ``photo_to_window`` is a 3 x 3 matrix that
+    acts on ``(x, y, 1)`` and maps pixels of the file to pixels of the expected image. ``noise_counts`` is the
+    standard deviation of the noise in the dark, and ``noise_share`` is that of the additional noise, relative
+    to the light. ``position_sd_um`` is the standard deviation of the fitted position along one axis, and
+    ``scale_sd`` is the relative standard deviation of the fitted scale. ``vignetting_sd`` is the standard
+    deviation of the possible loss of light in the camera's corners. ``blur_um`` is the standard deviation
+    (radius) of the fitted blur that is added to the expected image. The counts are proportional to a power of
+    the light, and ``gamma`` is the fitted exponent.
     """
 
     name: str
@@ -305,7 +306,7 @@ def photographed_image(
     dark, dark_sd = (dark_level, 0.0) if dark_level is not None else _dark_level(upright, wanted, fit)
     counts = upright - np.float32(dark)
     noise_counts, noise_share = noise_of_light(counts)
-    back = np.linalg.inv(orientation_matrix(orientation, cleaned.shape))
+    to_window = np.linalg.inv(fit.window_to_photo) @ orientation_matrix(orientation, cleaned.shape)
     record = CameraRecord(
         name=Path(photo_file).name,
         sha256=file_sha256(photo_file),
@@ -315,7 +316,7 @@ def photographed_image(
         replaced_pixels=replaced,
         saturated_share=saturated,
         correlation=fit.correlation,
-        photo_to_window=(back @ fit.window_to_photo).tolist(),
+        photo_to_window=(to_window / to_window[2, 2]).tolist(),
         orientation=orientation,
         ambiguous=ambiguous,
         noise_counts=noise_counts,

