@@ -179,7 +179,7 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
     The values are not rescaled.
 
     Raises:
-        InputError: the file does not exist or is not a readable image.
+        InputError: the file does not exist, is not a readable image, or has values that are not numbers.
     """
     import cv2
 
@@ -195,6 +195,10 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
         if (opaque < 1).any():
             grey = np.rint(cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY) * opaque).astype(stored.dtype)
             notes.append("alpha channel composed on black")
+    if not np.isfinite(grey.astype(np.float32)).all():
+        raise InputError(
+            what, got=f"{path} with values that are not numbers", wanted="finite values of brightness"
+        )
     return grey, notes
 
 
@@ -217,10 +221,6 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
 
     found, notes = read_grey(path, what)
     grey: np.ndarray = found.astype(np.float32)
-    if not np.isfinite(grey).all():
-        raise InputError(
-            what, got=f"{path} with values that are not numbers", wanted="finite values of brightness"
-        )
     if grey.max() <= 0:
         raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
     height, width = grey.shape

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.readers.reader import foreign_parser
 from litho_design.images.targets import TargetRecord, read_image
 from litho_design.printers.layout import LayoutSettings
 
@@ -63,12 +64,16 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
 def _float_tiff(path: Path) -> np.ndarray | None:
     """Return the heights, in µm, that a TIFF of floating-point numbers contains. Return None for any other
     file.
+
+    Raises:
+        InputError: the file is not a readable TIFF in spite of its name.
     """
     if path.suffix.lower() not in (".tif", ".tiff"):
         return None
     import tifffile
 
-    heights = tifffile.imread(path)
+    with foreign_parser(f"TIFF {path}"):
+        heights = tifffile.imread(path)
     return heights if np.issubdtype(heights.dtype, np.floating) else None
 
 

@@ -273,6 +273,18 @@ def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_wh
     assert whole[0] == pytest.approx(800, abs=310)
 
 
+def test_a_photograph_or_a_flat_with_values_that_are_not_numbers_is_refused(tmp_path):
+    light = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+    hole = light.copy()
+    hole[3, 3] = np.nan
+    for name, values in (("light.tif", light), ("hole.tif", hole)):
+        cv2.imwrite(str(tmp_path / name), values)
+    for photo, flat in (("hole.tif", None), ("light.tif", tmp_path / "hole.tif")):
+        source = PhotoSource(tmp_path / photo, 0.1, 0.0, flat=flat)
+        with pytest.raises(InputError, match=r"hole\.tif with values that are not numbers"):
+            photographed_image(light, 0.1, source, 2.0)
+
+
 @pytest.mark.parametrize("middle", [20.0, 20.5])
 def test_the_finest_spot_of_the_light_is_not_replaced_as_a_hot_pixel(middle):
     """Check an Airy spot with 0.4 periods of its finest detail per pixel, in the middle of a pixel and

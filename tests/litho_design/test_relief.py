@@ -206,6 +206,13 @@ def test_reliefs_are_read_in_micrometres(tmp_path):
     grey, record = load_relief(tmp_path / "a.png", layout, 0.5)
     assert grey == pytest.approx(0.5 * heights / heights.max(), abs=1e-5)
     assert "0.5 µm" in record.adaptation
+    for name, content in (
+        ("other.tif", b"not a TIFF"),
+        ("cut.tif", (tmp_path / "a.tif").read_bytes()[:5000]),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            load_relief(tmp_path / name, layout, 0.5)
     with pytest.raises(InputError, match="48"):
         load_relief(heights[:40], layout, 0.5)
     with pytest.raises(InputError, match="staircase"):
