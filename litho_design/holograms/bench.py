@@ -91,11 +91,9 @@ def hologram_score(
         waves: one pair (share, field) for each wave. The first item is the share of the light in this wave.
             The second is the complex field of the wave in the image plane for unit incident power, in 1/µm, a
             tensor of shape (m, m).
-        element: complex field just behind the element, shape (n, n), on pixels of the same size. The mean of
-            this field determines the zero order, which is the share of the power that continues undiffracted
-            as a plane wave.
+        element: complex field just behind the element, shape (m, m), from which the zero order is computed.
         target: target image with values in [0, 1], shape (m, m).
-        grid: grid of the pixels in the image plane.
+        grid: grid of the pixels in the image plane, which is also that of the element.
     """
     area = math.prod(grid.pitch_um)
     share = _added(waves) * area
@@ -104,7 +102,7 @@ def hologram_score(
     return HologramScore(
         **light_figures(share, wanted),
         eff_paper=float(share[wanted > 0].sum()),
-        zero_order_share=zero_order_share(element),
+        zero_order_share=zero_order_share(element, grid, optics),
         **likeness(share, wanted, at_resolution(wanted, grid, optics)),
         rmse_paper=float(paper_rmse(share, wanted)),
         clipped_share=float((scaled > 1).double().mean()),
@@ -130,12 +128,16 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     return blurs[0] @ target @ blurs[1].T
 
 
-def zero_order_share(element: Tensor) -> float:
-    """Return the share of the power behind the element that the undiffracted plane wave carries. The
-    amplitude of this plane wave is the mean of the field behind the element.
+def zero_order_share(element: Tensor, grid: PixelGrid, optics: Optics) -> float:
+    """Return the share of the power behind the element that continues undiffracted.
+
+    This is |sum u conj(i)|^2 / (sum |u|^2 sum |i|^2), where u is the wave behind the element and i the wave
+    behind a flat element. ``element`` contains u on the pixels of ``grid``.
     """
-    power = element.abs().square().double().mean()
-    return float(element.to(torch.complex128).mean().abs().square() / power)
+    flat = torch.zeros(grid.shape, dtype=torch.float64, device=element.device)
+    light = element_field(flat, grid, optics)
+    overlap = (element * light.conj()).sum().abs().square()
+    return float(overlap / (element.abs().square().double().sum() * light.abs().square().sum()))
 
 
 def _added(waves: Waves) -> Tensor:

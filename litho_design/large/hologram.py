@@ -138,8 +138,9 @@ class BandedHologram(HologramTask):
         process holds the whole element.
         """
         figures = image_figures(self.bench(height_um).cpu().numpy(), self.target.cpu().numpy(), self.bands)
-        wave = element_field(height_um, self.bench.grid, self.settings.optics)
-        return Figures(**figures, zero_order_share=zero_order_share(wave))
+        grid, optics = self.bench.grid, self.settings.optics
+        wave = element_field(height_um, grid, optics)
+        return Figures(**figures, zero_order_share=zero_order_share(wave, grid, optics))
 
     @torch.no_grad()
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:

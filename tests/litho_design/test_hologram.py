@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture
+from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture, zero_order_share
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramLoss
 from litho_design.images.similarity import (
@@ -114,6 +114,19 @@ def test_the_uniformity_of_more_than_16_million_pixels():
     target = torch.ones_like(share)
     target[0] = 0
     assert light_figures(share, target)["uniformity"] == pytest.approx(0.1, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "light", [{}, {"incidence_x": 0.1, "incidence_y": -0.2}, {"source_distance_um": 50.0}, {"beam_um": 3.0}]
+)
+def test_the_zero_order_is_the_light_that_the_element_leaves_as_it_was(light):
+    grid, optics = centred_grid((64, 64), 0.1), Optics(**light)
+    flat = torch.full((64, 64), 0.3)
+    assert zero_order_share(element_field(flat, grid, optics), grid, optics) == pytest.approx(1, abs=1e-6)
+    # A checkerboard of the phases 0 and phi leaves cos^2(phi / 2).
+    board = torch.from_numpy(np.indices((64, 64)).sum(0) % 2).float() * (optics.wave_height_um / 6)
+    share = zero_order_share(element_field(board, grid, optics), grid, optics)
+    assert share == pytest.approx(math.cos(math.pi / 6) ** 2, abs=1e-6)
 
 
 def test_si_psnr_ignores_scale():
