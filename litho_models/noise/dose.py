@@ -6,7 +6,7 @@ evaluation uses all scans that state a dose. The layouts of these scans are step
 which areas of one level are wider than the blur of the printer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -100,8 +100,8 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
     if len(by_dose) == 1:
         return None, [f"No dose matrix, because all scans in the store have the same dose, {min(by_dose):g}."]
     heights = {dose: _level_heights(by_dose[dose]) for dose in sorted(by_dose)}
-    narrow = [dose for dose in heights if len(heights[dose]) < _FEWEST_LEVELS]
-    rows = [_row(dose, by_dose[dose], heights[dose]) for dose in heights if dose not in narrow]
+    narrow = [dose for dose in heights if len(heights[dose][1]) < _FEWEST_LEVELS]
+    rows = [_row(dose, *heights[dose]) for dose in heights if dose not in narrow]
     notes = []
     if narrow:
         notes.append(
@@ -112,6 +112,12 @@ def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[s
         )
     if len(rows) < 2:
         return None, notes
+    used = {scan_id for row in rows for scan_id in row.scans}
+    if apart := [scan.id for row in rows for scan in by_dose[row.dose] if scan.id not in used]:
+        notes.append(
+            f"Left out of the dose matrix: {', '.join(apart)}, because no wide area has a level in common "
+            "with the other scans at this dose."
+        )
     fewest = min(row.lost_low + row.lost_high for row in rows)
     sound = [row for row in rows if row.lost_low + row.lost_high == fewest]
     best = min(sound, key=lambda row: abs(row.height_gain - 1))
@@ -147,40 +153,81 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
     )
 
 
-def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
+def _level_heights(scans: Sequence[PrintedScan]) -> tuple[list[PrintedScan], list[LevelHeight]]:
     """Return the mean and the standard deviation of the height of each level, computed from pixels far from
-    every change of level. Before that, the datum, the tilt and the effect of the surrounding layout are
-    removed from each scan.
+    every change of level, after the scans from which they are computed. Before that, the datum, the tilt and
+    the effect of the surrounding layout are removed from each scan. Scans that share no level with the others
+    are not used, because their datum is unknown.
     """
-    found: dict[int, list[Array]] = {}
-    for scan in scans:
-        inside = _plateaus(scan)
-        if not inside.any():
-            continue
-        level = scan.mask_level[inside]
-        y, x = np.nonzero(inside)
-        present = np.unique(level)
-        dummies = (level[:, None] == present[None, :]).astype(np.float64)
-        # The fit has one height per level, one tilt, and an effect of the surroundings. Height differences
-        # within areas of one level distinguish the tilt and the effect of the surroundings from the heights
-        # of the levels.
-        slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
-        others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
-        height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
-        weights, *_ = np.linalg.lstsq(np.hstack([dummies, others]), height_nm, rcond=None)
-        flat = height_nm - others @ weights[len(present) :] - weights[0]
-        for value in present:
-            found.setdefault(int(value), []).append(flat[level == value])
+    found = [_level_parts(scan) for scan in scans]
+    linked = _linked_levels(found)
+    used = [(scan, parts) for scan, parts in zip(scans, found, strict=True) if linked & parts.keys()]
+    height_nm = _common_heights_nm([parts for _, parts in used])
     rows = []
-    for level_number, parts in sorted(found.items()):
-        heights = np.concatenate(parts)
-        if heights.size >= _FEWEST_PIXELS:
-            rows.append((level_number, float(heights.mean()), _pooled_sd(parts), heights.size))
+    for level in sorted(height_nm):
+        own = [parts[level] for _, parts in used if level in parts]
+        pixels = sum(part.size for part in own)
+        if pixels >= _FEWEST_PIXELS:
+            rows.append((level, height_nm[level], _pooled_sd(own), pixels))
     ground = rows[0][1] if rows else 0.0
-    return [
-        LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
-        for level, mean, sd, pixels in rows
+    heights = [
+        LevelHeight(level=level, height_nm=height - ground, sigma_nm=sd, pixels=pixels)
+        for level, height, sd, pixels in rows
     ]
+    return [scan for scan, _ in used], heights
+
+
+def _level_parts(scan: PrintedScan) -> dict[int, Array]:
+    """Return the heights of the pixels of each level, nm, that are far from every change of level. The tilt
+    and the effect of the surrounding layout are removed, but not the datum.
+    """
+    inside = _plateaus(scan)
+    if not inside.any():
+        return {}
+    level = scan.mask_level[inside]
+    y, x = np.nonzero(inside)
+    present = np.unique(level)
+    dummies = (level[:, None] == present[None, :]).astype(np.float64)
+    # The fit has one height per level, one tilt, and an effect of the surroundings. Height differences within
+    # areas of one level distinguish the tilt and the effect of the surroundings from the heights of the
+    # levels.
+    slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
+    others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
+    height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
+    weights, *_ = np.linalg.lstsq(np.hstack([dummies, others]), height_nm, rcond=None)
+    flat = height_nm - others @ weights[len(present) :]
+    return {int(value): flat[level == value] for value in present}
+
+
+def _linked_levels(scans: Sequence[Mapping[int, Array]]) -> set[int]:
+    """Return the levels whose heights can be compared: those of the scan with the most levels, those of the
+    scans that share a level with it, those of the scans that share a level with these, and so on.
+    """
+    most = max(scans, key=len)
+    linked = set(most)
+    while more := {level for parts in scans if linked & parts.keys() for level in parts} - linked:
+        linked |= more
+    return linked
+
+
+def _common_heights_nm(scans: Sequence[Mapping[int, Array]]) -> dict[int, float]:
+    """Return the height of each level, nm, from a joint fit of one height per level and one datum per scan.
+    Only differences between the heights have a meaning.
+    """
+    levels = sorted({level for parts in scans for level in parts})
+    rows, means, weights = [], [], []
+    for number, parts in enumerate(scans):
+        for level, part in parts.items():
+            row = np.zeros(len(levels) + len(scans))
+            row[[levels.index(level), len(levels) + number]] = 1
+            rows.append(row)
+            means.append(part.mean())
+            weights.append(np.sqrt(part.size))
+    if not rows:
+        return {}
+    weight = np.array(weights)
+    fitted, *_ = np.linalg.lstsq(np.array(rows) * weight[:, None], np.array(means) * weight, rcond=None)
+    return {level: float(height) for level, height in zip(levels, fitted[: len(levels)], strict=True)}
 
 
 def _surroundings(scan: PrintedScan) -> Array:

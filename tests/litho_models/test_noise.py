@@ -292,6 +292,43 @@ def test_a_tilted_scan_does_not_change_its_dose_row():
     assert rows[1].height_gain == pytest.approx(rows[0].height_gain, abs=1e-4)
 
 
+def part_of_ladder(dose, first, last, datum_um=0.0):
+    """Return a scan of the levels ``first`` to ``last`` of a ladder."""
+    scan, columns = ladder(dose, seed=first), slice(40 * first, 40 * (last + 1))
+    return replace(
+        scan,
+        id=f"{scan.id}L{first}",
+        mask_level=scan.mask_level[:, columns],
+        height_um=scan.height_um[:, columns] + np.float32(datum_um),
+        valid=scan.valid[:, columns],
+    )
+
+
+def test_scans_of_different_levels_are_brought_to_one_zero():
+    doses = [0.8, 1.0, 1.2]
+    scans = [
+        part_of_ladder(dose, *levels)
+        for dose in doses
+        for levels in ((6, 8, 0.3), (0, 4, -0.1), (4, 7, 0.05))
+    ]
+    found, notes = dose_matrix(scans)
+    assert notes == []
+    assert found.recommended_dose == 1.0
+    for row in found.rows:
+        assert len(row.scans) == 3
+        assert [entry.level for entry in row.levels] == list(range(9))
+        # The tilt of each part is known less well than that of a whole ladder.
+        assert row.height_gain == pytest.approx(row.dose, abs=0.04)
+
+
+def test_a_scan_that_shares_no_level_is_left_out_and_named():
+    parts = [part_of_ladder(dose, *levels) for dose in (0.9, 1.0) for levels in ((0, 4), (6, 8))]
+    found, (note,) = dose_matrix(parts)
+    assert "D0.9L6, D1L6, because no wide area has a level in common" in note
+    assert [row.scans for row in found.rows] == [["D0.9L0"], ["D1L0"]]
+    assert [entry.level for entry in found.rows[0].levels] == [0, 1, 2, 3, 4]
+
+
 def test_without_two_doses_there_is_no_matrix_and_a_note_says_so():
     for scans, reason in (
         ([ladder(1.0), ladder(1.0, seed=1)], "all scans in the store have the same dose, 1"),
