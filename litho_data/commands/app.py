@@ -204,6 +204,10 @@ def _not_allowed(error: Exception) -> InputError | None:
         return InputError(
             "input", got="parts nested too deeply", wanted="a file with fewer levels of nesting"
         )
+    if type(error).__name__.endswith("LinAlgError"):  # that of NumPy or of PyTorch, which may not be loaded
+        return InputError(
+            "numbers to fit", got=error, wanted="data that determine them, such as layouts of several levels"
+        )
     if isinstance(error, OverflowError):
         return InputError("number in the input", got=error, wanted="a number within the supported range")
     return None

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from litho_data.cards.card import load_card
@@ -47,6 +48,7 @@ OUTSIDE: dict[str, tuple[Exception, str]] = {
     "no memory on a GPU": (CannotAllocate("CUDA out of memory. Tried"), "not enough memory"),
     "a link to itself": (RuntimeError("Symlink loop from '/a/b'"), "leads to itself, got /a/b"),
     "too deep": (RecursionError("maximum recursion depth"), "parts nested too deeply"),
+    "nothing to fit to": (np.linalg.LinAlgError("Singular matrix"), "got Singular matrix, wanted data that"),
     "too large": (OverflowError("int too large to convert to float"), "int too large"),
     "bad input": (InputError("x", got=1, wanted=2), "x, got 1, wanted 2"),
 }
