@@ -152,9 +152,9 @@ def _phases(task: FanOut) -> dict[str, Tensor]:
 
 def _gerchberg_saxton(task: FanOut) -> Tensor:
     """Return the phase of every cell, in radians, after sixty steps of the Gerchberg-Saxton algorithm."""
-    target = _spots().sum(0)
+    target, bench = _spots().sum(0), task.bench.benches[0]
     return gerchberg_saxton(
-        task.bench.benches[0].propagator, target, task.cells, iterations=60, weighted=False, seed=0
+        bench.propagator, target, task.cells, bench.illumination(), iterations=60, weighted=False, seed=0
     )[0]
 
 

@@ -44,8 +44,9 @@ def hologram_baselines(
     found["diffraction-limited"] = {name: getattr(score, name) for name in _OF_IMAGES}
     best, loss = _continuous_phase(bench, cells, target, settings, counted)
     weighted, _ = gerchberg_saxton(
-        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=True, seed=settings.search.seed
-    )
+        bench.propagator, target, cells, bench.illumination(), iterations=_ITERATIONS, weighted=True,
+        seed=settings.search.seed,
+    )  # fmt: skip
     for name, phase in (("continuous phase", best), ("weighted GS", weighted)):
         height_um = cells(phase) * (wave_um / (2 * math.pi))
         found[name] = bench.score(height_um, target).model_dump()
@@ -105,8 +106,8 @@ def _continuous_phase(
     radians, and their loss.
     """
     phase, _ = gerchberg_saxton(
-        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
-        counted=counted,
+        bench.propagator, target, cells, bench.illumination(), iterations=_ITERATIONS, weighted=False,
+        seed=settings.search.seed, counted=counted,
     )  # fmt: skip
     free = phase.clone().requires_grad_()
 

@@ -96,9 +96,9 @@ class HologramTask(Task):
         """
         search = self.settings.search
         phase, _ = gerchberg_saxton(
-            self.bench.propagator, self.target, self.cells, iterations=_START_ITERATIONS,
-            weighted=search.start == "wgs", seed=search.seed, level_phase=level_phase, counted=self.counted,
-            total=self.total,
+            self.bench.propagator, self.target, self.cells, self.bench.illumination(),
+            iterations=_START_ITERATIONS, weighted=search.start == "wgs", seed=search.seed,
+            level_phase=level_phase, counted=self.counted, total=self.total,
         )  # fmt: skip
         return nearest_levels(phase, level_phase)
 

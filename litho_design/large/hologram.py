@@ -182,6 +182,13 @@ class BandedBench(nn.Module):
         origin_um = (top_um + rows.start * pitch_um, left_um)
         self.rows = replace(self.grid, shape=(len(rows), bands.size_px), origin_um=origin_um)
 
+    def illumination(self) -> Tensor:
+        """Return the wave behind the rows of a flat element that this process holds, as complex128 of shape
+        (rows, size).
+        """
+        flat = torch.zeros(self.rows.shape, dtype=torch.float64)
+        return element_field(flat, self.rows, self.optics, pixels=self.pixels)
+
     def forward(self, height_um: Tensor) -> Tensor:
         """Return the share of the incident power on each pixel of the image plane that this process holds,
         shape (rows, size). ``height_um`` contains the heights in the rows of this process.

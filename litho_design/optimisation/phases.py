@@ -27,6 +27,7 @@ def gerchberg_saxton(
     propagator: Any,
     target: Tensor,
     cells: CellMap,
+    illumination: Tensor,
     *,
     iterations: int,
     weighted: bool,
@@ -39,20 +40,21 @@ def gerchberg_saxton(
 
     Each step replaces the propagated amplitude inside the output window by the target amplitude and keeps the
     wave outside the window unchanged. The adjoint of the propagator carries this correction back to the
-    element, and the corrected wave is projected onto the waves that phases of the cells can produce: u' =
-    Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P the propagator, a the
-    target amplitude and Pi the projection. The norm of P is at most one, so each step minimises an upper
-    bound of the squared amplitude error, and the error never rises (Gerchberg and Saxton 1972). The weighted
-    form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude where light is
-    missing. This form improves uniformity but loses the guarantee that the error never rises. The initial
-    phases are drawn at random within one radian of pi. The phase pi is the middle of the range if the levels
-    span a full wave.
+    element, and the corrected wave is projected onto the waves that phases of the cells can produce in the
+    given light: u' = Pi(u + P^H (a exp(j arg P u) - P u)). Here, u is the wave behind the element, P the
+    propagator, a the target amplitude and Pi the projection. The norm of P is at most one, so each step
+    minimises an upper bound of the squared amplitude error, and the error never rises (Gerchberg and Saxton
+    1972). The weighted form (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the target amplitude
+    where light is missing. This form improves uniformity but loses the guarantee that the error never rises.
+    The initial phases are drawn at random within one radian of pi. The phase pi is the middle of the range if
+    the levels span a full wave.
 
     Args:
         propagator: propagator with an adjoint, such as ``RSPropagator``, on square grids with the pixel pitch
             of the element.
         target: target intensity in [0, 1], shape (size, size).
         cells: map between the free cells of the element and its pixels.
+        illumination: wave behind a flat element, shape (size, size), at any scale.
         counted: boolean mask, shape (size, size), of the pixels whose amplitude is prescribed. On other
             pixels, the wave is kept as it is. If a mask is given, the target amplitude is scaled to the light
             on the pixels of the mask.
@@ -76,11 +78,16 @@ def gerchberg_saxton(
     amplitude = target.clamp(min=0).sqrt()
     incident = math.sqrt(math.prod(propagator.source.shape) * math.prod(propagator.source.pitch_um))
     area = math.prod(propagator.target.pitch_um)
+    # The light is scaled to a mean square of 1. It is rounded last, so that a plane wave along the axis is
+    # exactly 1.
+    light = illumination.to(target.device, torch.complex128)
+    light = light * (math.sqrt(math.prod(propagator.source.shape)) / norm(light.abs()))
+    light = light.to(target.dtype.to_complex())
     amplitude = amplitude * (incident / math.sqrt(float(add(amplitude.square())) * area))
     wanted, lit = amplitude.clone(), amplitude > 0
     errors = []
     for step in range(iterations):
-        wave = cells(torch.polar(torch.ones_like(phase), phase))
+        wave = cells(torch.polar(torch.ones_like(phase), phase)) * light
         seen = propagator(wave)
         size = seen.abs()
         errors.append(float(norm(size - amplitude)))
@@ -91,7 +98,7 @@ def gerchberg_saxton(
         aim = wanted if counted is None else wanted * (norm(size[counted]) / norm(wanted))
         missing = seen * (aim / size.clamp(min=_DARK) - 1)
         missing = missing if counted is None else missing * counted
-        mean_wave = cells.average(wave + propagator.adjoint(missing))
+        mean_wave = cells.average(light.conj() * (wave + propagator.adjoint(missing)))
         phase = mean_wave.angle()
         if level_phase is not None and step >= iterations // 2:
             phase = level_phase[nearest_levels(phase, level_phase)]

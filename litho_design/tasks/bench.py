@@ -39,6 +39,12 @@ class ElementBench(nn.Module):
         """Return the propagator from the element to the image plane, for the middle wavelength."""
         return self.carried[_key(self.optics.wavelength_um)]
 
+    def illumination(self) -> Tensor:
+        """Return the wave behind a flat element, for the middle wave of the source, as complex128 of shape
+        (size, size).
+        """
+        return element_field(torch.zeros(self.grid.shape, dtype=torch.float64), self.grid, self.optics)
+
     def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
         """Yield one pair for each plane wave of the source: its share of the light, and the wave in the image
         plane, an array of shape (..., size, size).

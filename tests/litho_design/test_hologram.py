@@ -29,6 +29,7 @@ from litho_design.printers.layout import LayoutSettings
 pytestmark = pytest.mark.numerics
 
 WAVELENGTH_UM = 0.6328
+LIGHTS = [{}, {"incidence_x": 0.1, "incidence_y": -0.05}, {"beam_um": 6.0, "source_distance_um": 50.0}]
 
 
 def test_gradient_from_mask_through_print_and_field_to_loss(make_printer):
@@ -116,9 +117,7 @@ def test_the_uniformity_of_more_than_16_million_pixels():
     assert light_figures(share, target)["uniformity"] == pytest.approx(0.1, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    "light", [{}, {"incidence_x": 0.1, "incidence_y": -0.2}, {"source_distance_um": 50.0}, {"beam_um": 3.0}]
-)
+@pytest.mark.parametrize("light", LIGHTS)
 def test_the_zero_order_is_the_light_that_the_element_leaves_as_it_was(light):
     grid, optics = centred_grid((64, 64), 0.1), Optics(**light)
     flat = torch.full((64, 64), 0.3)
@@ -197,25 +196,27 @@ def test_an_aperture_passes_what_is_inside_it_and_nothing_else():
         assert float(out.abs().square().sum() / wave.abs().square().sum()) == pytest.approx(passed, abs=1e-9)
 
 
-def test_gerchberg_saxton_error_never_rises():
+@pytest.mark.parametrize("light", LIGHTS)
+def test_gerchberg_saxton_error_never_rises(light):
     layout = LayoutSettings(size_px=96)
-    grid = centred_grid((96, 96), 0.1)
-    propagate = RSPropagator(grid, grid, 25.0, WAVELENGTH_UM, dtype=torch.complex128)
+    bench = HologramBench(layout, Optics(distance_um=25.0, **light), dtype=torch.complex128)
     target = torch.from_numpy(draw_target("ring", 96)).double()
     arguments = {"iterations": 30, "weighted": False, "seed": 1}
-    _, errors = gerchberg_saxton(propagate, target, CellMap(layout), **arguments)
+    _, errors = gerchberg_saxton(bench.propagator, target, CellMap(layout), bench.illumination(), **arguments)
     assert all(after <= before * (1 + 1e-12) for before, after in itertools.pairwise(errors))
     assert errors[-1] < 0.85 * errors[0]
 
 
-def test_what_a_flat_plate_shows_is_made_by_a_flat_plate():
+@pytest.mark.parametrize("light", LIGHTS)
+def test_what_a_flat_plate_shows_is_made_by_a_flat_plate(light):
     layout = LayoutSettings(size_px=96)
-    bench = HologramBench(layout, Optics(distance_um=25.0), dtype=torch.complex128)
+    bench = HologramBench(layout, Optics(distance_um=25.0, **light), dtype=torch.complex128)
     seen = bench(torch.zeros(96, 96, dtype=torch.float64))
     for weighted in (False, True):
         phase, _ = gerchberg_saxton(
-            bench.propagator, seen / seen.max(), CellMap(layout), iterations=40, weighted=weighted, seed=1
-        )
+            bench.propagator, seen / seen.max(), CellMap(layout), bench.illumination(), iterations=40,
+            weighted=weighted, seed=1,
+        )  # fmt: skip
         # |mean exp(j phase)| is 1 for a flat plate, sin(1) / 1 = 0.84 for the first phase, which is within
         # 1 rad of its mean, and 1 / sqrt(cells) = 0.04 for random phases on the whole circle.
         assert float(torch.polar(torch.ones_like(phase), phase).mean().abs()) > 0.9
@@ -228,7 +229,9 @@ def test_weighting_makes_the_image_more_even():
     cells = CellMap(layout)
     spread = {}
     for weighted in (False, True):
-        phase, _ = gerchberg_saxton(bench.propagator, target, cells, iterations=30, weighted=weighted, seed=0)
+        phase, _ = gerchberg_saxton(
+            bench.propagator, target, cells, bench.illumination(), iterations=30, weighted=weighted, seed=0
+        )
         lit = bench(cells(phase) * Optics().wave_height_um / (2 * math.pi))[target > 0.5]
         spread[weighted] = float(lit.std() / lit.mean())
     assert spread[True] < spread[False]
