@@ -106,15 +106,16 @@ def gerchberg_saxton(
 
 
 def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tensor:
-    """Return the phase of each cell of a perfect lens, in radians: phi = k (f - sqrt(f^2 + r^2)), where r is
-    the distance from the axis.
+    """Return the phase of each cell of a perfect lens, in radians: phi = k (f - sqrt(f^2 + r^2) - s . p),
+    where r is the distance from the axis, p the position and s the sines of the angles of incidence.
 
     ``optics.distance_um`` is the focal length f.
     """
     grid = centred_grid((cells.size_px, cells.size_px), pitch_um)
     y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
     radius = (x**2 + y**2 + optics.distance_um**2).sqrt()
-    phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius)
+    tilt = optics.incidence_x * x + optics.incidence_y * y
+    phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius - tilt)
     # For each cell, the mean of the complex wave is computed instead of the mean of the phase, because the
     # mean of wrapped phases is meaningless.
     return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()

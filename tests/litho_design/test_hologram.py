@@ -237,9 +237,10 @@ def test_weighting_makes_the_image_more_even():
     assert spread[True] < spread[False]
 
 
-def test_fresnel_start_focuses_to_the_diffraction_limit():
+@pytest.mark.parametrize("light", LIGHTS[:2])
+def test_fresnel_start_focuses_to_the_diffraction_limit(light):
     layout = LayoutSettings(size_px=200, cell_um=0.1)
-    optics = Optics(distance_um=100.0)
+    optics = Optics(distance_um=100.0, **light)
     cells = CellMap(layout)
     phase = cells(fresnel_lens_phase(cells, layout.pitch_um, optics))
     grid = centred_grid((200, 200), 0.1)

@@ -60,6 +60,14 @@ def test_perfect_lens_reaches_the_diffraction_limit(aperture):
         assert float(row[126 + position]) > 0.5 > float(row[128 + position])
 
 
+@pytest.mark.parametrize("direction", [{"incidence_x": 0.2}, {"incidence_x": -0.1, "incidence_y": 0.3}])
+def test_a_perfect_lens_is_as_sharp_in_oblique_light(direction):
+    layout, view = LayoutSettings(size_px=200, cell_um=0.1), LensView(window_px=64)
+    axial, oblique = (LensBench(layout, Optics(distance_um=40.0, **one), view) for one in ({}, direction))
+    psf = axial(axial.ideal_height_um())
+    assert (oblique(oblique.ideal_height_um()) - psf).abs().max() < 1e-4 * psf.max()
+
+
 def test_airy_power_inside_the_focusing_radius():
     bench = LensBench(LAYOUT, OPTICS, LensView(window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
