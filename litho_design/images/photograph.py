@@ -271,8 +271,9 @@ def photographed_image(
     raw, notes = read_grey(photo_file, "photograph")
     photo = raw.astype(np.float32)
     saturated = _saturated(raw)
-    cut_off = float((raw <= raw.min()).mean()) if dark_level is None or dark_level > 0 else 0.0
-    if max(saturated, cut_off if raw.min() == 0 else 0.0) > _LARGEST_SATURATED:
+    may_cut_off = raw.min() == 0 and (dark_level is None or dark_level > 0)
+    cut_off = float((raw == 0).mean()) if may_cut_off else 0.0
+    if max(saturated, cut_off) > _LARGEST_SATURATED:
         raise InputError(
             f"photograph {photo_file}",
             got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at the lowest or highest value",

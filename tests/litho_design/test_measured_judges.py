@@ -285,6 +285,16 @@ def test_a_photograph_or_a_flat_with_values_that_are_not_numbers_is_refused(tmp_
             photographed_image(light, 0.1, source, 2.0)
 
 
+@pytest.mark.parametrize(("darkest", "hint"), [(500, "shorter exposure"), (0, "black level")])
+def test_dark_pixels_are_cut_off_only_at_zero(tmp_path, darkest, hint):
+    """Check a photograph with 30 % of equally dark pixels and 3 % of overexposed pixels."""
+    counts = np.random.default_rng(0).integers(600, 3500, (100, 100)).astype(np.uint16)
+    counts[:, :30], counts[:3] = darkest, 4095
+    cv2.imwrite(str(tmp_path / "photo.png"), counts)
+    with pytest.raises(InputError, match=hint):
+        photographed_image(counts, 0.1, PhotoSource(tmp_path / "photo.png", 0.1), 2.0)
+
+
 @pytest.mark.parametrize("middle", [20.0, 20.5])
 def test_the_finest_spot_of_the_light_is_not_replaced_as_a_hot_pixel(middle):
     """Check an Airy spot with 0.4 periods of its finest detail per pixel, in the middle of a pixel and
