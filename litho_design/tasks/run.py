@@ -59,7 +59,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
     facts = {
         "settings": settings.model_dump(mode="json"),
         "target": task.target_record.model_dump(mode="json") if task.target_record else None,
-        "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
+        "fingerprint": record_sha256([task.name, before, judged_by, task.inputs_sha256()]),
     }
     # If several processes share a design, the first of them creates the folder.
     with growing_folder(folder, Design.FILE_NAME, facts) if task.ranks.rank == 0 else nullcontext() as begun:

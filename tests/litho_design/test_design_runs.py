@@ -289,6 +289,16 @@ def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
         score_design(tmp_path, tmp_path / "score", judges=[printer])
 
 
+def test_a_robust_design_is_not_taken_for_a_plain_one(tmp_path, tiny_settings, make_printer, tiny_target):
+    search = tiny_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
+    settings = tiny_settings.model_copy(update={"search": search})
+    own, judge = make_printer(settings.layout), make_printer(settings.layout, sigma_um=0.3, name="wide")
+    given = {"settings": settings, "judges": [judge], "announce": False}
+    assert design_hologram(tiny_target, own, tmp_path, **given).width.searched_with == 1
+    with pytest.raises(InputError, match=r"other settings \(fingerprint"):
+        design_hologram(tiny_target, own, tmp_path, robust=True, **given)
+
+
 def test_the_search_finds_the_true_optimum_of_a_toy():
     # With 2 x 2 cells of 2 x 2 px and 12 levels, all 20736 layouts can be computed by superposing cells.
     layout = LayoutSettings(size_px=4, pitch_um=0.3, cell_um=0.6, levels=12)
