@@ -20,6 +20,7 @@ from litho_design.optimisation.budget import measure_budget
 from litho_design.optimisation.checkpoint import SearchState, finished_iterations, remove_checkpoint
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.search import search_layout
+from litho_design.printers.printer import Printer
 from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, Width
@@ -145,7 +146,7 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         from.
     """
     candidates = {SEARCHED: searched, **task.untouched()}
-    models = {printer.name: printer for printer in (*task.printers, *task.judges)}
+    models = _by_name((*task.printers, *task.judges))
     if len(models) == 1 and len(candidates) == 1:
         return searched, None
     figures: dict[str, dict[str, dict[str, float]]] = {}
@@ -171,6 +172,19 @@ def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
         loss_unit=task.loss_unit,
         level_heights_um={model: list(one.level_heights_um()) for model, one in models.items()},
     )
+
+
+def _by_name(printers: Sequence[Printer]) -> dict[str, Printer]:
+    """Return the models by name. If an earlier model has the name of a later one but other weights, the
+    source of the later model is added to its name.
+    """
+    named: dict[str, Printer] = {}
+    for one in printers:
+        name = one.name
+        while name in named and named[name].weights_sha256() != one.weights_sha256():
+            name = f"{name} ({one.source})"
+        named.setdefault(name, one)
+    return named
 
 
 class _Searched(NamedTuple):

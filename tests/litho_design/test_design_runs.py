@@ -299,6 +299,26 @@ def test_a_robust_design_is_not_taken_for_a_plain_one(tmp_path, tiny_settings, m
         design_hologram(tiny_target, own, tmp_path, robust=True, **given)
 
 
+def test_a_judge_with_the_name_of_the_designs_model_does_not_replace_it(
+    tiny_settings, make_printer, tiny_target
+):
+    """Check that the range of the scores does not depend on the names of the models."""
+    level = torch.randint(0, 13, (64, 64), generator=torch.Generator().manual_seed(0))
+    own = make_printer(tiny_settings.layout)
+
+    def width(name):
+        task = HologramTask(tiny_settings, own, inputs={"target": tiny_target.pixels})
+        other = make_printer(tiny_settings.layout, sigma_um=0.3, name=name)
+        # A model that is given twice counts once.
+        task.judges = [other, own]
+        return tasks_run.best_layout(task, level)[1]
+
+    apart, same = width("wide"), width("blur")
+    assert same.values().tolist() == apart.values().tolist()
+    assert same.returned == apart.returned
+    assert [*same.level_heights_um] == ["blur", "blur (closed form)"]
+
+
 def test_the_search_finds_the_true_optimum_of_a_toy():
     # With 2 x 2 cells of 2 x 2 px and 12 levels, all 20736 layouts can be computed by superposing cells.
     layout = LayoutSettings(size_px=4, pitch_um=0.3, cell_um=0.6, levels=12)
