@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.names import require_plain_name
 from litho_design.printers.fab import is_fab, load_fab
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
@@ -68,12 +69,15 @@ def load_printers(
     loaded printers.
 
     Raises:
-        InputError: a printer has no name, two printers have the same name, or ``load_printer`` rejects a
-            printer.
+        InputError: the name of a printer is not plain (see ``require_plain_name``), two printers have the
+            same name, or ``load_printer`` rejects a printer.
     """
     fit: Any = {"device": device, "extrapolate": extrapolate}
     if isinstance(sources, Mapping):
-        return {name: load_printer(source, layout, name=name, **fit) for name, source in sources.items()}
+        return {
+            require_plain_name("name of a model", name): load_printer(source, layout, name=name, **fit)
+            for name, source in sources.items()
+        }
     printers: dict[str, Printer] = {}
     for item in sources:
         source, name = item, ""
@@ -90,7 +94,7 @@ def load_printers(
                 wanted="a different name for each",
                 hint="use NAME=MODEL",
             )
-        printers[printer.name] = printer
+        printers[require_plain_name("name of a model", printer.name)] = printer
     return printers
 
 

@@ -165,6 +165,14 @@ def test_printers_are_given_by_name_or_as_objects(make_printer):
             load_printers(words, layout)
 
 
+@pytest.mark.parametrize("name", ["../../x", "a/b", "..", "-x", "/x"])
+def test_a_name_that_leads_out_of_the_folder_is_refused(make_printer, name):
+    layout = LayoutSettings(size_px=16)
+    for sources in ([f"{name}=none"], {name: "none"}, [make_printer(layout, name=name)]):
+        with pytest.raises(InputError, match=r"^name of a model, got .*, wanted a plain name"):
+            load_printers(sources, layout)
+
+
 def test_a_score_without_a_judge_uses_the_available_models(tmp_path, monkeypatch):
     """Check that a score without a judge uses the available models and states how far they disagree."""
     changes = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 2}
