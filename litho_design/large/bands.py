@@ -118,11 +118,14 @@ def require_reach(printer: Printer) -> None:
         InputError: according to the printer model, the print at one place depends on the whole layout or on
             the position in the write field.
     """
-    whole = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
+    # A virtual fab states no halo, because it frames the layout itself and prints it as a whole.
+    no_reach = printer.simulator is not None and getattr(printer.simulator, "reach_um", None) is None
+    whole = no_reach or printer.only_judges
     if whole or printer.depends_on_position:
         why = "the whole image" if whole else "the position in the write field"
         raise InputError(
             f"printer {printer.name} for a large element",
             got=f"a print that depends on {why}",
             wanted="a model with a finite reach, such as zoo:pbl, or none",
+            hint="without --large and --stream, the element is designed and scored in one piece",
         )

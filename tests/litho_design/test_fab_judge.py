@@ -14,6 +14,7 @@ from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise
 from litho_data.virtual_fab.settings import Printer as FabPrinter
 from litho_design.images.targets import load_target
+from litho_design.large.bands import require_reach
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.source import load_printer
 from litho_design.tasks.design import Design
@@ -79,6 +80,14 @@ def test_a_fab_judge_scores_designs_and_is_refused_for_designing(tmp_path, small
     assert score.independent
     assert score.judge.name == "fab"
     assert score.figures != Design.read(tmp_path / "design").predicted
+
+
+def test_a_fab_is_refused_as_a_judge_in_parts(tmp_path):
+    """Check that a fab, whose print depends on the whole layout, prints no bands and no strip of rings."""
+    fab = load_printer(str(truth_folder(tmp_path / "fab")), LAYOUT)
+    with pytest.raises(InputError, match=r"printer fab .*the whole image.*scored in one piece"):
+        require_reach(fab)
+    require_reach(load_printer("none", LAYOUT))
 
 
 def test_fabs_with_other_knobs_have_other_hashes(tmp_path):
