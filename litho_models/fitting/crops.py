@@ -15,6 +15,8 @@ from litho_models.fitting.config import TrainingConfig
 # Largest number of pixels that the network processes at once. To compute its gradient, a network stores
 # hundreds of bytes per pixel.
 _PASS_PX = 256**2
+# A scan, or the part of it that is fitted, with fewer measured pixels says too little.
+FEWEST_PIXELS = 1024
 
 
 @dataclass(frozen=True)

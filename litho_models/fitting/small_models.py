@@ -10,16 +10,18 @@ import torch
 from torch import Tensor, nn
 
 from litho_data.commands.progress import progress
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
-from litho_models.fitting.crops import Window, cut, stack
+from litho_models.fitting.crops import FEWEST_PIXELS, Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Room, Rules, fit_least_squares
 from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
 # A window with this side length, placed in one corner of each scan, contains enough pixels to fit a small
-# model. Successive scans use different corners.
+# model. Successive scans use different corners. A corner with few measured pixels is replaced by the one that
+# has most.
 WINDOW_PX = 256
 THINNING_PX = 2
 # Largest step of a parameter. Its unit is µm for a height, and 1 for a raw number (see ``layers.ranges``).
@@ -100,15 +102,14 @@ class _Sample:
     """The fitted pixels of one scan: those in every second row and column of one window."""
 
     def __init__(self, scan: PrintedScan, number: int):
-        size = min(WINDOW_PX, *scan.shape)
-        row, column = divmod(number % 4, 2)
-        y, x = ((length - size) * far for length, far in zip(scan.shape, (row, column), strict=True))
-        self._window = Window(0, y, x, size)
+        self._window = _corner(scan, number % 4)
         self._layout_um = scan.layout_um
         height = cut(scan.height_um, self._window)
         used = np.zeros(height.shape, bool)
         used[::THINNING_PX, ::THINNING_PX] = True
-        self._used = np.flatnonzero(used & cut(scan.valid, self._window) & np.isfinite(height))
+        self._used = np.flatnonzero(used & cut(scan.usable, self._window))
+        if not self._used.size:
+            raise InputError(f"corners of scan {scan.id}", got="no measured pixel", wanted="at least one")
         self._height = height.reshape(-1)[self._used].astype(np.float64)
         self._expansion: tuple[Array, Array, Array] | None = None
 
@@ -147,6 +148,19 @@ class _Sample:
 
     def _thinned(self, fields: Array) -> Array:
         return fields.reshape(*fields.shape[:-2], -1)[..., self._used]
+
+
+def _corner(scan: PrintedScan, usual: int) -> Window:
+    """Return the window that is fitted, in one of the four corners of a scan. ``usual`` is the number of the
+    corner to use if it has enough measured pixels.
+    """
+    size = min(WINDOW_PX, *scan.shape)
+    last_y, last_x = (length - size for length in scan.shape)
+    corners = [Window(0, y, x, size) for y in (0, last_y) for x in (0, last_x)]
+    counts = [int(cut(scan.usable, corner).sum()) for corner in corners]
+    # A small scan has few pixels in every corner.
+    enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
+    return corners[usual if enough else int(np.argmax(counts))]
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> Array:

@@ -79,9 +79,15 @@ def train_network(
             for step in progress(range(first, last), what, estimate_of=left):
                 sums.append(_step(state, targets, config, step, device))
         absolute, counted = torch.stack(sums).cpu().double().numpy().T
+        # A step says nothing about the error if its crops contain no measured pixel.
+        seen = counted > 0
+        if not seen.any():
+            raise InputError(
+                f"crops of {model.name} up to step {last}", got="no measured pixel", wanted="at least one"
+            )
         record = RoundRecord(
             step=last,
-            training_mae_nm=NM_PER_UM * float(np.mean(absolute / counted)),
+            training_mae_nm=NM_PER_UM * float(np.mean(absolute[seen] / counted[seen])),
             validation_mae_datum_free_nm=validation_error(model, validation),
             seconds=time.monotonic() - started,
         )

@@ -16,6 +16,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
+from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
@@ -23,8 +24,6 @@ from litho_models.scan_terms.blocks import thinned
 # If both sides of a scan have at least this length, fits and screening use only one quadrant of the scan. The
 # quadrant is predicted with a margin.
 LARGE_PX = 400
-# A scan, or the part of it that is fitted, with fewer measured pixels says too little.
-FEWEST_PIXELS = 1024
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from litho_data.reports.page import filled
 from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
+from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.bases import AUTO, bases_for
@@ -27,7 +28,6 @@ from litho_models.loop.fits import Study
 from litho_models.loop.marks import marks, rounding_step_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
-from litho_models.loop.prepared import FEWEST_PIXELS
 from litho_models.loop.record import CloseLoop, Decision, ErrorRow, ScanFinding
 from litho_models.loop.report import write_report
 from litho_models.loop.results import record

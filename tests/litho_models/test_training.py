@@ -18,7 +18,7 @@ from litho_models.fitting.checkpoint import CheckpointFolder, TrainingState
 from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
 from litho_models.fitting.small_models import fit_small_model
-from litho_models.fitting.stochastic import learning_rate
+from litho_models.fitting.stochastic import learning_rate, train_network
 from litho_models.layers.ranges import FLAT_FROM
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
@@ -441,6 +441,34 @@ def test_the_windows_of_four_scans_lie_in_their_four_corners(monkeypatch):
     part = {name: getattr(whole, name)[:24] for name in ("mask_level", "height_um", "valid")}
     windows = [small_models._Sample(replace(whole, **part), number)._window for number in range(4)]
     assert [(one.y, one.x, one.size_px) for one in windows] == [(y, x, 16) for y in (0, 8) for x in (0, 24)]
+
+
+def test_a_fit_uses_the_corner_that_was_measured(monkeypatch):
+    """Check a scan of which only the last corner was measured. A first scan usually uses another."""
+    monkeypatch.setattr(small_models, "WINDOW_PX", 32)
+    whole = make_scan(0, size_px=64)
+    exact = (0.8 * whole.layout_um - 0.05).astype(np.float32)
+    measured = np.zeros(whole.shape, bool)
+    measured[32:, 32:] = True
+    model = build_model("affine")
+    fit_small_model(model, [replace(whole, height_um=exact, valid=measured)], "none")
+    assert float(model.gain.detach()) == pytest.approx(0.8, abs=1e-5)
+    with pytest.raises(InputError, match="corners of scan P0F0, got no measured pixel"):
+        fit_small_model(model, [replace(whole, valid=~np.ones(whole.shape, bool))], "none")
+
+
+def test_steps_without_a_measured_pixel_are_left_out_of_the_error():
+    scan = make_scan(0, size_px=64)
+    part = replace(scan, valid=np.arange(64) < 16 + np.zeros((64, 1)))
+    config = TrainingConfig(steps=12, rounds=1, batch=1, crop_px=16, nuisance="none")
+    windows = [plan_batch([scan.shape], config, step)[0] for step in range(config.steps)]
+    assert 0 < sum(window.x < 16 for window in windows) < config.steps
+    model = build_model("pbl", **CHANNELS, surroundings=None, scan_axis=None)
+    none = [0 * scan.height_um]
+    error_nm = train_network(model, [part], [], config, lambda: none)[0].training_mae_nm
+    assert 0 < error_nm < 1000
+    with pytest.raises(InputError, match="up to step 12, got no measured pixel"):
+        train_network(model, [replace(scan, valid=~np.ones(scan.shape, bool))], [], config, lambda: none)
 
 
 @pytest.mark.parametrize(("name", "rate"), [("pbl", 1e6), ("fno", 1e3), ("fno", 1e9), ("physics", 1e8)])
