@@ -127,20 +127,26 @@ def find_edges(height_um: Array, level_height_um: float) -> tuple[Axis, list[int
     The price is the amount by which an edge between two treads reduces the squared error if the treads have
     the narrowest width and their heights differ by half a level.
 
+    A tilt along the axis would add edges, so it is removed before. Columns or rows without a measured pixel
+    are skipped.
+
     Raises:
         InputError: there is no edge along either axis.
     """
     found: dict[Axis, tuple[float, list[int]]] = {}
     for axis in ("x", "y"):
-        profile = np.nanmedian(height_um, axis=0 if axis == "x" else 1)
-        profile = profile[np.isfinite(profile)]
+        along = height_um if axis == "x" else height_um.T
+        measured = np.flatnonzero(np.isfinite(along).any(axis=0))
+        profile = np.nanmedian(along[:, measured], axis=0)
         narrowest = max(3, int(len(profile) * _NARROWEST_TREAD))
         # If two pieces of w pixels each are joined to one, and their heights differ by d, the squared error
         # grows by w d²/2.
         price = narrowest * (level_height_um / 2) ** 2 / 2
+        tilted = _piecewise_constant(profile, price, narrowest)
+        profile = profile - _slope_of_treads(profile, measured, tilted) * measured
         edges = _piecewise_constant(profile, price, narrowest)
         means = [piece.mean() for piece in np.split(profile, edges)]
-        found[axis] = (float(np.ptp(means)), edges)
+        found[axis] = (float(np.ptp(means)), [int(measured[edge]) for edge in edges])
     chosen = max(found, key=lambda name: found[name][0])
     if not found[chosen][1]:
         raise InputError(
@@ -174,6 +180,22 @@ def _piecewise_constant(profile: Array, price: float, narrowest: int) -> list[in
         stop = int(last[stop])
         edges.append(stop)
     return edges[::-1]
+
+
+def _slope_of_treads(profile: Array, position: Array, edges: list[int]) -> float:
+    """Return the median slope of a profile between its edges, in µm per unit of ``position``. Edges that the
+    tilt itself adds do no harm, because the profile between them has the slope of the tilt. Only the middle
+    of each piece is used, because the blurred edges may reach far into a narrow tread. The result is 0 for a
+    profile of fewer than two pixels.
+    """
+    if len(profile) < 2:
+        return 0.0
+    slopes = []
+    for start, stop in pairwise([0, *edges, len(profile)]):
+        inset = min(2 * (stop - start) // 5, (stop - start) // 2 - 1)
+        middle = slice(start + inset, stop - inset)
+        slopes.append(np.polyfit(position[middle], profile[middle], 1)[0])
+    return float(np.median(slopes))
 
 
 def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:

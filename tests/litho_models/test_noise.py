@@ -205,6 +205,38 @@ def test_the_treads_of_a_staircase_are_found(axis):
     assert np.abs(np.array(edges) - [50, 100, 150, 200]).max() <= 2
 
 
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize("degrees", [-3.0, 1.0])
+def test_a_tilt_along_the_stairs_adds_no_steps(axis, degrees):
+    tilt_um = np.tan(np.radians(degrees)) * 0.1 * np.arange(250)
+    tilt_um = tilt_um if axis == "x" else tilt_um[:, None]
+    plain = step_print("plain", staircase(0.01, axis=axis), (0.1, 0.1), 0.1)
+    tilted = step_print("tilted", staircase(0.01, axis=axis) + tilt_um, (0.1, 0.1), 0.1)
+    assert tilted.axis == axis
+    assert np.allclose(tilted.edges_um, plain.edges_um, atol=0.1)
+    assert tilted.tread_sigma_nm == pytest.approx(plain.tread_sigma_nm, rel=0.01)
+    with pytest.raises(InputError, match="no step"):
+        find_edges(rough((200, 250), 0.01) + (tilt_um if axis == "x" else tilt_um[:200]), 0.1)
+
+
+def test_narrow_blurred_treads_are_not_taken_for_a_tilt():
+    from scipy.ndimage import gaussian_filter1d
+
+    # The treads are 4.4 standard deviations of the blur wide.
+    profile = gaussian_filter1d(np.repeat(np.arange(24) * 0.1, 11), 2.5, mode="nearest")
+    _, edges = find_edges(np.broadcast_to(profile, (20, profile.size)), 0.1)
+    assert np.allclose(edges, 11 * np.arange(1, 24), atol=1)
+
+
+def test_unmeasured_columns_do_not_move_the_edges():
+    height = staircase(0.01)
+    _, edges = find_edges(height, 0.1)
+    height[:, 20:32] = np.nan
+    _, found = find_edges(height, 0.1)
+    assert np.allclose(found, edges, atol=1)
+    assert step_print("gap", height, (0.1, 0.1), 0.1).tread_sigma_nm == pytest.approx(10, rel=0.02)
+
+
 @pytest.mark.parametrize("narrowest", [3, 4, 5, 6])
 def test_no_tread_is_narrower_than_the_narrowest(narrowest):
     edges = _piecewise_constant(np.repeat([0.0, 0.3, 0.0], [10, 4, 9]), 0.01, narrowest)
