@@ -13,7 +13,7 @@ from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import (
     card_background,
-    locked_by_the_card,
+    locked_scans,
     made_of_these_prints,
     predict_frozen,
     trained_ids,
@@ -71,8 +71,7 @@ def evaluate(
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Evaluation.FILE_NAME, subject):
         every = dataset.scans()
-        kept = locked_by_the_card(frozen, dataset)
-        locked = sorted({*dataset.locked_ids, *kept})
+        locked = locked_scans(frozen, dataset)
         locked_too = open_lock_box or not made_of_these_prints(frozen, dataset)
         scans = [scan for scan in every if locked_too or scan.id not in locked]
         if not scans:

@@ -68,6 +68,13 @@ def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
     return same_dataset or bool(locked_by_the_card(model, dataset))
 
 
+def locked_scans(model: FrozenSimulator, dataset: Store) -> list[str]:
+    """Return the sorted ids of the scans in a store that count as locked for a model: those that the store
+    locks, and those that were locked when the model was trained.
+    """
+    return sorted({*dataset.locked_ids, *locked_by_the_card(model, dataset)})
+
+
 def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """Return the ids of the scans in a store that were locked when the model was trained. The scans are
     recognised by their raw files.

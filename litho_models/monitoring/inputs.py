@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import first_error
 from litho_data.store import Store, open_store
-from litho_models.frozen.on_store import locked_by_the_card, made_of_these_prints, predict_frozen, trained_ids
+from litho_models.frozen.on_store import locked_scans, made_of_these_prints, predict_frozen, trained_ids
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
 
@@ -112,10 +112,10 @@ def _rows(frozen: FrozenSimulator, store: Store, dropped: list[str]) -> list[Sca
     """Compute the monitored values of the scans of a store, and add the excluded scans to ``dropped``. If the
     model was trained on prints of this store, locked scans are excluded.
     """
-    seen, locked = trained_ids(frozen, store), set()
+    seen, locked = trained_ids(frozen, store), []
     if made_of_these_prints(frozen, store):
-        locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
-        dropped += [f"{scan_id}: lock box" for scan_id in sorted(locked)]
+        locked = locked_scans(frozen, store)
+        dropped += [f"{scan_id}: lock box" for scan_id in locked]
     rows = []
     for scan in (store.scan(scan_id) for scan_id in store.ids if scan_id not in locked):
         row = scan_figures(scan, predict_frozen(frozen, scan), held_out=scan.id not in seen)

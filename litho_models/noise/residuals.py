@@ -17,8 +17,9 @@ from litho_models.evaluation.results import Benchmark
 from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
-from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
+from litho_models.frozen.on_store import card_background, locked_scans, predict_frozen, trained_ids
 from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scan_terms.policies import usual_background, usual_policy
 from litho_models.scoring.metrics import residual_um
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.statistics import Interval, pixel_interval
@@ -75,7 +76,8 @@ def read_residuals(store: Store, source: str | Path, model: str | None = None) -
     Args:
         store: dataset store on which the benchmark was run, or to whose scans the frozen model is applied.
         source: a frozen model (a folder or ``zoo:NAME``), or the result folder of ``litho-models benchmark``,
-            whose cache contains predictions of held-out scans. Locked scans are left out.
+            whose cache contains predictions of held-out scans. Scans are left out if the store locks them or
+            if they were locked when the frozen model was trained.
         model: name of a model in the benchmark; by default the best model.
 
     Raises:
@@ -135,9 +137,11 @@ def _of_benchmark(
 def _of_frozen(store: Store, folder: Path) -> tuple[str, dict[str, Array], NuisanceProtocol, bool]:
     frozen = load_frozen(folder)
     frozen.check_geometry(store.pitch_um, store.level_height_um)
-    scans = [store.scan(scan_id) for scan_id in store.ids if scan_id not in store.locked_ids]
-    learned = card_background(frozen, scans)
+    film = store.instrument == "sem"
+    locked = locked_scans(frozen, store)
+    scans = [store.scan(scan_id) for scan_id in store.ids if scan_id not in locked]
+    learned = card_background(frozen, scans) if usual_background(film) == "training" else None
     predictions = {scan.id: Prediction.beside(learned, scan, predict_frozen(frozen, scan)) for scan in scans}
     maps = {scan: prediction.map_um for scan, prediction in predictions.items()}
-    protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
+    protocol = NuisanceProtocol.of_policy(usual_policy(film), background="training" if learned else "none")
     return frozen.name, maps, protocol, not trained_ids(frozen, store) & set(maps)

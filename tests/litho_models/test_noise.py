@@ -771,6 +771,27 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
         assert mae_nm < 0.8 * scores.without_background[1].mae_nm
 
 
+@pytest.mark.parametrize("instrument", ["afm", "sem"])
+def test_residuals_of_a_store_built_anew_are_of_the_scans_and_terms_of_the_evaluation(tmp_path, instrument):
+    from litho_data.store import open_store
+    from litho_models.evaluation.evaluate import evaluate
+    from litho_models.fitting.runs import train
+    from litho_models.noise.residuals import read_residuals
+
+    first = write_store(tmp_path / "first.zarr", make_scans(4, size_px=48), instrument=instrument)
+    lock_box = train(first, "identity", tmp_path / "run").lock_box
+    model = tmp_path / "run" / "model"
+    # With one scan more, the store locks another scan.
+    scans = make_scans(5, size_px=48, datum_um=0.02)
+    assert not set(lock_box) & set(locked_ids(scans))
+    anew = write_store(tmp_path / "anew.zarr", scans, instrument=instrument)
+    found, evaluated = read_residuals(open_store(anew), model), evaluate(model, anew, tmp_path / "e")
+    assert [scan.id for scan in found.scans] == evaluated.split.scored_ids
+    assert not set(lock_box) & set(evaluated.split.scored_ids)
+    assert found.protocol == evaluated.nuisance
+    assert found.protocol.policy == ("none" if instrument == "sem" else "offset")
+
+
 @pytest.mark.pictures
 def test_the_command_takes_single_files(tmp_path):
     from typer.testing import CliRunner
