@@ -64,7 +64,7 @@ class HologramTask(Task):
         record: TargetRecord | None = None,
     ):
         target = inputs["target"]
-        _check_target(target, settings.layout)
+        check_target(target, settings.layout)
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         if settings.loss.signal_window_um:
             self.headline = ("si_psnr_window_db", *self.headline[1:])  # type: ignore[misc]
@@ -155,7 +155,13 @@ def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
     ]
 
 
-def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
+def check_target(target: np.ndarray, layout: LayoutSettings) -> None:
+    """Check that a hologram can show a target.
+
+    Raises:
+        InputError: the element is too small for its score, or the target does not have the size of the
+            element, has values outside [0, 1], or lacks dark or bright pixels.
+    """
     if layout.size_px < SSIM_WINDOW_PX:
         raise InputError(
             "size_px of a hologram",

@@ -19,7 +19,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_design.holograms.bench import zero_order_share
 from litho_design.holograms.settings import HologramSettings
-from litho_design.holograms.task import HologramTask
+from litho_design.holograms.task import HologramTask, check_target
 from litho_design.images.targets import TargetRecord
 from litho_design.large.bands import Bands, require_reach
 from litho_design.large.figures import image_figures
@@ -70,7 +70,8 @@ class BandedHologram(HologramTask):
         record: record that states where the target comes from.
 
     Raises:
-        InputError: the settings of the light or the printer are not supported for a large element.
+        InputError: the settings of the light or the printer are not supported for a large element, or
+            ``check_target`` rejects the target.
     """
 
     in_one_piece = False
@@ -85,6 +86,7 @@ class BandedHologram(HologramTask):
         record: TargetRecord | None = None,
     ):
         only(settings, LIGHT)
+        check_target(inputs["target"], settings.layout)
         self.bands, self.ranks, self.total = bands, bands.ranks, bands.ranks.total
         Task.__init__(self, settings, printer, record=record)
         self.counted = None

@@ -18,7 +18,7 @@ from litho_design.large.bands import require_reach
 from litho_design.large.hologram import LIGHT, only
 from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.settings import LensSettings
-from litho_design.lenses.task import DirectLensTask, strip_rings
+from litho_design.lenses.task import DirectLensTask, check_lens, strip_rings
 from litho_design.optics import Optics
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.phases import focusing_levels
@@ -70,8 +70,8 @@ class RingLens(DirectLensTask):
     bench: Any
 
     def __init__(self, settings: LensSettings, printer: Printer, tile_px: int):
-        rings = {"task": "direct", "layout.symmetry": "radial", "view.aperture": "circle"}
-        only(settings, LIGHT | rings)
+        only(settings, LIGHT | {"task": "direct"})
+        check_lens(settings, radial=True)
         self.tile_px = tile_px
         Task.__init__(self, settings, printer)
         self.notes = ["a lens of rings has levels and heights along one radius, but no layout of the plane"]

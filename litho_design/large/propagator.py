@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from litho_data.foundation.errors import InputError
 from litho_design.large.bands import Bands
 from litho_design.optics import ASMPropagator, Optics, centred_grid
 from litho_design.optics.angular_spectrum import spectrum_axes, transfer_function
@@ -38,11 +39,14 @@ class BandedPropagator:
         bands: bands of the element.
 
     Raises:
-        InputError: the Rayleigh-Sommerfeld propagator is requested, but its kernel is aliased at this
-            distance.
+        InputError: the far field is requested, or the Rayleigh-Sommerfeld propagator is, but its kernel is
+            aliased at this distance.
     """
 
     def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: Device = "cpu"):
+        if optics.propagation == "far-field":
+            wanted = "auto, because only the near field is computed in bands"
+            raise InputError("propagation of a large element", got="far-field", wanted=wanted)
         size = bands.size_px
         self.bands, self.device = bands, device
         self.source = self.target = centred_grid((size, size), pitch_um)

@@ -91,7 +91,7 @@ class LensTask(Task):
         ensemble: Sequence[Printer] = (),
         record: TargetRecord | None = None,
     ):
-        _check(settings)
+        check_lens(settings, radial=settings.view.path == "radial")
         imaging = settings.imaging
         objects = (*imaging.objects, *imaging.test_objects)
         pictures = (inputs or {}).get(PICTURES, ())
@@ -260,8 +260,13 @@ def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
     return ring.clamp(max=rings - 1)
 
 
-def _check(settings: LensSettings) -> None:
-    radial = settings.view.path == "radial"
+def check_lens(settings: LensSettings, *, radial: bool) -> None:
+    """Check that the settings describe a lens that can be designed, along a radius if ``radial`` is True.
+
+    Raises:
+        InputError: the light along a radius is not that of the lens, the propagation is the far field, or the
+            outermost zone of a focusing lens is narrower than two cells.
+    """
     if radial and (settings.layout.symmetry != "radial" or settings.view.aperture != "circle"):
         raise InputError(
             "search path 'radial'",
@@ -271,7 +276,8 @@ def _check(settings: LensSettings) -> None:
     optics = settings.optics
     if radial and (optics.incidence_x or optics.incidence_y or optics.beam_um):
         got, wanted = "oblique incidence or a beam", "uniform light along the axis"
-        raise InputError("search path 'radial'", got=got, wanted=wanted, hint="use --set view.path=plane")
+        hint = "use --set view.path=plane, without --large"
+        raise InputError("search path 'radial'", got=got, wanted=wanted, hint=hint)
     if optics.propagation == "far-field":
         raise InputError(
             "propagation of a lens", got="far-field", wanted="auto, because a lens has its own focal plane"

@@ -164,9 +164,34 @@ def test_what_a_large_element_cannot_have_is_refused():
     thick = settings.model_copy(update={"optics": settings.optics.model_copy(update={"element": "thick"})})
     with pytest.raises(InputError, match=r"optics\.element of a large element"):
         BandedHologram(thick, printer, wide, inputs=inputs)
+    far = settings.model_copy(
+        update={"optics": settings.optics.model_copy(update={"propagation": "far-field"})}
+    )
+    with pytest.raises(InputError, match="propagation of a large element, got far-field"):
+        BandedHologram(far, printer, wide, inputs=inputs)
+    with pytest.raises(InputError, match="0 % of its pixels above half brightness"):
+        BandedHologram(settings, printer, wide, inputs={"target": 0.4 * inputs["target"]})
     printer.simulator.reach_um = None
     with pytest.raises(InputError, match="depends on the whole image"):
         BandedHologram(settings, printer, wide, inputs=inputs)
+
+
+@pytest.mark.parametrize("path", ["radial", "plane"])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"optics.incidence_x": 0.3}, "oblique incidence"),
+        ({"optics.propagation": "far-field"}, "propagation of a lens"),
+        ({"layout.size_px": 101}, "an even number"),
+        ({"optics.distance_um": 1.0, "layout.cell_um": 0.4}, "an outermost zone"),
+        ({"view.aperture": "square"}, "a ring layout behind a circular aperture"),
+    ],
+)
+def test_a_lens_in_rings_is_checked_like_a_search_along_a_radius(path, change, message):
+    small = {"layout.size_px": 100, "optics.distance_um": 40.0, "view.window_px": 64, "view.path": path}
+    settings = lens_settings(changes=small | change)
+    with pytest.raises(InputError, match=message):
+        RingLens(settings, Printer(None, settings.layout, source="none"), 64)
 
 
 def test_a_lens_in_rings_equals_the_lens_of_the_plane(tmp_path):
