@@ -18,7 +18,8 @@ from typing import Any
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256, source_sha256
 
-_PACKAGE = Path(__file__).parents[1]
+SOURCES = ("litho_data", "litho_models", "litho_design")
+_PACKAGES = [Path(__file__).parents[2] / name for name in SOURCES]
 GROUP, OPTION = "litholoop.plugins", "--plugin"
 # Maps the name of each loaded plug-in to its version, or the file of the plug-in to the beginning of the
 # file's hash.
@@ -54,19 +55,30 @@ def plugin_versions() -> dict[str, str]:
 
 
 def foreign_sha256(function: Callable[..., Any]) -> str:
-    """Return the hash of the source that defines a function, which is a file, a package or the cell of a
-    notebook. The result is empty for functions of this package and for compiled functions.
+    """Return the hash of the source that defines a function or a class, which is a file, a package or the
+    cell of a notebook. The result is empty for the code of this project and for compiled code.
     """
     code = inspect.unwrap(function.func if isinstance(function, partial) else function)
-    try:
-        source = Path(inspect.getfile(code if inspect.isroutine(code) else type(code)))
-    except TypeError:
+    named = inspect.isroutine(code) or inspect.isclass(code)
+    file = _file_of(code if named else type(code))
+    if not file:
         return ""
+    source = Path(file)
     while (source.parent / "__init__.py").is_file():
         source = source.parent
-    if source == _PACKAGE:
+    if source in _PACKAGES:
         return ""
     return source_sha256(source) if source.exists() else record_sha256(linecache.getlines(str(source)))
+
+
+def _file_of(code: Callable[..., Any]) -> str:
+    try:
+        return inspect.getfile(code)
+    except TypeError:
+        return ""
+    except OSError:
+        # Python knows the cell of a notebook that defines a method, but not the cell that defines a class.
+        return next((_file_of(own) for own in vars(code).values() if inspect.isfunction(own)), "")
 
 
 def without_plugins(words: Sequence[str]) -> tuple[list[str], list[str]]:

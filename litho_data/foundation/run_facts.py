@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from litho_data.foundation.plugins import plugin_versions
+from litho_data.foundation.plugins import SOURCES, plugin_versions
 from litho_data.foundation.results import Record
 
 _PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
-_SOURCES = ("litho_data", "litho_models", "litho_design")
 _COMMAND: ContextVar[str] = ContextVar("command", default="")
 
 
@@ -99,7 +98,7 @@ def checkout_state(folder: Path) -> dict[str, Any]:
         return {"commit": None, "dirty": None}
     try:
         commit = _git(folder, "rev-parse", "HEAD").strip()
-        changes = _git(folder, "status", "--porcelain", "--", *_SOURCES)
+        changes = _git(folder, "status", "--porcelain", "--", *SOURCES)
     except (OSError, subprocess.CalledProcessError):
         return {"commit": None, "dirty": None}
     return {"commit": commit, "dirty": bool(changes.strip())}

@@ -22,7 +22,7 @@ from litho_models.fitting.pixels import fit_feature_networks
 from litho_models.fitting.ridge import fit_ridge
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import train_network
-from litho_models.models import build_model
+from litho_models.models import build_model, registered_sources
 from litho_models.models.features import Features
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
@@ -143,14 +143,16 @@ def run_key(
     model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
 ) -> str:
     """Return the key of a fit: a hash of the model, its hyper-parameters, the settings of the training, the
-    training scans and the ids of the held-out scans.
+    training scans, the ids of the held-out scans, and the code of registered models and parts.
     """
+    settings = model.config.model_dump(mode="json")
     record = {
         "held_out_ids": list(held_out_ids),
         "model": model.name,
-        "model_config": model.config.model_dump(mode="json"),
+        "model_config": settings,
         "training": config.model_dump(mode="json"),
         "scans": scans_sha256(scans),
+        **registered_sources(model.name, {**settings, **config.model}),
     }
     return record_sha256(record)
 

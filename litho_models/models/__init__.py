@@ -1,16 +1,17 @@
 """List the models of the printer by name, register further ones, and build them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
 from litho_data.commands.settings import refused
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.plugins import foreign_sha256
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
-from litho_models.models.parts import kernels_part, register_part
+from litho_models.models.parts import REGISTERED, kernels_part, register_part
 from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
 from litho_models.models.printers import DmdGrayscale, ElectronBeam, LaserWriter, Printer, Projection
@@ -24,6 +25,7 @@ __all__ = [
     "model_class",
     "register_part",
     "register_simulator",
+    "registered_sources",
     "require_models",
 ]
 
@@ -34,6 +36,8 @@ MODELS: dict[str, type[Simulator]] = {
         *(Features, RandomFeatures, Physics, ElectronBeam, Projection, LaserWriter, DmdGrayscale, Pbl, Fno),
     )
 }
+# Maps the name of each registered model to the hashes of the sources of its class and of the base classes.
+_REGISTERED: dict[str, list[str]] = {}
 
 
 def register_simulator(model: type[Simulator]) -> type[Simulator]:
@@ -48,7 +52,19 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
     if not name or name in MODELS:
         raise InputError("simulator to register", got=f"name {name!r}", wanted="a name that is not taken")
     MODELS[name] = model
+    _REGISTERED[name] = [foreign_sha256(one) for one in model.__mro__ if one not in Simulator.__mro__]
     return model
+
+
+def registered_sources(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return hashes of the registered code on which a model depends: its class and the parts that its
+    settings name. The dict is empty if the model and all of its parts belong to this package.
+    """
+    modular = issubclass(model_class(name), Printer)
+    named = settings["parts"] if modular else [settings.get("illumination")]
+    parts = {part: source for part, source in REGISTERED.items() if part in named}
+    own = {"model_sources": _REGISTERED.get(name), "part_sources": parts}
+    return {key: value for key, value in own.items() if value}
 
 
 def model_class(name: str) -> type[Simulator]:

@@ -18,6 +18,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError, damaged, require_known
+from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.plugins import foreign_sha256
 from litho_data.readers.registry import require_file
 from litho_models.layers.gaussian import gaussian_blur, kernel_radius_px
 from litho_models.layers.ranges import Range
@@ -64,6 +66,7 @@ class Part:
 
     Attributes:
         numbers: parameters of the part by name; ``source``: reference for the formula.
+        data_sha256: hash of the file from which the part was made, if there is one.
         apply: function with the arguments (field, values of the parameters, pitch in µm). It returns the next
             field.
     """
@@ -73,6 +76,7 @@ class Part:
     apply: Apply
     source: str
     reach_px: Callable[[Values, float], int] = field(default=lambda values, pitch_um: 0)
+    data_sha256: str = ""
 
 
 def spot_radius_px(sigma_um: Tensor | float, pitch_um: float) -> int:
@@ -204,7 +208,7 @@ def kernels_part(name: str, file: str | Path) -> Part:
     def apply(pattern: Tensor, values: Values, pitch_um: float) -> Tensor:
         return imaged_inside(pattern, spectra(*pattern.shape[-2:]), size_px // 2)
 
-    return Part(name, {}, apply, Path(file).name, lambda *_: size_px // 2)
+    return Part(name, {}, apply, Path(file).name, lambda *_: size_px // 2, file_sha256(file))
 
 
 _SIGMA = {"sigma_um": Number(0.2, "µm")}
@@ -295,6 +299,8 @@ PARTS = {
         ),
     )
 }
+# Maps the name of each registered part to the hash of its parameters, its data and its source.
+REGISTERED: dict[str, str] = {}
 
 
 def register_part(part: Part) -> Part:
@@ -306,6 +312,8 @@ def register_part(part: Part) -> Part:
     if part.name in PARTS:
         raise InputError("part to register", got=part.name, wanted="a name that is not taken")
     PARTS[part.name] = part
+    sources = foreign_sha256(part.apply), foreign_sha256(part.reach_px)
+    REGISTERED[part.name] = record_sha256([repr(part.numbers), part.data_sha256, *sources])
     return part
 
 

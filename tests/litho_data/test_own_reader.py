@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import linecache
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,3 +127,14 @@ def test_the_source_of_a_reader_is_its_whole_package(tmp_path: Path) -> None:
     (tmp_path / "lab" / "scale.py").write_text("UM = 2")
     assert "" != before != foreign_sha256(names["f"]) != ""
     assert foreign_sha256(read_scan) == ""
+
+
+def test_the_source_of_a_class_in_a_notebook_is_its_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("__main__.__file__", raising=False)
+    found = []
+    for text in ("class A:\n    def f(self): return 1", "class A:\n    def f(self): return 2"):
+        monkeypatch.setitem(linecache.cache, "<cell>", (len(text), None, [text], "<cell>"))
+        names: dict[str, Any] = {"__name__": "__main__"}
+        exec(compile(text, "<cell>", "exec"), names)
+        found.append(foreign_sha256(names["A"]))
+    assert "" != found[0] != found[1] != ""

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+
+import numpy as np
 import pytest
 
 from examples import own_simulator
+from litho_data.foundation import plugins
 from litho_data.foundation.errors import InputError
 from litho_models import load_frozen, register_simulator
-from litho_models.models import MODELS
+from litho_models.evaluation.fit_cache import fit_or_load
+from litho_models.fitting import TrainingConfig
+from litho_models.fitting.fit import run_key
+from litho_models.models import MODELS, build_model, kernels_part, register_part
+from litho_models.models.baselines import Affine
+from litho_models.models.parts import PARTS, REGISTERED
+from litho_models.splits.folds import Fold
 from tests.litho_models.prints import make_scans, write_store
 
 
@@ -24,3 +34,49 @@ def test_the_example_trains_freezes_and_loads_its_model_by_name(tmp_path, monkey
     with pytest.raises(InputError, match="not taken"):
         register_simulator(own_simulator.TwoSpots)
     assert known["two-spots"] is own_simulator.TwoSpots
+
+
+OWN = """
+from litho_models.models import register_simulator
+from litho_models.models.baselines import Affine
+
+
+class Base(Affine):
+    def interior(self, layout_um):
+        return {}
+
+
+@register_simulator
+class Own(Base):
+    name = "own"
+"""
+
+
+def test_a_fit_is_made_again_after_the_code_of_its_model_changed(tmp_path, monkeypatch):
+    scans = make_scans(3, 32)
+    spreads = []
+    for formula in ("self.gain * layout_um", "0 * self.gain * layout_um"):
+        monkeypatch.setattr("litho_models.models.MODELS", dict(MODELS))
+        (tmp_path / "own_model.py").write_text(OWN.format(formula))
+        plugins._import(tmp_path / "own_model.py")
+        monkeypatch.delitem(sys.modules, "own_model")
+        heights = fit_or_load("own", Fold(0, scans[:2], scans[2:]), TrainingConfig(), tmp_path, False)[1]
+        spreads.append(heights[0].std())
+    assert spreads[0] > 0.1
+    assert spreads[1] == 0
+    assert plugins.foreign_sha256(Affine) == ""
+
+
+def test_the_key_of_a_fit_covers_the_parts_and_kernels_that_its_model_names(tmp_path, monkeypatch):
+    monkeypatch.setattr("litho_models.models.parts.PARTS", known := dict(PARTS))
+    monkeypatch.setitem(REGISTERED, "own-lens", "")
+    scans, keys = make_scans(1, 32), []
+    model = build_model("projection")
+    for value in (1, 1, 2):
+        np.save(tmp_path / "kernels.npy", np.full((1, 3, 3), value))
+        known.pop("own-lens", None)
+        register_part(kernels_part("own-lens", tmp_path / "kernels.npy"))
+        configs = [TrainingConfig(model=one) for one in ({}, {"parts": ["own-lens", "etch"]})]
+        keys.append([run_key(model, scans, config) for config in configs])
+    assert keys[0] == keys[1]
+    assert [before == after for before, after in zip(keys[0], keys[2], strict=True)] == [True, False]
