@@ -27,13 +27,14 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
         out: file for the height: ``.gsf`` (opens in Gwyddion) or ``.npy``.
 
     Raises:
-        InputError: the layout cannot be read, its pitch is not that of the model, its heights are beyond the
-            calibrated range, or ``out`` has neither of the two suffixes.
+        InputError: the layout cannot be read, its pitch or level height is not that of the model, its heights
+            are beyond the calibrated range, or ``out`` has neither of the two suffixes.
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])
     says = {"pitch_um": pitch_um, "level_height_um": model.card["level_height_um"], **export_of(Path(layout))}
-    height = model.predict(levels * np.float32(says["level_height_um"]), pitch_um=says["pitch_um"])
+    model.check_geometry(says["pitch_um"], says["level_height_um"])
+    height = model.predict(levels * np.float32(says["level_height_um"]))
     write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")
     return height
 

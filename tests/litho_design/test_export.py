@@ -70,7 +70,7 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
 
 def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
     """Check that a model predicts an exported design by means of its sidecar file, and that it refuses a
-    design with another pitch.
+    design with another pitch or level height.
     """
     from litho_models.frozen.files import load_frozen
     from litho_models.frozen.on_store import predict_file
@@ -81,8 +81,10 @@ def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
     for kind in FORMATS:
         file = export_design(levels, kind, tmp_path / kind)
         assert np.array_equal(predict_file(model, file, tmp_path / f"{kind}.gsf"), wanted)
-    with pytest.raises(InputError, match="pitch"):
-        predict_file(model, export_design(levels, "gds", tmp_path / "x", pitch_um=0.2), tmp_path / "x.npy")
+    for name in ("pitch_um", "level_height_um"):
+        file = export_design(levels, "gds", tmp_path / name, **{name: 0.05})
+        with pytest.raises(InputError, match=name):
+            predict_file(model, file, tmp_path / "x.npy")
 
 
 def _saved(path, array):
