@@ -95,8 +95,12 @@ def _spread(result: ScoreResult) -> str:
     """
     task = registered_task(result.task)
     figure = next((one for one in task.headline if one in result.designed), "")
-    judged = {one.judge.name: one.figures.get(figure) for one in result.scores if one.kind == "model"}
-    by_model = {result.designed_with.name: result.designed.get(figure)} | judged
+    models, own = [one for one in result.scores if one.kind == "model"], result.designed_with
+    taken = any(one.judge.name == own.name and one.judge.sha256 != own.sha256 for one in models)
+    name = f"{own.name} of the design" if taken else own.name
+    by_model = {name: result.designed.get(figure)} | {
+        one.judge.name: one.figures.get(figure) for one in models
+    }
     known = {name: value for name, value in by_model.items() if value is not None}
     return spread_sentence(figure, known, figure in task.errors, result.gain) if len(known) > 2 else ""
 

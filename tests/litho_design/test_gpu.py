@@ -49,11 +49,12 @@ def test_a_large_hologram_has_the_same_gradient():
     found = []
     for device in ("cpu", GPU):
         printer, settings = large_rank.printer().to(device), large_rank.settings()
-        target = load_target("ring", large_rank.SIZE).pixels
+        inputs = {"target": load_target("ring", large_rank.SIZE).pixels}
         bands = Bands(large_rank.SIZE, large_rank.BAND, cell_px=4)
-        level = 12 * torch.rand(1, 1, *target.shape, generator=torch.Generator().manual_seed(0))
+        shape = (1, 1, large_rank.SIZE, large_rank.SIZE)
+        level = 12 * torch.rand(shape, generator=torch.Generator().manual_seed(0))
         level = level.to(device).requires_grad_()
-        loss, _ = BandedHologram(settings, printer, target, bands).objective(level)
+        loss, _ = BandedHologram(settings, printer, bands, inputs=inputs).objective(level)
         found.append([float(loss.detach()), torch.autograd.grad(loss, level)[0].cpu()])
     (loss, slope), (loss_there, slope_there) = found
     # Convolutions on a GPU may round their factors to 10 bits.
