@@ -36,13 +36,16 @@ _TERM_WEIGHT = 1e-3
 
 
 def fit_ridge(model: Features, scans: Sequence[PrintedScan], policy: Policy) -> None:
-    """Fit the weights of ``model`` in place by minimising the mean absolute error.
+    """Fit the weights of ``model`` in place by minimising the mean absolute error. Fixed weights stay as they
+    are.
 
     Args:
         model: the model to fit; ``scans``: training scans.
         policy: names the terms that are fitted to each scan. Line offsets are left out of the fit, because
             they average out over a scan.
     """
+    if not model.weights.requires_grad:
+        return
     terms = smooth_training_terms(policy)
     if isinstance(model, RandomFeatures):
         seen = [feature_rows(model, scan, grid_pixels(scan, FITTED_PX)) for scan in scans]

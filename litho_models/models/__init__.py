@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from litho_data.commands.settings import refused
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError, require_known, unknown_name
 from litho_data.foundation.plugins import foreign_sha256
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
@@ -113,7 +113,8 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
     geometry and its hyper-parameters.
 
     Raises:
-        InputError: the model, a field or a parameter to fix is unknown, or a value is not allowed.
+        InputError: the model, a field or a parameter to fix is unknown or belongs to a network inside the
+            model, or a value is not allowed.
     """
     kind = model_class(name)
     for field in fields:
@@ -123,8 +124,10 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
         model = kind(kind.Config.of_variant(variant, **fields))
     except ValidationError as error:
         raise refused(error) from None
-    numbers = {key: key for key, _ in model.named_parameters()}
-    numbers |= {key: own.name for key, own in model.ranges.items()}
+    ranges, own = model.ranges, [key for key, _ in model.named_parameters(recurse=False)]
+    numbers = [ranges[key].name if key in ranges else key for key in own]
     for fixed in model.config.fixed:
-        require_known(f"parameter of {name} to fix", fixed, [*numbers.values()])
+        if fixed not in numbers:
+            what, hint = f"parameter of {name} to fix", "the weights inside networks are always fitted"
+            raise unknown_name(what, fixed, numbers, hint)
     return model

@@ -40,6 +40,13 @@ def error_nm(model, scan, height_um) -> float:
 
 
 @pytest.mark.parametrize("name", ["features", "random-features"])
+def test_fixed_weights_are_not_fitted(name):
+    fixed = fitted(name, make_scans(1, 32), fixed=("weights",))
+    start = build_model(name, **NARROW).state_dict()
+    assert all(torch.equal(value, start[key]) for key, value in fixed.state_dict().items())
+
+
+@pytest.mark.parametrize("name", ["features", "random-features"])
 def test_a_print_made_of_its_features_is_found_through_datum_bow_and_blobs(name):
     known = build_model("features", **NARROW)
     torch.manual_seed(1)

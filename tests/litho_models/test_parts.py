@@ -292,6 +292,11 @@ def test_a_fixed_number_stays_and_a_freed_one_does_not() -> None:
     assert fixed_numbers("e-beam", ["etch.bias_px"], ["etch.threshold"]) == ["etch.bias_px"]
     with pytest.raises(InputError, match="to fix"):
         build_model("physics", fixed=("nonsense",))
+    for name in ("fno", "pbl"):
+        with pytest.raises(InputError, match="to fix"):
+            build_model(
+                name, fixed=(next(key for key, _ in build_model(name).named_parameters() if "." in key),)
+            )
     with pytest.raises(InputError, match="fixed parameter"):
         fixed_numbers("physics", free=["eta"])
 
