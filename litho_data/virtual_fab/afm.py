@@ -41,8 +41,8 @@ def scan_surface(
     if strength := (job.tip == 1) * knobs["tip-dilation"]:
         height = _dilate_by_tip(height, frame.pitch_um, (strength, strength))
     if strength := (job.tip == 1) * knobs["asymmetric-tip"]:
-        rng = knobs.machine_rng("asymmetric-tip")
-        radii_um = rng.permutation([strength, strength / rng.uniform(3, 6)])
+        tip_rng = knobs.machine_rng("asymmetric-tip")
+        radii_um = tip_rng.permutation([strength, strength / tip_rng.uniform(3, 6)])
         height = _dilate_by_tip(height, frame.pitch_um, (radii_um[0], radii_um[1]))
     if strength := knobs["feedback-lag"]:
         onwards = slice(None, None, int(job.direction))

@@ -121,6 +121,16 @@ def test_noise_is_the_same_with_and_without_a_process_knob(jobs):
     )
 
 
+def test_an_asymmetric_tip_leaves_the_noise_of_the_microscope_as_it_is(jobs):
+    # The tip changes how roughness is scanned, so the surface has none here.
+    smooth = Noise(roughness_nm=0.0)
+    for job in jobs:
+        plain, tipped = (scan(job, *one, noise=smooth) for one in ((), (KnobSetting("asymmetric-tip", 0.6),)))
+        np.testing.assert_allclose(
+            tipped.height_um - tipped.noiseless_um, plain.height_um - plain.noiseless_um, atol=1e-14
+        )
+
+
 def test_own_seed_redraws_that_knob_only(jobs):
     first, again, other = (
         scan(jobs[0], KnobSetting("ghost-spot", 0.3, seed)).height_um for seed in (1, 1, 2)
