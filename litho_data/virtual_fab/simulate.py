@@ -154,12 +154,15 @@ def simulate(
 
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
-    """Write the file of one scan in the format that the microscope's settings name."""
+    """Write the file of one scan in the format that the microscope's settings name. An id may contain dots,
+    so the ending is appended to the id.
+    """
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
-        write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
+        path = file.with_name(f"{file.name}.gsf")
+        write_heights(path, scan.height_um, pitch_um=pitch_um, title=scan.job.id)
     else:
-        write_text_matrix(file.with_suffix(".txt"), scan.height_um)
+        write_text_matrix(file.with_name(f"{file.name}.txt"), scan.height_um)
 
 
 # The values that a usual scan has in the columns SCANNING. Such a scan is not rotated, is made in trace with

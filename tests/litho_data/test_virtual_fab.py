@@ -268,6 +268,14 @@ class TestFiles:
             assert other.read_bytes() == field.scan.read_bytes()
         assert load_card(again) == load_card(first)
 
+    @pytest.mark.parametrize("files", ["text-matrix", "gsf"])
+    def test_each_id_with_dots_has_a_scan_of_its_own(self, tmp_path, files):
+        doses = {f"dose{dose:.2f}": dose for dose in (1.05, 1.10)}
+        jobs = [Job(name, np.full((16, 16), 6, np.uint8), dose=dose) for name, dose in doses.items()]
+        card = simulate(tmp_path / "run", jobs=jobs, microscope=Microscope(files=files))
+        assert [field.id for field in list_fields(card).fields] == list(doses)
+        assert {file.stem for file in (card.parent / "scans").iterdir()} == set(doses)
+
     def test_bad_runs_write_nothing(self, tmp_path):
         for settings in (
             {"knobs": ["nosuch=1"]},
