@@ -20,6 +20,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from litho_data.commands.progress import progress
 from litho_data.foundation import Array, InputError, Shape, require_known
 from litho_data.foundation.begun import whole_folder
+from litho_data.foundation.quantities import DOSE, LENGTH_UM, PLACE_UM, Range
 from litho_data.foundation.results import Result
 from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
@@ -66,6 +67,9 @@ class FilmKnobs:
         defocus_um: defocus of the lens.
         dose_error: relative error of the dose.
         charging: relative change of the brightness from the middle of a micrograph to its right edge.
+
+    Raises:
+        InputError: a value is not finite or is out of range.
     """
 
     backscatter: float = 0.0
@@ -75,6 +79,22 @@ class FilmKnobs:
     defocus_um: float = 0.0
     dose_error: float = 0.0
     charging: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, allowed in _KNOB_RANGES.items():
+            allowed.require(f"value of film knob {name}", getattr(self, name))
+
+
+_KNOB_RANGES = {
+    "backscatter": Range(0, 1e3),
+    "backscatter_um": LENGTH_UM,
+    "diffusion_um": Range(0, LENGTH_UM.high, LENGTH_UM.unit),
+    "etch_bias_um": PLACE_UM,
+    "defocus_um": PLACE_UM,
+    # The dose itself is 1 plus its error.
+    "dose_error": Range(DOSE.low - 1, DOSE.high - 1),
+    "charging": Range(-1, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -135,11 +155,13 @@ def film_knobs(words: Iterable[str]) -> FilmKnobs:
     """Make the knobs of a film from texts ``name=value``.
 
     Raises:
-        InputError: a name is unknown, or a value is not a number.
+        InputError: a name is unknown or repeated, or a value is not a number or is out of range.
     """
-    values = {}
+    values: dict[str, float] = {}
     for name, value in (word.split("=", 1) if "=" in word else (word, "") for word in words):
         require_known("knob of a film", name, [one.name for one in fields(FilmKnobs)])
+        if name in values:
+            raise InputError("knobs of a film", got=f"{name} more than once", wanted="each name at most once")
         try:
             values[name] = float(value)
         except ValueError:
@@ -207,11 +229,16 @@ def simulate_films(
         knobs: the effects that are added to the plain process.
 
     Raises:
-        InputError: the process is unknown, or the folder contains a run with other settings or other files.
+        InputError: the process is unknown or has no lens to defocus, or the folder contains a run with other
+            settings or other files.
     """
     import cv2
 
     require_known("process of a film", process, FILM_PRINTERS)
+    if knobs.defocus_um and process != "projection":
+        raise InputError(
+            "film knob defocus_um", got=f"the process {process}", wanted="the process projection"
+        )
     printer = FILM_PRINTERS[process]
     truth = FilmTruth(process=process, knobs=knobs, seed=seed, count=count, size_px=size_px)
     facts = truth.model_dump(mode="json", exclude={"schema_"})

@@ -122,3 +122,29 @@ def test_unknown_knobs_are_refused() -> None:
     for word, said in {"tilt=1": "tilt", "backscatter=much": "a number", "backscatter": "a number"}.items():
         with pytest.raises(InputError, match=said):
             film_knobs([word])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["dose_error=nan"], "dose_error"),
+        (["dose_error=-1"], "dose_error"),
+        (["backscatter=-1"], "backscatter, "),
+        (["backscatter_um=0"], "backscatter_um"),
+        (["diffusion_um=-0.01"], "diffusion_um"),
+        (["etch_bias_um=inf"], "etch_bias_um"),
+        (["defocus_um=nan"], "defocus_um"),
+        (["charging=-inf"], "charging"),
+        (["diffusion_um=0.01", "charging=0.1", "diffusion_um=0.02"], "diffusion_um more than once"),
+    ],
+)
+def test_knobs_that_no_process_can_have_are_refused(words: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said) as refused:
+        film_knobs(words)
+    assert "wanted" in str(refused.value)
+
+
+def test_an_electron_beam_has_no_lens_to_defocus(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="defocus_um, got the process e-beam"):
+        simulate_films(tmp_path / "fab", "e-beam", count=1, knobs=FilmKnobs(defocus_um=1.0))
+    assert not list(tmp_path.iterdir())
