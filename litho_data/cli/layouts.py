@@ -166,18 +166,34 @@ def simulate(
             got="only one of the two",
             wanted="both: the plan to print, and the earlier run whose printer prints it",
         )
-    shaped = any(value is not None for value in (count, size_px, write_field_um))
+    used = {
+        "--preset": preset != "plain",
+        "--layouts": layouts is not None,
+        "--count": count is not None,
+        "--size-px": size_px is not None,
+        "--knob": bool(knob),
+        "--noise": noise != "default",
+        "--microscope": microscope != "default",
+        "--write-field-um": write_field_um is not None,
+        "--stitch-field-um": stitch_field_um is not None,
+        "--references": references,
+    }
+    options = [name for name, is_used in used.items() if is_used]
     if plan is not None and fab is not None:
-        if layouts is not None or knob or shaped:
+        if options:
             wanted = "only --out and --seed, because the plan and the fab set all other options"
-            raise InputError("options given with --plan", wanted=wanted)
+            raise InputError("options given with --plan", got=", ".join(options), wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
         return
-    if layouts is not None and shaped:
+    if layouts is not None and (used["--count"] or used["--size-px"] or used["--write-field-um"]):
         wanted = "no --count, --size-px or --write-field-um, because the card's layouts set them"
         raise InputError("options given with --layouts", wanted=wanted)
     if preset in FILM_PRINTERS:
+        of_films = ("--preset", "--count", "--size-px", "--knob")
+        if unused := [name for name in options if name not in of_films]:
+            wanted = "only --out, --seed, --count, --size-px and --knob"
+            raise InputError(f"options given with --preset {preset}", got=", ".join(unused), wanted=wanted)
         knobs = film_knobs(knob or ())
         card = simulate_films(out, preset, count=count or 12, size_px=size_px or 256, seed=seed, knobs=knobs)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / FilmTruth.FILE_NAME}")

@@ -127,6 +127,26 @@ def test_options_that_a_card_already_fixes_are_refused(app, tmp_path):
         run(app, "simulate", "--out", tmp_path / "s", *card, "--references")
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--noise", "off"),
+        ("--microscope", "aligned"),
+        ("--references",),
+        ("--stitch-field-um", 50),
+        ("--write-field-um", 100),
+        ("--layouts", "card.toml"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(app, tmp_path, option):
+    for kind in (("--preset", "e-beam"), ("--preset", "projection"), ("--plan", "plan", "--fab", "fab")):
+        with pytest.raises(InputError, match=rf"options given with .*, got {option[0]}, wanted only --out"):
+            run(app, "simulate", "--out", tmp_path / "s", *kind, *option)
+    with pytest.raises(InputError, match="given with --plan, got --preset, wanted"):
+        run(app, "simulate", "--out", tmp_path / "s", "--plan", "p", "--fab", "f", "--preset", "e-beam")
+    assert not list(tmp_path.iterdir())
+
+
 def test_every_knob_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "virtual_fab.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in page for name in KNOBS)
