@@ -36,7 +36,7 @@ def masks(
     count: Annotated[
         int, option("number of random layouts, or of doses for the pattern dose-matrix", min=1)
     ] = 12,
-    size_px: Annotated[int, option("side length of a layout, pixels", min=8)] = 512,
+    size_px: Annotated[int, option("side length of a layout, pixels", min=64)] = 512,
     levels: Annotated[
         int, option("number of levels L; a layout contains the levels 0 to L − 1", min=2, max=65536)
     ] = 13,

@@ -147,6 +147,14 @@ def test_options_that_would_do_nothing_are_refused(app, tmp_path, option):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_set_of_layouts_starts_at_the_size_that_its_statistics_need(app, tmp_path):
+    words = ("masks", "--out", tmp_path / "m", "--count", 1, "--size-px")
+    refused = run(app, *words, 63)
+    assert refused.exit_code == 2
+    assert "--size-px" in refused.output
+    assert run(app, *words, 64).exit_code == 0
+
+
 def test_every_knob_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "virtual_fab.md").read_text(encoding="utf-8")
     assert all(f"`{name}`" in page for name in KNOBS)
