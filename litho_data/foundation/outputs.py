@@ -62,6 +62,9 @@ def require_same(folder: Path, held: Any, facts: Facts) -> None:
 def first_difference(then: Facts, now: Facts, path: str = "") -> str:
     """Return the first setting of ``now`` that is missing in ``then`` or has another value there; return ""
     if there is none.
+
+    A part of a record, such as the dataset, may hold fields that ``now`` does not state. If the value of such
+    a field is itself a mapping, such as the values that were set by name, it must hold nothing else.
     """
     for name, after in now.items():
         if isinstance(after, dict):
@@ -70,7 +73,9 @@ def first_difference(then: Facts, now: Facts, path: str = "") -> str:
         elif name not in then or then[name] != after:
             short = name in then and not isinstance(after, list)
             return f"{path}{name}" + (f" = {then[name]!r}, but now {after!r} is requested" if short else "")
-    return ""
+    within_a_field = path.count(".") > 1
+    dropped = [name for name in then if name not in now] if within_a_field else []
+    return f"{path}{dropped[0]} = {then[dropped[0]]!r}, but now no value is requested" if dropped else ""
 
 
 def require_own_folder(path: str | Path, record: str, *begun: str) -> None:

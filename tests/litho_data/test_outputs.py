@@ -91,6 +91,20 @@ def test_settings_of_an_older_result_are_compared_one_by_one(tmp_path: Path) -> 
         require_same(tmp_path, read_record(tmp_path / "plan.json"), now)
 
 
+@pytest.mark.parametrize("part", ["config", "settings"])
+def test_a_value_that_is_no_longer_set_is_another_setting(part: str, tmp_path: Path) -> None:
+    def facts(**values: float) -> dict[str, object]:
+        return {"dataset": {"name": "a"}, part: {"seed": 0, "model": values}}
+
+    # The record of a result holds more than its facts, at the top and in its parts.
+    whole = {"name": "a", "sha256": "f"}
+    for then, now in (({"x": 1, "sigma.um": 0.6}, {"x": 1}), ({"x": 1}, {}), ({"x": 1}, {"x": 2})):
+        require_same(tmp_path, {**facts(**then), "dataset": whole, "scans": 3}, facts(**then))
+        for before, after in ((then, now), (now, then)):
+            with pytest.raises(InputError, match=r"settings \((config\.)?model\."):
+                require_same(tmp_path, {**facts(**before), "dataset": whole}, facts(**after))
+
+
 def test_the_current_folder_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="current folder"):
