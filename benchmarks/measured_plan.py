@@ -40,14 +40,10 @@ def main() -> None:
     plan = NextPrint.read(given.plan)
     shutil.rmtree(RESULTS, ignore_errors=True)
     for name in HOLDS:
-        source = given.plan / name
-        if name in _LEFT_OUT or not source.exists():
-            continue
-        RESULTS.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, RESULTS / name)
-        else:
-            shutil.copy(source, RESULTS / name)
+        for source in given.plan.glob(name) if name not in _LEFT_OUT else ():
+            copy = RESULTS / source.relative_to(given.plan)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source, copy)
     draw(plan)
     for name, text in texts(plan).items():
         publish(PAGE, name, text)

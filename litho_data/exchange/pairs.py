@@ -213,7 +213,7 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     store = open_store(store_path)
     notes: list[str] = []
     scales: dict[str, float] = {}
-    with whole_folder(out, "mask", "afm", SCALES_FILE) as folder:
+    with whole_folder(out, "mask/*.tif", "afm/*.tif", SCALES_FILE) as folder:
         for name in ("mask", "afm"):
             (folder / name).mkdir()
         for scan_id in progress(store.ids, "exporting pairs"):

@@ -101,7 +101,7 @@ def whole_folder(
 
     Args:
         out: the folder that will be replaced.
-        holds: names, or patterns of names, of all files and folders that such a result may contain.
+        holds: as for ``require_replaceable_folder``.
         record, facts: as for ``growing_folder``. If no record is named, any older result is replaced,
             whatever its settings.
 

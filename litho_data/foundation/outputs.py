@@ -17,11 +17,12 @@ from litho_data.foundation.kinds import Facts
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
     """Accept a path that does not exist, an empty folder, or a folder that contains nothing but an older
-    result.
+    result, in its subfolders too.
 
     Args:
         path: where the result will be.
-        holds: names, or patterns of names, of all files and folders that such a result may contain.
+        holds: paths in the folder, such as ``layouts/*.tif``, or patterns of paths, of all files that such a
+            result may contain. A folder that is named without its files may contain anything.
 
     Raises:
         InputError: the path is the current folder, a file, or a folder that contains anything else; the
@@ -35,12 +36,14 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             wanted="another folder, such as one inside it",
         )
     _refuse_a_file(folder)
-    names = sorted(child.name for child in folder.iterdir()) if folder.exists() else []
-    strangers = [name for name in names if not any(fnmatch(name, pattern) for pattern in holds)]
-    if strangers:
+    patterns = [pattern.split("/") for pattern in holds]
+    paths = sorted(path.relative_to(folder) for path in folder.rglob("*"))
+    # Only as many parts are compared as the shorter path has, so the folders of a file fit its pattern.
+    strangers = (one for one in paths if not any(all(map(fnmatch, one.parts, held)) for held in patterns))
+    if stranger := next(strangers, None):
         raise InputError(
             "output",
-            got=f"{folder}, which holds {strangers[0]}",
+            got=f"{folder}, which holds {stranger.as_posix()}",
             wanted="a new folder, or one that contains only an older result, which will be replaced",
         )
 

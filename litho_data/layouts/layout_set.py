@@ -112,7 +112,7 @@ def write_layout_set(
     settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed, quantiser, field_px)
     made = {"pattern": pattern, **asdict(settings), "level_height_um": level_height_um}
     record = LayoutStatistics.FILE_NAME
-    holds = (CARD_NAME, TABLE_NAME, "layouts", record, "levels.csv", "report.html")
+    holds = (CARD_NAME, TABLE_NAME, "layouts/*.tif", record, "levels.csv", "report.html")
     with whole_folder(out, *holds, record=record, facts={"settings": made}) as folder:
         paths: list[Path] = []
         rows: list[tuple[object, ...]] = []

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from litho_models.effects.chain import EffectChain
 
 WEIGHTS_FILE, README_FILE = "model.safetensors", "README.md"
+MODEL_FILES = (WEIGHTS_FILE, CARD_FILE, README_FILE)
 
 
 def save_frozen(
@@ -62,7 +63,7 @@ def save_frozen(
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
     _check_numbers(state, f"weights of {simulator.name}")
     config = simulator.config
-    with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
+    with whole_folder(folder, *MODEL_FILES) as temporary:
         # The file has no metadata. Safetensors writes metadata in no fixed order, so with metadata the hash
         # of the file would change from call to call.
         (temporary / WEIGHTS_FILE).write_bytes(save(state))

@@ -20,7 +20,7 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
 from litho_models.fitting.crops import FEWEST_PIXELS
 from litho_models.fitting.runs import level_share, step_share
-from litho_models.frozen.files import save_frozen
+from litho_models.frozen.files import MODEL_FILES, save_frozen
 from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, errors_of_others
@@ -104,7 +104,8 @@ def close_loop(
         "open_lock_box": open_lock_box, "seed": seed, "new_prints": list(decided_by),
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
-    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
+    model_files = [f"{MODEL_FOLDER}/{name}" for name in MODEL_FILES]
+    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", *model_files, LAWS_FILE)
     with (
         whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,

@@ -55,7 +55,7 @@ _TEMPLATES = Path(__file__).parent
 HOLDS = (
     "card.toml",
     "scans.csv",
-    "layouts",
+    "layouts/*.tif",
     NextPrint.FILE_NAME,
     "report.html",
     "*.csv",

@@ -12,7 +12,12 @@ from litho_data.exchange.pairs import export_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, atomic_folder
-from litho_data.foundation.outputs import read_record, require_own_folder, require_same
+from litho_data.foundation.outputs import (
+    read_record,
+    require_own_folder,
+    require_replaceable_folder,
+    require_same,
+)
 from litho_data.layouts import write_layout_set
 from litho_data.virtual_fab import simulate
 
@@ -46,6 +51,44 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
     with pytest.raises(InputError, match="which is a file"):
         write(campaign, file)
     assert file.read_text() == "years of work"
+
+
+@pytest.mark.parametrize("name", ["masks", "pairs"])
+def test_a_file_of_the_user_in_a_subfolder_is_not_deleted(name: str, campaign: Path, tmp_path: Path) -> None:
+    write, out = WRITERS[name], tmp_path / "out"
+    write(campaign, out)
+    folders = [path for path in out.iterdir() if path.is_dir()]
+    assert folders
+    for folder in folders:
+        (folder / "notes").mkdir()
+        (folder / "notes" / "monday.txt").write_text("a day of measuring")
+        with pytest.raises(InputError, match=f"which holds {folder.name}/notes"):
+            write(campaign, out)
+        assert (folder / "notes" / "monday.txt").read_text() == "a day of measuring"
+        (folder / "notes" / "monday.txt").unlink()
+        (folder / "notes").rmdir()
+    write(campaign, out)
+
+
+@pytest.mark.parametrize(
+    ("name", "holds", "is_own"),
+    [
+        ("a/b/c.tif", ("*.csv", "a/b/*.tif"), True),
+        ("a/b/c.txt", ("a",), True),
+        ("a/b/c.txt", ("a/b/*.tif", "*.txt"), False),
+        ("a/c.tif", ("*.tif", "a/b/*.tif"), False),
+    ],
+)
+def test_a_pattern_admits_files_of_its_own_folder_only(
+    name: str, holds: tuple[str, ...], is_own: bool, tmp_path: Path
+) -> None:
+    (tmp_path / name).parent.mkdir(parents=True)
+    (tmp_path / name).touch()
+    if is_own:
+        require_replaceable_folder(tmp_path, *holds)
+        return
+    with pytest.raises(InputError, match=f"which holds {name}"):
+        require_replaceable_folder(tmp_path, *holds)
 
 
 OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {
