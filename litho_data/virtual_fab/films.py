@@ -242,7 +242,9 @@ def simulate_films(
     printer = FILM_PRINTERS[process]
     truth = FilmTruth(process=process, knobs=knobs, seed=seed, count=count, size_px=size_px)
     facts = truth.model_dump(mode="json", exclude={"schema_"})
-    with whole_folder(out, "raw", "truth", record=f"truth/{truth.FILE_NAME}", facts=facts) as folder:
+    record = f"truth/{truth.FILE_NAME}"
+    holds = (f"raw/{CARD_NAME}", "raw/layouts/*.tif", "raw/scans/*.png", "truth/*.npy", record)
+    with whole_folder(out, *holds, record=record, facts=facts) as folder:
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden):
             part.mkdir(parents=True)

@@ -112,7 +112,10 @@ def simulate(
         "knobs": [KnobTruth.of(setting, seed).model_dump() for setting in fab.knobs.settings],
         "settings": asked,
     }
-    with whole_folder(out, "raw", "truth", record=f"truth/{Truth.FILE_NAME}", facts=facts) as folder:
+    record = f"truth/{Truth.FILE_NAME}"
+    raw_files = (CARD_NAME, TABLE_NAME, "layouts/*.tif", "scans/*.txt", "scans/*.gsf")
+    holds = (*(f"raw/{name}" for name in raw_files), "truth/prints/*.npy", "truth/surfaces/*.npy", record)
+    with whole_folder(out, *holds, record=record, facts=facts) as folder:
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden / "prints", hidden / "surfaces"):
             part.mkdir(parents=True)

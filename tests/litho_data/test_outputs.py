@@ -53,7 +53,7 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
     assert file.read_text() == "years of work"
 
 
-@pytest.mark.parametrize("name", ["masks", "pairs"])
+@pytest.mark.parametrize("name", ["masks", "simulate", "pairs"])
 def test_a_file_of_the_user_in_a_subfolder_is_not_deleted(name: str, campaign: Path, tmp_path: Path) -> None:
     write, out = WRITERS[name], tmp_path / "out"
     write(campaign, out)
