@@ -5,7 +5,7 @@ uncertainty of Sq.
 import numpy as np
 import scipy.fft
 
-from litho_data.foundation import Array, InputError
+from litho_data.foundation import Array, InputError, Shape
 from litho_data.foundation.results import Record
 
 
@@ -67,7 +67,7 @@ def autocorrelation(height_um: Array) -> Array:
 
     Element ``[i, j]`` of the result is the value at the lag of i rows and ``j − (nx // 2 − 1)`` columns. The
     sum of products at each lag is divided by the number of pixel pairs with this lag. The result has shape
-    (ny // 2, 2 (nx // 2) − 1).
+    (ny // 2, 2 (nx // 2) − 1). For a profile of one row or column, the only lag across it is 0.
 
     Raises:
         InputError: the surface contains NaN, or its heights are constant.
@@ -79,12 +79,17 @@ def autocorrelation(height_um: Array) -> Array:
     padded = [scipy.fft.next_fast_len(size + size // 2, real=True) for size in (ny, nx)]
     spectrum = scipy.fft.rfft2(deviation, padded)
     products = scipy.fft.irfft2(np.abs(spectrum) ** 2, padded)
-    rows, columns = np.arange(ny // 2), np.arange(-(nx // 2 - 1), nx // 2)
-    pairs = np.outer(ny - rows, nx - np.abs(columns))
-    covariance = products[np.ix_(rows, columns)] / pairs
-    if covariance[0, nx // 2 - 1] <= 0:
+    half_y, half_x = max(1, ny // 2), max(1, nx // 2)
+    rows, columns = np.arange(half_y), np.arange(1 - half_x, half_x)
+    covariance = products[np.ix_(rows, columns)] / _pairs((ny, nx), rows, columns)
+    if covariance[0, half_x - 1] <= 0:
         raise InputError("surface", got="constant heights", wanted="heights that vary")
-    return covariance / covariance[0, nx // 2 - 1]
+    return covariance / covariance[0, half_x - 1]
+
+
+def _pairs(shape: Shape, rows: Array, columns: Array) -> Array:
+    """Return how many pixel pairs have each lag, an array of shape (rows, columns)."""
+    return np.outer(shape[0] - rows, shape[1] - np.abs(columns))
 
 
 def effective_samples(height_um: Array) -> float:
@@ -94,16 +99,24 @@ def effective_samples(height_um: Array) -> float:
 
     The formula holds for Gaussian surfaces, whose estimated mean square has the relative variance ``2 Σ ρ² /
     pixels``. The sum excludes lags beyond a quarter of the field, because the estimated ρ is nothing but
-    noise there.
+    noise there. The noise of the other estimates, whose expected square is Σ ρ² divided by the number of
+    pixel pairs, is subtracted.
     """
     correlation = autocorrelation(height_um)
-    rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
     centre = correlation.shape[1] // 2
-    near = correlation[:rows, centre - columns : centre + columns + 1]
-    # ρ is computed only for row lags of 0 and more. Its values at negative row lags mirror those at positive
-    # ones.
-    total = 2 * np.sum(near**2) - np.sum(near[0] ** 2)
-    return float(min(height_um.size, max(1.0, height_um.size / total)))
+    rows = np.arange(max(1, correlation.shape[0] // 2))
+    reach = min(centre, max(1, correlation.shape[1] // 4))
+    columns = np.arange(-reach, reach + 1)
+
+    def total(values: Array) -> float:
+        """Sum over all lags. Values at negative row lags mirror those at positive ones."""
+        return float(2 * np.sum(values) - np.sum(values[0]))
+
+    noise = 1 / _pairs(height_um.shape, rows, columns)
+    # At lag 0, ρ is 1 without noise.
+    noise[0, reach] = 0
+    summed = total(correlation[np.ix_(rows, centre + columns)] ** 2) / (1 + total(noise))
+    return float(min(height_um.size, max(1.0, height_um.size / summed)))
 
 
 def sq_uncertainty_nm(height_um: Array) -> float:
