@@ -58,9 +58,11 @@ def highest_curvature(height_um: Array, pitch_um: YX, radius_px: float) -> Array
 
     kernels, edge = disc_kernels(radius_px, pitch_um), int(radius_px)
     measured = np.isfinite(height_um)
+    highest = np.full(height_um.shape, np.nan)
+    if min(height_um.shape) < kernels.shape[-1]:
+        return highest
     filled = np.where(measured, height_um, 0.0)
     xx, xy, yy = (oaconvolve(filled, kernel[::-1, ::-1], mode="valid") for kernel in kernels)
-    highest = np.full(height_um.shape, np.nan)
     inner = slice(edge, height_um.shape[0] - edge), slice(edge, height_um.shape[1] - edge)
     highest[inner] = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
     if not measured.all():

@@ -26,6 +26,7 @@ from litho_data.tip import (
     reconstructed,
     tip_certain,
 )
+from litho_data.tip.curvature import highest_curvature
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_data.known_tips import OVER, PITCH_UM, fine_surface, noise_of_snr, print_under_tip
@@ -225,6 +226,21 @@ def test_a_blunter_tip_leaves_fewer_pixels_certain_and_a_flat_scan_all() -> None
     assert tip_certain(noise, PITCH, 0.05).all()
     with pytest.raises(InputError, match="radius of the tip"):
         tip_certain(noise, PITCH, float("nan"))
+
+
+@pytest.mark.parametrize("shape", [(9, 9), (10, 9), (9, 30), (8, 8), (8, 9), (30, 8), (1, 30)])
+def test_curvatures_are_known_only_where_the_disc_fits_into_the_scan(shape: tuple[int, int]) -> None:
+    y, x = 0.1 * np.indices(shape)
+    found = highest_curvature(x**2 / 2 + y**2, (0.1, 0.1), 4.0)
+    inside = np.zeros(shape, bool)
+    inside[4 : max(4, shape[0] - 4), 4 : max(4, shape[1] - 4)] = True
+    assert np.array_equal(np.isfinite(found), inside)
+    assert found[inside] == pytest.approx(2.0, rel=1e-9)
+
+
+def test_a_noisy_scan_smaller_than_the_disc_has_no_valley() -> None:
+    height = np.random.default_rng(0).normal(0, 0.2, (10, 32))
+    assert tip_certain(height, (0.1, 0.1), 1.0).all()
 
 
 def test_the_lateral_resolution_follows_its_closed_form_and_surface_topography() -> None:
