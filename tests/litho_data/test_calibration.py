@@ -155,7 +155,7 @@ def test_a_standard_is_read_as_the_scans_are(tmp_path: Path) -> None:
     assert scale("x.gsf", own='format = "gsf"\n') == pytest.approx(true, rel=1e-4)
     # It must agree with what the card states for this standard.
     with pytest.raises(InputError, match="size_um"):
-        scale("x.gsf", own='format = "gsf"\nsize_um = [12.8, 12.8]\n')
+        scale("x.gsf", own='format = "gsf"\nunit = "m"\nsize_um = [12.8, 12.8]\n')
     marks, own = "missing = [-9999]\n", own.replace('"m"', '"um"')
     assert scale("marked.txt", marks, own) == pytest.approx(true, rel=1e-3)
     assert scale("marked.txt", "missing = []\n", own + marks) == scale("marked.txt", marks, own)

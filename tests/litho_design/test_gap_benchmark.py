@@ -112,7 +112,7 @@ def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
 
 
 def test_the_model_of_a_closed_loop_is_an_arm_of_the_measured_task_only(tmp_path):
-    zoo = {name: f"zoo/{name}" for name in ("physics", "fno", "pbl")}
+    zoo = {name: f"zoo/{name}" for name in ("physics", "fno", "pbl", "random-features")}
     *others, measured = tasks(tmp_path, TINY, zoo, "loop/model")
     assert dict(measured.models) == {"none": "none", **zoo, "closed-loop": "loop/model"}
     assert all("closed-loop" not in task.models for task in others)
