@@ -21,6 +21,7 @@ from litho_design.images.similarity import (
     ssim,
 )
 from litho_design.optics import Optics, element_field
+from litho_design.optics.thin_element import flat_field
 from litho_design.tasks.bench import ElementBench
 
 # Pixel side in the image plane and NA of an assumed camera: pixels of 3.45 µm behind an objective with a
@@ -134,8 +135,7 @@ def zero_order_share(element: Tensor, grid: PixelGrid, optics: Optics) -> float:
     This is |sum u conj(i)|^2 / (sum |u|^2 sum |i|^2), where u is the wave behind the element and i the wave
     behind a flat element. ``element`` contains u on the pixels of ``grid``.
     """
-    flat = torch.zeros(grid.shape, dtype=torch.float64, device=element.device)
-    light = element_field(flat, grid, optics)
+    light = flat_field(grid, optics).to(element.device)
     overlap = (element * light.conj()).sum().abs().square()
     return float(overlap / (element.abs().square().double().sum() * light.abs().square().sum()))
 

@@ -25,6 +25,7 @@ from litho_design.large.bands import Bands, require_reach
 from litho_design.large.figures import image_figures
 from litho_design.large.propagator import BandedPropagator
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share
+from litho_design.optics.thin_element import flat_field
 from litho_design.optimisation.parameters import CellMap
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import out_of_distribution
@@ -188,8 +189,7 @@ class BandedBench(nn.Module):
         """Return the wave behind the rows of a flat element that this process holds, as complex128 of shape
         (rows, size).
         """
-        flat = torch.zeros(self.rows.shape, dtype=torch.float64)
-        return element_field(flat, self.rows, self.optics, pixels=self.pixels)
+        return flat_field(self.rows, self.optics, pixels=self.pixels)
 
     def forward(self, height_um: Tensor) -> Tensor:
         """Return the share of the incident power on each pixel of the image plane that this process holds,

@@ -61,16 +61,14 @@ class LensOptics(nn.Module):
         """Return the distance from the axis of every point at which the lens has a height, float64, µm."""
         raise NotImplementedError
 
-    def tilt_um(self) -> Tensor | float:
-        """Return the path by which light arrives late at every such point, float64, µm. It is 0 for light
-        along the axis.
-        """
+    def oblique_path_um(self) -> Tensor | float:
+        """Return the extra path of oblique light to each of these points, float64, µm."""
         return 0.0
 
     def ideal_height_um(self) -> Tensor:
         """Return the heights of a perfect lens, µm, wrapped at the height that gives a phase delay of 2π."""
         focal_um = self.optics.distance_um
-        path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt() - self.tilt_um()
+        path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt() - self.oblique_path_um()
         # This height delays the wave by the difference in path length; wrapping the height does not change
         # the wave.
         height = path * self.optics.wave_height_um / self.optics.wavelength_um
@@ -101,11 +99,10 @@ class LensBench(LensOptics):
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
         return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
-    def tilt_um(self) -> Tensor:
-        """Return the path of oblique light to each pixel, relative to the axis, shape (size, size), µm."""
+    def oblique_path_um(self) -> Tensor:
+        """Return the extra path of oblique light to each pixel, float64 of shape (size, size), µm."""
         y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
-        path = self.optics.incidence_y * y[:, None] + self.optics.incidence_x * x[None, :]
-        return path.to(self.aperture.device)
+        return self.optics.oblique_path_um(y[:, None], x[None, :]).to(self.aperture.device)
 
 
 class RadialLensBench(LensOptics):

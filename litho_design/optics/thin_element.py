@@ -93,6 +93,12 @@ class Optics(Record):
         step = self.index_step + there - here
         return self.model_copy(update={"wavelength_um": wavelength_um, "index_step": step})
 
+    def oblique_path_um(self, y_um: Tensor, x_um: Tensor) -> Tensor:
+        """Return the extra path of oblique light to given positions, relative to the axis, µm. It is 0 for
+        light along the axis.
+        """
+        return self.incidence_x * x_um + self.incidence_y * y_um
+
     @property
     def wave_height_um(self) -> float:
         """Return the height that delays the wave by one period, µm."""
@@ -131,7 +137,7 @@ def element_field(
     if optics.incidence_x or optics.incidence_y or optics.source_distance_um or optics.beam_um:
         x, y = (torch.from_numpy(axis).double().to(phase.device) for axis in (grid.x_um, grid.y_um))
         squared = x[None, :] ** 2 + y[:, None] ** 2
-        path_um = optics.incidence_x * x[None, :] + optics.incidence_y * y[:, None]
+        path_um = optics.oblique_path_um(y[:, None], x[None, :])
         if optics.source_distance_um:
             path_um = path_um + (squared + optics.source_distance_um**2).sqrt() - optics.source_distance_um
         phase = phase + (path_um * (2 * math.pi / optics.wavelength_um)).to(phase)
@@ -148,6 +154,15 @@ def element_field(
         return torch.polar(amplitude, phase)
     tilted = torch.polar(amplitude, phase - height_um * (2 * math.pi / optics.wave_height_um))
     return through_relief(tilted, height_um, grid.pitch_um[0], optics)
+
+
+def flat_field(grid: PixelGrid, optics: Optics, *, pixels: int | None = None) -> Tensor:
+    """Return the wave just behind a flat element, complex128 of shape (ny, nx). The arguments are those of
+    ``element_field``.
+    """
+    import torch  # imported late, as in `element_field`
+
+    return element_field(torch.zeros(grid.shape, dtype=torch.float64), grid, optics, pixels=pixels)
 
 
 def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:

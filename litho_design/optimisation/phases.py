@@ -114,8 +114,8 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
     grid = centred_grid((cells.size_px, cells.size_px), pitch_um)
     y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
     radius = (x**2 + y**2 + optics.distance_um**2).sqrt()
-    tilt = optics.incidence_x * x + optics.incidence_y * y
-    phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius - tilt)
+    path_um = optics.distance_um - radius - optics.oblique_path_um(y, x)
+    phase = (2 * math.pi / optics.wavelength_um) * path_um
     # For each cell, the mean of the complex wave is computed instead of the mean of the phase, because the
     # mean of wrapped phases is meaningless.
     return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()

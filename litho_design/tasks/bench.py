@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share, make_propagator
 from litho_design.optics.source import coherent_parts
+from litho_design.optics.thin_element import flat_field
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -43,7 +44,7 @@ class ElementBench(nn.Module):
         """Return the wave behind a flat element, for the middle wave of the source, as complex128 of shape
         (size, size).
         """
-        return element_field(torch.zeros(self.grid.shape, dtype=torch.float64), self.grid, self.optics)
+        return flat_field(self.grid, self.optics)
 
     def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
         """Yield one pair for each plane wave of the source: its share of the light, and the wave in the image
