@@ -15,7 +15,7 @@ from typing import Any
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
-from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table
+from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, SAFE_ID_RULE, read_full_scales, read_table
 from litho_data.foundation import Facts, InputError
 from litho_data.foundation.names import is_plain_name
 from litho_data.readers.exported import sidecar_of
@@ -222,7 +222,7 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
     used.
     """
     if not SAFE_ID.fullmatch(scan_id):
-        return "an id may contain only letters, digits, spaces and ._+-"
+        return f"an id {SAFE_ID_RULE}"
     for what, name in (("id", scan_id), ("name of the print", print_id or scan_id)):
         if not is_plain_name(name):
             return f"the first or last character of the {what} {name[:80]!r}, or its length, is not allowed"

@@ -17,6 +17,7 @@ from litho_data.readers.text_blocks import read_text
 from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
+SAFE_ID_RULE = "may contain only letters, digits, spaces and ._+-, and begins with a letter or digit"
 READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
 """Columns of the card's CSV table that say how to read a single scan. Their values take precedence over the
 entries with the same names in the card's ``[scan]`` table.

@@ -17,7 +17,7 @@ import numpy as np
 
 from litho_data.cards.card import Card, check_card
 from litho_data.cards.listing import prints_of
-from litho_data.cards.tables import SAFE_ID, read_full_scales
+from litho_data.cards.tables import SAFE_ID, SAFE_ID_RULE, read_full_scales
 from litho_data.commands.progress import progress
 from litho_data.foundation import Array, InputError, file_sha256, record_sha256
 from litho_data.foundation.begun import whole_folder
@@ -33,7 +33,6 @@ from litho_data.store.read import open_store
 
 _QUADRANTS = (1, 2, 3, 4)
 SCALES_FILE = "src_max_dict.txt"
-_BAD_NAME = "a name may contain only letters, digits, spaces and ._+-, and begins with a letter or digit"
 _AUTHORS_IDS = r"FOV(?P<print>\d)(?P<field>\d)\d?"
 
 
@@ -172,7 +171,7 @@ def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int
     unpaired |= {f"afm/{name}": f"not in {SCALES_FILE}" for name in sorted((masks & heights) - set(scales))}
     paired = masks & heights & set(scales)
     complete = sorted(name for name in paired if SAFE_ID.fullmatch(name))
-    unpaired |= {f"afm/{name}": _BAD_NAME for name in sorted(paired.difference(complete))}
+    unpaired |= {f"afm/{name}": f"a name {SAFE_ID_RULE}" for name in sorted(paired.difference(complete))}
     cut: dict[str, dict[int, str]] = {}
     for name in complete:
         stem = Path(name).stem

@@ -62,21 +62,26 @@ def require_same(folder: Path, held: Any, facts: Facts) -> None:
         )
 
 
-def first_difference(then: Facts, now: Facts, path: str = "") -> str:
+def first_difference(then: Facts, now: Facts, *above: str) -> str:
     """Return the first setting of ``now`` that is missing in ``then`` or has another value there; return ""
     if there is none.
 
     A part of a record, such as the dataset, may hold fields that ``now`` does not state. If the value of such
     a field is itself a mapping, such as the values that were set by name, it must hold nothing else.
+
+    Args:
+        then, now: the older and the requested settings.
+        above: keys under which both are found in the whole record.
     """
+    path = "".join(f"{key}." for key in above)
     for name, after in now.items():
         if isinstance(after, dict):
-            if deeper := first_difference(then.get(name) or {}, after, f"{path}{name}."):
+            if deeper := first_difference(then.get(name) or {}, after, *above, name):
                 return deeper
         elif name not in then or then[name] != after:
             short = name in then and not isinstance(after, list)
             return f"{path}{name}" + (f" = {then[name]!r}, but now {after!r} is requested" if short else "")
-    within_a_field = path.count(".") > 1
+    within_a_field = len(above) > 1
     dropped = [name for name in then if name not in now] if within_a_field else []
     return f"{path}{dropped[0]} = {then[dropped[0]]!r}, but now no value is requested" if dropped else ""
 

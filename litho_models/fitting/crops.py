@@ -19,6 +19,14 @@ _PASS_PX = 256**2
 FEWEST_PIXELS = 1024
 
 
+def part_to_fit(counts: Sequence[int], usual: int) -> int:
+    """Return the number of the part of a scan to fit: the usual part, or the one with the most measured
+    pixels if the usual part has few. ``counts`` contains the number of measured pixels of each part.
+    """
+    enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
+    return usual if enough else int(np.argmax(counts))
+
+
 @dataclass(frozen=True)
 class Window:
     """A square window in a scan. ``scan`` is the number of the scan, ``y`` and ``x`` are the indices of the

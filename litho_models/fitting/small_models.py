@@ -13,7 +13,7 @@ from litho_data.commands.progress import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
-from litho_models.fitting.crops import FEWEST_PIXELS, Window, cut, stack
+from litho_models.fitting.crops import Window, cut, part_to_fit, stack
 from litho_models.fitting.least_squares import Linearised, Room, Rules, fit_least_squares
 from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
 from litho_models.scan_terms.policies import PINNED, smooth_training_terms
@@ -158,9 +158,7 @@ def _corner(scan: PrintedScan, usual: int) -> Window:
     last_y, last_x = (length - size for length in scan.shape)
     corners = [Window(0, y, x, size) for y in (0, last_y) for x in (0, last_x)]
     counts = [int(cut(scan.usable, corner).sum()) for corner in corners]
-    # A small scan has few pixels in every corner.
-    enough = counts[usual] >= min(FEWEST_PIXELS, max(counts))
-    return corners[usual if enough else int(np.argmax(counts))]
+    return corners[part_to_fit(counts, usual)]
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> Array:

@@ -60,18 +60,17 @@ def fit_with_measurement(twin: Twin, scans: Sequence[PreparedScan], seed: int = 
             the measurement model is fitted only once.
     """
     stored = [scan.stored for scan in scans]
-    # A strength that only other scans have would keep the value that was fitted to them.
-    twin = twin.known_from(scans)
     maps = [*map(twin.height, scans)]
     measurement = learn_measurement(stored, maps, seed=seed)
     if refit and len(twin.vector):
         freed = [*map(measurement.freed, stored, maps)]
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
-        twin = twin.known_from(scans)
         maps = [*map(twin.height, scans)]
         measurement = learn_measurement(stored, maps, seed=seed, like=measurement)
-    return Fit(twin, measurement)
+    # Strengths of groups to which none of these scans belongs were not fitted here. Their values may be from
+    # the scans that are left out, so they are replaced.
+    return Fit(twin.known_from(scans), measurement)
 
 
 def error_rows(

@@ -16,7 +16,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
-from litho_models.fitting.crops import FEWEST_PIXELS
+from litho_models.fitting.crops import part_to_fit
 from litho_models.fitting.least_squares import orthonormal
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 from litho_models.scan_terms.blocks import thinned
@@ -150,9 +150,8 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
         tuple(_half(size, bool(second)) for size, second in zip(shape, (one % 2, one // 2), strict=True))
         for one in range(4)
     ]
-    counts = [np.count_nonzero(usable[tuple(own for _, own in part)]) for part in parts]
-    chosen = number % 4 if counts[number % 4] >= FEWEST_PIXELS else int(np.argmax(counts))
-    cut, own = zip(*parts[chosen], strict=True)
+    counts = [int(np.count_nonzero(usable[tuple(own for _, own in part)])) for part in parts]
+    cut, own = zip(*parts[part_to_fit(counts, number % 4)], strict=True)
     mine = np.zeros(shape, bool)
     mine[own] = True
     sigma_um = scan.stored.height_sigma_um
