@@ -20,12 +20,12 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# Rounding in double precision leaves a direction of the fit undetermined if the ratio of its eigenvalue to
-# the largest eigenvalue of the normal matrix is below this limit. The background may still be well
-# determined: for example, if all pixels near two knots have the same level, only the response at these knots
-# is undetermined.
+# Eigenvalues of the normal matrix below this share of the largest are lost in rounding errors, so they are
+# raised to it. The background may still be well determined. For example, if all pixels between two knots have
+# the same level, only the heights at these knots are undetermined.
 _SINGULAR = 1e-9
-# The background is refused if noise shifts it by this many times more than it would without a layout.
+# A background is refused if its error due to noise is larger than this number times the error that a fit
+# without a layout would have.
 _MOST_LOSS = 1000.0
 # The response has one knot per level, but not more than this number of intervals between knots.
 _MOST_INTERVALS = 64
@@ -131,7 +131,8 @@ def layout_in_scan_frame(
 
 
 def level_hats(level: Array, top: int) -> Array:
-    """Return the hat functions whose weighted sums are the piecewise linear functions of the level.
+    """Compute the hat functions of the level. Their weighted sums are all functions of the level that are
+    linear between the knots.
 
     Each hat is 1 at its own knot and 0 at all others. There is one knot per level from 0 to ``top``, or 65
     evenly spaced knots if there are more levels.

@@ -31,8 +31,8 @@ OPERATIONS: dict[str, Operation] = {}
 READERS = ("read-scan", "read-micrograph")
 """The names of the operations that read the microscope's files."""
 READER_SHA256 = "reader_sha256"
-"""The parameter that states the hash of the source of a user's own reader. The operation does not use it, but
-steps with different readers get different ids.
+"""The name of the parameter that contains the source hash of a user's own reader. The operation ignores the
+hash. It only gives steps with different readers different ids.
 """
 
 

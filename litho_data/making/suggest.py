@@ -98,7 +98,7 @@ def suggest_recipe(
 
     Raises:
         InputError: the card is bad or describes micrographs, no scan can be read and registered, no recipe
-            can be applied, or the card has no line where the recipe can be named.
+            can be applied, or its name cannot be added to the card as a line.
     """
     listing = list_fields(card_path, data_dir)
     if listing.card.scan.instrument == "sem":
@@ -194,7 +194,8 @@ def _write_card(card: Path, best: str) -> Path:
     of the card stays unchanged. Return the path of the copy.
 
     Raises:
-        InputError: there is no line in the card where the recipe can be named, as in an inline table.
+        InputError: the recipe's name cannot be added to the card as a line, for example because the table
+            ``process`` is written on one line.
     """
     recipe, target = card.with_suffix(".recipe.toml"), card.with_suffix(".suggested.toml")
     before = card.read_text(encoding="utf-8")

@@ -262,7 +262,7 @@ def test_saturation_is_found_from_the_pixels_and_not_from_the_file_type(bits):
 
 
 def test_a_photograph_that_misses_a_part_of_the_image_has_the_dark_level_of_a_whole_one():
-    """Check a ramp along y. All columns are equal, so columns that are missing change nothing."""
+    """Check a ramp along y. All columns are equal, so missing columns do not change the result."""
     light = np.repeat(np.linspace(0.02, 1, 64, dtype=np.float32)[:, None], 64, axis=1)
     photo = (800 + 20000 * light).astype(np.float32)
     whole, cut = (

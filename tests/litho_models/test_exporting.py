@@ -48,7 +48,7 @@ def frozen(name: str, folder: Path) -> FrozenSimulator:
     [
         "zoo:physics",
         *CLOSED_FORM,
-        # An export to ONNX begins with the same program, and the test below makes it for PBL.
+        # PBL is left out: the test below exports it to ONNX, and that export begins with this program.
         *(pytest.param(n, marks=pytest.mark.long) for n in ("pbl", "zoo:pbl", "zoo:fno", "zoo:features")),
     ],
 )
