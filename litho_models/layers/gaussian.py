@@ -6,10 +6,12 @@ few thousand pixels wide, this is faster than a Fourier transform, and it needs 
 """
 
 import math
+from functools import lru_cache
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
@@ -84,7 +86,12 @@ def gaussian_blur(
                 raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
             # For the blur along x, the lines of all samples are stacked into one image.
             images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
-            blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
+            if _differentiated(sigma_px):
+                blurred = _Blur.apply(images, _band(radius, sigma_px), axis)
+            else:
+                # In a small field, what a derivative needs would take twice as long as the blur.
+                band = _known_band(radius, float(sigma_px), sigma_px.dtype, sigma_px.device)
+                blurred = _Blur.forward(images, band, axis)
             field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
         return field
 
@@ -198,6 +205,17 @@ def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
 def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
     border = (before, after) if axis == -1 else (0, 0, before, after)
     return functional.pad(field, border) if before or after else field
+
+
+def _differentiated(number: Tensor) -> bool:
+    """Return whether operations are recorded for derivatives, or whether ``number`` has no single value."""
+    forward_mode = torch.autograd.forward_ad._current_level >= 0
+    return torch.is_grad_enabled() or forward_mode or is_functorch_wrapped_tensor(number)
+
+
+@lru_cache(maxsize=32)
+def _known_band(radius: int, sigma_px: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return _band(radius, torch.tensor(sigma_px, dtype=dtype, device=device))
 
 
 def _band(radius: int, sigma_px: Tensor) -> Tensor:

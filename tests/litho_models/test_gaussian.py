@@ -152,3 +152,15 @@ def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice(samples):
         given = (field.detach()[:1, :, :34], *fixed)
         forward, reverse = (way(blur, argument)(*given) for way in (torch.func.jacfwd, torch.func.jacrev))
         assert torch.allclose(forward, reverse, rtol=0, atol=1e-12)
+
+
+def test_without_gradients_the_blur_is_the_same_and_forward_derivatives_stay():
+    field, width = torch.rand(2, 1, 41, 40, dtype=torch.float64), torch.tensor(0.7, dtype=torch.float64)
+
+    def blur(sigma: torch.Tensor) -> torch.Tensor:
+        return gaussian_blur(field, sigma, 1.0, radius_px=4)
+
+    wanted = blur(width), torch.func.jacfwd(blur)(width), torch.func.vmap(blur)(width[None])
+    with torch.no_grad():
+        found = blur(width), torch.func.jacfwd(blur)(width), torch.func.vmap(blur)(width[None])
+    assert all(map(torch.equal, found, wanted))
