@@ -402,6 +402,8 @@ class Screening:
                 exchanged += 1
                 least = options[best][0] * (1 - 1e-12)
                 beaten += any(gains_of(best, tuple(own)).mean() >= least for own in moved)
+                if beaten > EXCHANGED_P * (1 + PERMUTATIONS):
+                    return None
         p = beaten / exchanged
         return (best, p) if p <= EXCHANGED_P else None
 
