@@ -51,6 +51,12 @@ def added(found: Found) -> dict[str, str]:
     return {cause.name: cause.by for cause in found.causes}
 
 
+@pytest.fixture(scope="module")
+def in_all_scans() -> Found:
+    """Return what a search finds where all scans have the same loss on slopes."""
+    return found_in((THINNING, ALL, {"": thinning(0.2)}))
+
+
 def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
     found = found_in((THINNING, "field", {"1": thinning(0.0), "2": thinning(0.2)}))
     assert added(found) == {THINNING: "field"}
@@ -66,14 +72,12 @@ def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
 
 
 @pytest.mark.parametrize("needed", [True, False])
-def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool) -> None:
+def test_a_search_keeps_of_its_first_causes_what_it_needs(needed: bool, in_all_scans: Found) -> None:
     """Check a search that starts from a cause that another base lacked. The present base either lacks it too,
     or does not.
     """
-    seed = found_in((THINNING, ALL, {"": thinning(0.2)}))
-    assert added(seed) == {THINNING: ALL}
     lacking = [(MEMORY, ALL, {"": memory(0.3)}), (THINNING, ALL, {"": thinning(0.2)})][: 1 + needed]
-    found = search(bare_state(study_of(planted(lacking, seed=1))), CANDIDATES, seed=seed)
+    found = search(bare_state(study_of(planted(lacking, seed=1))), CANDIDATES, seed=in_all_scans)
     assert added(found) == {name: ALL for name, *_ in lacking}
     if not needed:
         assert found.refused[THINNING]
@@ -94,12 +98,12 @@ def test_a_grouping_that_shows_only_beside_the_other_causes_is_found_at_the_end(
     assert found.state.twin.values({"field": "2"})[THINNING]["along_x_um"] == pytest.approx(0.2, rel=0.1)
 
 
-def test_a_cause_in_all_scans_is_found_with_one_strength() -> None:
-    found = found_in((THINNING, ALL, {"": thinning(0.15)}))
-    assert added(found) == {THINNING: ALL}
-    assert found.causes[0].group_p is None
-    assert found.causes[0].family_p <= 0.05
-    assert found.causes[0].judgement.improved == (10, 10)
+def test_a_cause_in_all_scans_is_found_with_one_strength(in_all_scans: Found) -> None:
+    assert added(in_all_scans) == {THINNING: ALL}
+    (cause,) = in_all_scans.causes
+    assert cause.group_p is None
+    assert cause.family_p <= 0.05
+    assert cause.judgement.improved == (10, 10)
 
 
 def test_a_loss_along_a_diagonal_is_the_cause_with_its_direction() -> None:
