@@ -84,7 +84,7 @@ def test_no_height_of_a_held_out_scan_changes_its_prediction(
     scans.
     """
     monkeypatch.setattr(measurement_fit, "_OFFERS", (("background", 2, False), ("gain", 0, True)))
-    scans = planted([(LAW, ALL, {"": STRENGTH})], count=8)
+    scans = planted([(LAW, ALL, {"": STRENGTH})], count=6)
     study = study_of(scans)
     out = np.flatnonzero(study.fold_of == 1).tolist()
     other = [s.height_um + 0.2 * s.layout_um**2 if i in out else s.height_um for i, s in enumerate(scans)]
