@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Generator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,17 +13,13 @@ import pytest
 
 from litho_data.foundation.faces import let_waiting_threads_sleep
 from litho_data.reports import page as report
-from tests.figures import require_legible
+from tests.figures import require_legible, undrawn
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # This must run before any test loads torch.
 let_waiting_threads_sleep()
-
-# A blank picture that replaces figures: drawing one takes half a second, and the tests make hundreds.
-BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
-
 
 _figure = report.Page.figure
 
@@ -37,9 +34,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     """Check every figure that a test makes. Figures are drawn only in tests marked ``pictures``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report.Page, "figure", _legible)
-        if item.get_closest_marker("pictures") is None:
-            patch.setattr(report, "svg_address", lambda figure: BLANK)
-        return (yield)
+        with undrawn() if item.get_closest_marker("pictures") is None else nullcontext():
+            return (yield)
 
 
 def pytest_collection_finish() -> None:

@@ -5,13 +5,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
+
+from litho_data.reports import page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+# A blank picture that replaces figures: drawing one takes half a second, and the tests make hundreds.
+_BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
+
+
+@contextmanager
+def undrawn() -> Iterator[None]:
+    """Leave figures undrawn."""
+    with patch.object(page, "svg_address", lambda figure: _BLANK):
+        yield
 
 
 def require_legible(figure: Figure) -> None:

@@ -469,7 +469,7 @@ class _Fit:
 
 def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
     """Fit the camera whose photograph of the expected image is closest to ``photo``. With ``further``, also
-    fit its tilt and the relation between counts and light.
+    fit its tilt and the relation between counts and light, and end the fit only at full accuracy.
     """
     import cv2
 
@@ -493,6 +493,8 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     # Residuals of neighbouring pixels are not independent, so this number of pixels counts as one independent
     # pixel.
     alike = 4 * math.pi * blur_px**2
+    # The correlation alone is as accurate if the last step changes the sum of squares by less than this part.
+    close = 1e-8 if further else 1e-4
 
     def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
         target = (model - model.mean()) / model.std()
@@ -512,7 +514,9 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
             ways = 0.5 * np.eye(len(columns))
             return np.stack([residual(step + way) - residual(step - way) for way in ways], axis=1)
 
-        found = least_squares(residual, np.zeros(len(columns)), jac=slopes, method="lm", max_nfev=60)
+        found = least_squares(
+            residual, np.zeros(len(columns)), jac=slopes, method="lm", max_nfev=60, ftol=close, xtol=close
+        )  # fmt: skip
         at = start.copy()
         at[columns] += found.x * unit[columns]
         return at, found
