@@ -3,7 +3,7 @@
 This must run in a separate process with one thread, because each stopped command is a fork of that process.
 Every command is a function of its working folder, which already contains its input. The module runs each
 stopped command again, checks that the result equals that of an uninterrupted run, and prints the number of
-stops. NAMES are separated by commas. By default, a command is stopped up to five times. With ``every``, and
+stops. NAMES are separated by commas. By default, a command is stopped up to four times. With ``every``, and
 always if it takes little time, it is stopped after each write.
 """
 
@@ -333,9 +333,10 @@ def _steady(value: Any) -> Any:
 
 def chosen(count: int, most: int) -> list[int]:
     """Return the numbers of writes at which to stop. They are spread over all writes. The last three writes,
-    which put the results in place, are always among them.
+    which put the results in place, are always among them, and the first is not: before it, nothing is left.
     """
-    spread = range(0, count, max(1, -(-count // most)))
+    step = max(1, -(-count // (most + 1)))
+    spread = range(step, count, step)
     return sorted({*spread, *range(max(0, count - 3), count)})
 
 
@@ -345,8 +346,7 @@ def stop_everywhere(name: str, place: Path, most: int) -> int:
     prepared = place / "prepared"
     prepared.mkdir(parents=True)
     need(prepared)
-    # Run the command once in this process, so that the forks need not import anything.
-    command(Path(shutil.copytree(prepared, place / "first")))
+    # The whole run is in this process, so that the forks need not import anything.
     whole = Path(shutil.copytree(prepared, place / "whole"))
     count = writes_of(lambda: command(whole), whole)
     wanted = content(whole)
@@ -369,5 +369,5 @@ if __name__ == "__main__":
     # Pictures are part of the page. They take most of the time and write no files, so they are left undrawn.
     page.svg_address = lambda figure: "data:,"
     for name in sys.argv[1].split(","):
-        most = 10**9 if name in SHORT or "every" in sys.argv else 2
+        most = 10**9 if name in SHORT or "every" in sys.argv else 1
         stop_everywhere(name, Path(sys.argv[2]) / name, most)

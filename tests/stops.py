@@ -17,18 +17,10 @@ _STOPPED = 77
 
 
 def writes_of(work: Callable[[], object], below: Path) -> int:
-    """Run the work in a child process and return how many writes it makes inside a folder."""
-    reader, writer = os.pipe()
-    child = os.fork()
-    if child == 0:
-        count = _watch(below, stop_before=None)
-        _end(work, lambda: os.write(writer, str(count[0]).encode()))
-    os.close(writer)
-    with os.fdopen(reader) as stream:
-        said = stream.read()
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code == 0, f"the work ended with exit code {code} without being stopped"
-    return int(said)
+    """Run the work and return how many writes it makes inside a folder."""
+    count = _watch(below, stop_before=None)
+    work()
+    return count[0]
 
 
 def stopped_after(count: int, work: Callable[[], object], below: Path) -> bool:
@@ -36,17 +28,16 @@ def stopped_after(count: int, work: Callable[[], object], below: Path) -> bool:
     child = os.fork()
     if child == 0:
         _watch(below, stop_before=count)
-        _end(work, lambda: None)
+        _end(work)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     assert code in (0, _STOPPED), f"the work ended with exit code {code}"
     return code == _STOPPED
 
 
-def _end(work: Callable[[], object], last: Callable[[], object]) -> None:
+def _end(work: Callable[[], object]) -> None:
     code = 1
     try:
         work()
-        last()
         code = 0
     except BaseException as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
