@@ -14,6 +14,7 @@ from litho_design.optics import (
     ASMPropagator,
     Optics,
     RSPropagator,
+    angular_spectrum,
     centred_grid,
     element_field,
     intensity_share,
@@ -208,17 +209,19 @@ def gaussian(grid, waist=3.0):
 
 
 # Pixels below half a wavelength hold evanescent waves, which grow without limit on the way back.
-@pytest.mark.parametrize(("count", "pitch"), [(256, 0.35), (512, 0.1)])
-def test_asm_semigroup_and_reversal(count, pitch):
+@pytest.mark.parametrize(("count", "pitch"), [(128, 0.35), (256, 0.1)])
+def test_asm_semigroup_and_reversal(monkeypatch, count, pitch):
+    # This beam has no grazing rays, which alone need a long period.
+    monkeypatch.setattr(angular_spectrum, "_LONGEST_PERIOD", 1024)
     grid = centred_grid((count, count), pitch)
 
     def asm(z):
         return ASMPropagator(grid, grid, z, WAVELENGTH_UM, dtype=torch.complex128)
 
     u = gaussian(grid)
-    once = asm(50.0)(u)
-    assert (asm(30.0)(asm(20.0)(u)) - once).abs().max() < 1e-5
-    assert (asm(-50.0)(once) - u).abs().max() < 1e-5
+    once = asm(20.0)(u)
+    assert (asm(12.0)(asm(8.0)(u)) - once).abs().max() < 1e-5
+    assert (asm(-20.0)(once) - u).abs().max() < 1e-5
     assert (asm(0.0)(u) - u).abs().max() < 1e-12
 
 
