@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,8 @@ def _sources(package: str, root: Path = ROOT) -> list[Path]:
     return files
 
 
-def _imports(file: Path) -> set[str]:
+@cache
+def _imports(file: Path) -> frozenset[str]:
     """Return the dotted names of everything that a file imports, including the imports inside its
     functions.
     """
@@ -59,7 +61,7 @@ def _imports(file: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file} has a relative import"
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return frozenset(names)
 
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))
@@ -209,9 +211,9 @@ def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
 
 
 def test_importing_litho_data_takes_less_than_half_a_second() -> None:
-    # Take the best of three, because another process may slow this one down.
+    # One of three is enough, because another process may slow this one down.
     code = "import time; t = time.perf_counter(); import litho_data; print(time.perf_counter() - t)"
-    assert min(float(_python(code)) for _ in range(3)) < 0.5
+    assert any(float(_python(code)) < 0.5 for _ in range(3))
 
 
 @pytest.mark.parametrize("package", sorted(ALLOWED))

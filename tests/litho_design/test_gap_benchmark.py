@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 
 import pytest
 import torch
 from typer.testing import CliRunner
 
+from benchmarks.gap.__main__ import main
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
@@ -119,12 +119,13 @@ def test_the_model_of_a_closed_loop_is_an_arm_of_the_measured_task_only(tmp_path
     assert "closed-loop" not in tasks(tmp_path, TINY, zoo, None)[-1].models
 
 
-def test_a_page_with_some_of_the_tasks_is_not_published(tmp_path):
+def test_a_page_with_some_of_the_tasks_is_not_published(tmp_path, monkeypatch, capsys):
     options = ["--out", str(tmp_path / "gap"), "--tasks", "hoe", "--publish"]
-    command = [sys.executable, "-m", "benchmarks.gap", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "--publish" in done.stderr
+    monkeypatch.setattr(sys, "argv", ["gap", *options])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "--publish" in capsys.readouterr().err
     assert not (tmp_path / "gap").exists()
 
 
