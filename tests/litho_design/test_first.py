@@ -25,7 +25,6 @@ TINY = {
 }
 
 
-@pytest.mark.pictures
 def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_path):
     result = first(tmp_path, target="ring", settings=hologram_settings(changes=TINY), announce=False)
     assert {(entry.arm, entry.judge) for entry in result.entries} == {

@@ -26,6 +26,7 @@ from litho_models.models import model_class
 from tests.tables import require_figures_by_column
 
 SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20", "--yield-draws", "5")
+FEW = ("--yield-draws", "2", "--set", "search.polish_rounds=0")
 
 
 @pytest.fixture
@@ -256,6 +257,7 @@ def test_a_model_of_another_pitch_designs_at_its_own_pitch(tmp_path, monkeypatch
         0.2,
         "--iterations",
         2,
+        *FEW,
     )
     monkeypatch.setattr(sys, "argv", ["litho-design", *task, *map(str, common)])
     with pytest.raises(SystemExit) as stop:
@@ -303,7 +305,7 @@ def test_a_picture_of_another_shape_is_adapted_and_the_adaptation_is_reported(tm
         "--out",
         str(tmp_path / "d"),
     )
-    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments, *SMALL[:4], "--iterations", "2"])
+    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments, *SMALL[:4], "--iterations", "2", *FEW])
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 0
