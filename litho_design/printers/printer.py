@@ -226,11 +226,10 @@ class Printer(nn.Module):
         if self._level_heights_um:
             return self._level_heights_um
         size = 2 * self.guard_px + 16
-        middle = slice(size // 2 - 4, size // 2 + 4)
         heights = []
         for level in range(self.layout.levels):
             nominal = torch.full((1, 1, size, size), level * self.layout.level_height_um, device=self.device)
-            heights.append(float(self._printed(nominal)[..., middle, middle].mean()))
+            heights.append(float(self._inside(nominal, size // 2 - 4).mean()))
         self._level_heights_um = heights
         return heights
 

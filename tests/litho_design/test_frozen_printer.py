@@ -275,13 +275,13 @@ def test_a_model_that_changes_itself_is_refused_and_leaves_no_design(
     tmp_path, affine_folder, monkeypatch, capsys
 ):
     simulator_class = model_class("affine")
-    prints = simulator_class.forward
+    prints = simulator_class.interior
 
-    def forward(self, *arguments, **settings):
+    def interior(self, *arguments, **settings):
         next(self.parameters()).data.add_(1e-6)
         return prints(self, *arguments, **settings)
 
-    monkeypatch.setattr(simulator_class, "forward", forward)
+    monkeypatch.setattr(simulator_class, "interior", interior)
     arguments = ("hoe", "--model", str(affine_folder), "--target", "ring", "--out", str(tmp_path / "d"))
     monkeypatch.setattr(sys, "argv", ["litho-design", *arguments, *SMALL[:4], "--iterations", "1"])
     with pytest.raises(SystemExit) as stop:
