@@ -29,7 +29,11 @@ SMALLER = {
         '"layout.size_px": 192, "optics.distance_um": 18, "search.iterations": 30': '"layout.size_px": 64, '
         '"optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0, "window.yield_draws": 4'
     },
-    "gallery": {"count=4": "count=2", '"search.iterations": 20': '"search.iterations": 2'},
+    "gallery": {
+        "count=4": "count=2",
+        '"layout.size_px": 160, "optics.distance_um": 15, "search.iterations": 20': '"layout.size_px": 64, '
+        '"optics.distance_um": 12, "search.iterations": 2, "window.yield_draws": 4',
+    },
 }
 
 

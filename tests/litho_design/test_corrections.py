@@ -15,7 +15,7 @@ from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.task import ReliefTask
 from tests.litho_design.conftest import BlurPrinter
 
-SEEDS = (5, 6, 7)
+SEEDS = (5, 6)
 
 
 class Hidden(BlurPrinter):
@@ -81,12 +81,12 @@ def test_a_correction_is_no_worse_than_none_by_a_judge_that_took_no_part(rows):
 
 
 def test_the_stated_width_contains_the_printed_heights(rows):
-    assert sum(map(holds, rows)) >= 14
+    assert sum(map(holds, rows)) >= 9
     # The width is not trivially large, because the reliefs have an rms height of at least 170 nm.
     assert np.median([row["between_nm"][1] for row in rows]) < 100
     # The models agree with each other, so without their errors the width would contain hardly any print.
     smooth = [row for row in rows if row["relief"] in ("cap", "freeform", "staircase")]
-    assert sum(abs(row["printed_nm"]["corrected"] / row["stated_nm"] - 1) < 0.1 for row in smooth) < 4
+    assert sum(abs(row["printed_nm"]["corrected"] / row["stated_nm"] - 1) < 0.1 for row in smooth) < 3
 
 
 def test_the_error_of_a_model_is_that_of_its_prints_and_grows_with_the_relief():

@@ -55,8 +55,9 @@ def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
 
 
 def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_printer):
-    target = load_target("ring", 128)
-    layout = small_settings.layout
+    target, layout = load_target("ring", 64), LayoutSettings(size_px=64)
+    tiny = {"layout": layout, "optics": Optics(distance_um=12.0)}
+    small_settings = small_settings.model_copy(update=tiny)
 
     def models() -> tuple[Printer, Printer]:
         return make_printer(layout, sigma_um=0.2), make_printer(layout, sigma_um=0.35, name="wide")

@@ -33,9 +33,9 @@ def settings():
     search = default.search.model_copy(update={"iterations": 20, "polish_rounds": 2})
     view = default.view.model_copy(update={"window_px": 128})
     imaging = default.imaging.model_copy(update={"object_px": 48, "iterations": 10})
-    return default.model_copy(
-        update={"layout": LAYOUT, "optics": OPTICS, "search": search, "view": view, "imaging": imaging}
-    )
+    window = default.window.model_copy(update={"yield_draws": 4})
+    changes = {"search": search, "view": view, "imaging": imaging, "window": window}
+    return default.model_copy(update={"layout": LAYOUT, "optics": OPTICS} | changes)
 
 
 @pytest.mark.parametrize("aperture", ["circle", "square"])
