@@ -23,8 +23,9 @@ from litho_design.sheets.record import ARMS, HOLOGRAM, SCANS_OF_HOLOGRAMS, Sheet
 from litho_models import load_frozen
 from tests.litho_models.loop_scans import search_little
 
+SIZE_PX, LAYOUTS = 128, 5
 SMALL = {
-    "layout.size_px": 128,
+    "layout.size_px": SIZE_PX,
     "optics.distance_um": 15,
     "search.iterations": 2,
     "search.polish_rounds": 0,
@@ -36,7 +37,8 @@ SMALL = {
 def sheet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sheets") / "sheet"
     settings = hologram_settings(changes=SMALL)
-    new_sheet(folder, model="zoo:physics", format="png16", settings=settings, layouts=7, announce=False)
+    told = {"format": "png16", "layouts": LAYOUTS, "announce": False}
+    new_sheet(folder, model="zoo:physics", settings=settings, **told)
     return folder
 
 
@@ -47,7 +49,7 @@ def print_and_scan(sheet: Path) -> None:
     for folder in ("scans", SCANS_OF_HOLOGRAMS):
         (sheet / folder).mkdir()
     for field in record.fields:
-        level = _levels(sheet, field.file) if field.file else np.zeros((128, 128), np.uint8)
+        level = _levels(sheet, field.file) if field.file else np.zeros((SIZE_PX, SIZE_PX), np.uint8)
         place = SCANS_OF_HOLOGRAMS if field.id in ARMS else "scans"
         job = Job(id=field.id, level=level, index=field.order, order=field.order / len(record.fields) - 0.5)
         scan = scan_job(fab, job)
@@ -70,7 +72,7 @@ def test_a_lab_gets_every_file_and_instructions(sheet):
         if field.file:
             assert field.file in page
             # The files for the printer contain the layouts that the card names.
-            assert _levels(sheet, field.file).shape == (128, 128)
+            assert _levels(sheet, field.file).shape == (SIZE_PX, SIZE_PX)
     levels = {arm: np.load(design_folder(sheet / HOLOGRAM, arm, 0) / "layout_level.npy") for arm in ARMS}
     for arm in ARMS:
         printed = _levels(sheet, f"to-printer/hologram-{arm}/layout.png")
@@ -90,7 +92,7 @@ def test_scans_of_a_sheet_give_a_model_a_loop_and_a_comparison(sheet, tmp_path, 
     result = read_sheet(sheet, tmp_path / "answer")
     # Witnesses, including empty ones, are stored but not used for training.
     store = open_store(tmp_path / "answer" / "prints.zarr")
-    assert len(store.scans()) == 7
+    assert len(store.scans()) == LAYOUTS
     assert store.references() == {"flat": "flat", "steps": "steps", "substrate": "substrate"}
     printer = load_frozen(tmp_path / "answer" / "printer")
     assert printer.card["levels"] == 13
