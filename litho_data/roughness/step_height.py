@@ -60,7 +60,7 @@ def groove_depth(height_um: Array, pitch_um: float, *, left_um: float, right_um:
     feature = (position_um >= left_um + third_um) & (position_um <= right_um - third_um)
     before = (position_um >= left_um - width_um) & (position_um <= left_um - third_um)
     after = (position_um >= right_um + third_um) & (position_um <= right_um + width_um)
-    return _fit_steps(lines, position_um, [before | after, feature])[0]
+    return _fit_steps(lines, [position_um], [before | after, feature])[0]
 
 
 def stair_steps(
@@ -81,7 +81,11 @@ def stair_steps(
             pixels.
     """
     lines, position_um = _profiles(height_um, pitch_um, axis)
-    limits_um = np.array([0.0, *edges_um, lines.shape[1] * pitch_um])
+    return _fit_steps(lines, [position_um], _middle_thirds(position_um, pitch_um, edges_um))
+
+
+def _middle_thirds(position_um: Array, pitch_um: float, edges_um: Sequence[float]) -> list[Array]:
+    limits_um = np.array([0.0, *edges_um, position_um.size * pitch_um])
     widths_um = np.diff(limits_um)
     if len(edges_um) == 0 or widths_um.min() < 3 * pitch_um:
         raise InputError(
@@ -89,11 +93,10 @@ def stair_steps(
             got=list(edges_um),
             wanted="ascending positions inside the field, at least 3 pixels apart",
         )
-    treads = [
+    return [
         (position_um >= start + width / 3) & (position_um <= start + 2 * width / 3)
         for start, width in zip(limits_um[:-1], widths_um, strict=True)
     ]
-    return _fit_steps(lines, position_um, treads)
 
 
 def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Array]:
@@ -101,21 +104,20 @@ def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Arr
     return lines, (np.arange(lines.shape[1]) + 0.5) * pitch_um
 
 
-def _fit_steps(lines: Array, position_um: Array, treads: list[Array]) -> list[StepHeight]:
-    """Fit the heights of all treads and one common slope to each line, and return the height of each step,
-    averaged over the lines.
+def _fit_steps(lines: Array, background: list[Array], treads: list[Array]) -> list[StepHeight]:
+    """Fit the heights of all treads and the functions of the background, which all treads have in common, to
+    each line. Return the height of each step, averaged over the lines.
     """
     used = np.any(treads, axis=0)
-    design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
-        used
-    ]
+    centred = [function - function.mean() for function in background]
+    design = np.stack([*centred, *(tread.astype(float) for tread in treads)], axis=1)[used]
     heights = []
     for line in lines[:, used]:
         finite = np.isfinite(line)
         if np.linalg.matrix_rank(design[finite]) < design.shape[1]:
             continue
         weights, *_ = np.linalg.lstsq(design[finite], line[finite], rcond=None)
-        heights.append(np.diff(weights[1:]))
+        heights.append(np.diff(weights[len(background) :]))
     if len(heights) < 2:
         raise InputError("lines that show all treads of a step", got=len(heights), wanted="at least 2")
     return [_summary(step) for step in np.array(heights).T]
@@ -150,15 +152,16 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
     steps at these edges.
 
     The slope of the field is removed from the median profile. An edge is a place where the change of this
-    profile is at least half as large as its largest change. ``stair_steps`` measures the heights of the
-    steps, and their absolute values are averaged. Steps of one scan share treads, so their errors are not
+    profile is at least half as large as its largest change. The heights of the steps are fitted as in
+    ``stair_steps``, and their absolute values are averaged. A raw scan shows the bow of the scanner, so a
+    curvature common to all treads is fitted too. Steps of one scan share treads, so their errors are not
     independent. The stated uncertainty is therefore that of a single step, not that of a mean of independent
     values.
 
     Raises:
         InputError: no edge stands out from the profile, or edges are closer than three pixels.
     """
-    lines, _ = _profiles(height_um, pitch_um, axis)
+    lines, position_um = _profiles(height_um, pitch_um, axis)
     profile = np.nanmedian(lines, axis=0)
     width = max(2, profile.size // 50)
     sums = np.cumsum(np.insert(np.nan_to_num(profile), 0, 0.0))
@@ -177,7 +180,8 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
         float(np.average(group + width, weights=np.abs(change[group])) * pitch_um)
         for group in np.split(steep, np.flatnonzero(np.diff(steep) > 1) + 1)
     ]
-    steps = stair_steps(height_um, pitch_um, edges_um=edges, axis=axis)
+    along = np.linspace(-1, 1, profile.size)
+    steps = _fit_steps(lines, [along, along**2], _middle_thirds(position_um, pitch_um, edges))
     return StepHeight(
         height_nm=float(np.mean([abs(step.height_nm) for step in steps])),
         line_sd_nm=float(np.mean([step.line_sd_nm for step in steps])),
