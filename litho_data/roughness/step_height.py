@@ -12,6 +12,8 @@ from litho_data.scan import Axis
 # An edge counts only if the profile changes there by more than this many times the median change. On a rough
 # surface without a step, the largest change is 4 to 5 times the median change.
 _EDGE_SIGMA = 9.0
+# Two treads of three pixels each.
+_FEWEST_COLUMNS = 6
 
 
 class StepHeight(Record):
@@ -158,13 +160,27 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
     independent. The stated uncertainty is therefore that of a single step, not that of a mean of independent
     values.
 
+    Args:
+        height_um: heights in µm, shape (ny, nx); NaN where not measured.
+
     Raises:
         InputError: no edge stands out from the profile, or edges are closer than three pixels.
     """
     lines, position_um = _profiles(height_um, pitch_um, axis)
-    profile = np.nanmedian(lines, axis=0)
+    measured = np.flatnonzero(np.isfinite(lines).any(axis=0))
+    if measured.size < _FEWEST_COLUMNS:
+        raise InputError(
+            f"step along {axis}",
+            got=f"{measured.size} measured positions",
+            wanted=f"at least {_FEWEST_COLUMNS}",
+        )
+    # Unmeasured borders are cut off, and gaps are bridged by straight lines.
+    lines = lines[:, measured[0] : measured[-1] + 1]
+    places = measured - measured[0]
+    position_um = position_um[: lines.shape[1]]
+    profile = np.interp(np.arange(lines.shape[1]), places, np.nanmedian(lines[:, places], axis=0))
     width = max(2, profile.size // 50)
-    sums = np.cumsum(np.insert(np.nan_to_num(profile), 0, 0.0))
+    sums = np.cumsum(np.insert(profile, 0, 0.0))
     means = (sums[width:] - sums[:-width]) / width
     change = means[width:] - means[:-width]
     change = change - np.median(change)

@@ -118,6 +118,23 @@ def test_the_bow_of_a_scan_is_not_taken_for_the_height_of_its_step(until: int) -
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.3
 
 
+@pytest.mark.parametrize("missing", [slice(0, 12), slice(-30, None), slice(70, 80), slice(95, 105)])
+def test_unmeasured_columns_are_not_taken_for_a_step(missing: slice) -> None:
+    along = np.linspace(-1, 1, 200)
+    raw = np.tile(0.5 + STEP_UM * (along > 0) + 3.0 * along, (20, 1))
+    raw[:, missing] = np.nan
+    assert find_step(raw, PITCH_UM).height_nm == pytest.approx(1e3 * STEP_UM, abs=1e-6)
+    assert find_step(raw.T, PITCH_UM, axis="y").height_nm == pytest.approx(1e3 * STEP_UM, abs=1e-6)
+
+
+@pytest.mark.parametrize("columns", [0, 1, 5])
+def test_a_scan_of_a_few_columns_shows_no_step(columns: int) -> None:
+    raw = np.full((20, 40), np.nan)
+    raw[:, 10 : 10 + columns] = 0.1
+    with pytest.raises(InputError, match=f"got {columns} measured positions, wanted at least 6"):
+        find_step(raw, PITCH_UM)
+
+
 def test_lines_that_vary_together_count_as_fewer() -> None:
     """Check the number of independent lines. Here only neighbouring lines have a positive correlation."""
     wave = np.cos(np.pi * np.arange(60) / 3)
