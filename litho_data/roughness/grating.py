@@ -15,14 +15,16 @@ from litho_data.scan import Axis
 # by up to this factor.
 SEARCHED = 1.25
 # Width of the windows in which phases are measured, and smallest accepted length of the scan, both in
-# periods. In a Hann window of two periods, the mean and all harmonics cancel. A line is fitted to the phases,
-# which needs several windows side by side.
+# periods. In a Hann window of two periods, all harmonics cancel, apart from a change of the phase that is the
+# same in all windows, because these are one period apart. A line is fitted to the phases, which needs several
+# windows side by side.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
 # Largest accepted scatter of the phases. Phases of pure noise scatter by 1.8 rad.
 _MOST_SCATTER_RAD = 0.5
 # Factor by which the overlap of the windows increases the variance of the fit. Neighbouring windows overlap
-# by half, so the noise of each window has the correlation 1/6 with that of the two windows beside it.
-_OVERLAP_VARIANCE = 1 + 2 / 6
+# by half, so the noise of each window is correlated with that of the two windows beside it. The correlation
+# is between 1/6 and 2/9, depending on where in the windows the bars are.
+_OVERLAP_VARIANCE = 1 + 2 * 2 / 9
 
 
 @dataclass(frozen=True)
@@ -170,11 +172,26 @@ def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]
 
 
 def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array]:
+    """Measure the phase of a wave in windows one period apart.
+
+    The tilt and the bow of a scanner have a slope in each window, which a Hann window does not cancel. So the
+    wave, its conjugate, a constant and a slope are fitted together.
+
+    Args:
+        carried: profile multiplied by the conjugate of the wave exp(2πi x / period_um), shape (nx,), complex.
+    """
     width_um = _WINDOW_PERIODS * period_um
     places = np.arange(x_um[0] + width_um / 2, x_um[-1] - width_um / 2, width_um / 2)
     distance = (x_um[None, :] - places[:, None]) / width_um
     windows = np.where(np.abs(distance) < 0.5, np.cos(np.pi * distance) ** 2, 0.0)
-    return places, np.unwrap(np.angle(windows @ carried))
+    # The multiplication turns a constant into this, and the conjugate wave into its square.
+    constant = np.exp(-2j * np.pi * x_um / period_um)
+    columns = [np.ones_like(constant), constant**2, constant, (x_um - x_um.mean()) / width_um * constant]
+    design = np.column_stack(columns)
+    products = design.conj()[:, :, None] * design[:, None, :]
+    normal = np.tensordot(windows, products, 1)
+    weights = np.linalg.solve(normal, (windows @ (design.conj() * carried[:, None]))[:, :, None])
+    return places, np.unwrap(np.angle(weights[:, 0, 0]))
 
 
 def _line(places: Array, phases: Array) -> tuple[float, float, float]:

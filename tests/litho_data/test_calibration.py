@@ -70,6 +70,23 @@ def test_a_stretched_grating_gives_both_factors_within_their_uncertainty():
     assert inside[1] > 0.88
 
 
+@pytest.mark.parametrize("periods", [8.5, 20.3])
+def test_the_bow_of_a_scan_does_not_change_the_period_of_its_grating(periods: float) -> None:
+    """Check a grating of 50 nm in raw scans with tilt and bow, whatever the phase of the grating."""
+    x = np.arange(512) * PITCH_UM
+    period_um, along = 51.2 / periods, np.linspace(-1, 1, 512)
+    ratios = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        wave_um = 0.05 * np.cos(2 * np.pi * (x / period_um + rng.uniform())) + 0.15 * along
+        raw = wave_um + 0.1 * along**2 + 0.001 * rng.standard_normal((64, 512))
+        wave = find_wave(raw, (PITCH_UM,) * 2, period_um, "x")
+        assert wave.x_per_um * period_um == pytest.approx(1, abs=1e-4)
+        ratios.append((wave.x_per_um - 1 / period_um) / wave.uncertainty_per_um)
+    # For 30 draws, the rms of 1 has an error of 0.13.
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
 def test_the_scale_of_a_turned_grating_depends_on_the_other_axis_only_to_second_order():
     """Check a grating that is rotated by 3°, while the scale of the other axis is wrong by 2 %."""
     rng = np.random.default_rng(3)
