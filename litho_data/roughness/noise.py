@@ -39,7 +39,8 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
     count = measured.sum(axis=1)
     means = np.where(measured, lines, 0.0).sum(axis=1) / np.maximum(count, 1)
     line_nm = _fine_sd(_fine(np.where(2 * count > lines.shape[1], means, np.nan), 0))
-    return pixel_nm, float(np.sqrt(max(0.0, line_nm**2 - pixel_nm**2 / max(1.0, float(np.median(count))))))
+    own_nm2 = line_nm**2 - pixel_nm**2 / max(1.0, float(np.median(count)))
+    return pixel_nm, float(np.sqrt(np.maximum(own_nm2, 0.0)))
 
 
 def _fine(values: Array, axis: int) -> Array:

@@ -58,7 +58,15 @@ def test_noise_of_pixels_and_lines_is_told_from_a_print(fast_axis):
 def test_the_noise_is_unknown_where_gaps_leave_too_few_neighbouring_pixels():
     height = _print(0, 64)
     height[::5, ::5] = np.nan
-    assert np.isnan(white_noise(height)[0])
+    assert np.isnan(white_noise(height)).all()
+
+
+@pytest.mark.parametrize(("lines", "known"), [(16, False), (17, True)])
+def test_the_line_noise_of_too_few_lines_is_unknown_and_not_zero(lines, known):
+    rng = np.random.default_rng(0)
+    noise_nm = 0.8 * rng.standard_normal((lines, 200)) + 3.0 * rng.standard_normal((lines, 1))
+    assert np.isfinite(white_noise(1e-3 * noise_nm)).tolist() == [True, known]
+    assert np.isfinite(white_noise(1e-3 * noise_nm.T, fast_axis="y")).tolist() == [True, known]
 
 
 @pytest.mark.parametrize("frequency", [0.15, 0.3, 0.4])
