@@ -93,7 +93,7 @@ def build(
     if suggest:
         from litho_data.making.suggest import suggest_recipe
 
-        folder = out.parent / f"{out.stem}-levelling"
+        folder = out.parent / f"{out.name.removesuffix('.zarr')}-levelling"
         found = suggest_recipe(card, folder, data_dir=data_dir)
         for name, of in found.left_nm.items():
             left = ", ".join(f"{scan} {one:.1f} nm" for scan, one in of.items())
@@ -249,7 +249,8 @@ def import_pairs(
     from litho_data.exchange.pairs import import_pairs as build_from_pairs
     from litho_data.making.result import report_folder
 
-    target = out or folder.resolve().with_suffix(".zarr")
+    place = folder.resolve()
+    target = out or place.parent / f"{place.name}.zarr"
     result = build_from_pairs(
         folder,
         target,

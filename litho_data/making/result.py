@@ -36,4 +36,4 @@ class BuildResult(Result):
 
 def report_folder(out: str | Path) -> Path:
     """Return the folder of a store's report, which is ``<name>-report`` beside the store."""
-    return Path(out).parent / f"{Path(out).stem}-report"
+    return Path(out).parent / f"{Path(out).name.removesuffix('.zarr')}-report"

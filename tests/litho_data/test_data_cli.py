@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from litho_data.cli.app import app
+from litho_data.making.result import report_folder
 from litho_data.store import open_store
 from tests.litho_data.campaigns import card_text
 
@@ -59,6 +60,23 @@ def test_bad_input_is_one_line_and_code_2(tmp_path: Path) -> None:
     assert len(done.stderr.strip().splitlines()) == 1
     assert "scan.unit = 'furlong'" in done.stderr
     assert list(tmp_path.iterdir()) == [card]
+
+
+def test_folders_whose_names_differ_after_a_dot_become_different_stores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Path] = []
+
+    def build(folder: Path, target: Path, **_: object) -> SimpleNamespace:
+        made.append(target)
+        return SimpleNamespace(n_scans=1, skipped={}, seconds=0.0)
+
+    monkeypatch.setattr("litho_data.exchange.pairs.import_pairs", build)
+    said = "".join(run.invoke(app, ["import-pairs", str(tmp_path / f"p.{year}")]).output for year in (24, 25))
+    assert made == [tmp_path / "p.24.zarr", tmp_path / "p.25.zarr"]
+    assert [str(tmp_path / f"p.{year}-report") in said for year in (24, 25)] == [True, True]
+    # A store may have a name without .zarr.
+    assert [report_folder(f"p.{year}").name for year in (24, 25)] == ["p.24-report", "p.25-report"]
 
 
 def test_the_commands_on_a_store(own_campaign: Path) -> None:
