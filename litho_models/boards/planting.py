@@ -138,8 +138,8 @@ def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -
         fab = fab_of(draw, planted, job, noise=Noise.off(), microscope=Microscope.aligned())
         height = scan_job(fab, job).noiseless_um
         # Scan and layout have the same centre.
-        margin = (height.shape[0] - job.level.shape[0]) // 2
-        found.append(height[margin : len(height) - margin, margin : len(height) - margin])
+        top, left = ((a - b) // 2 for a, b in zip(height.shape, job.level.shape, strict=True))
+        found.append(height[top : height.shape[0] - top, left : height.shape[1] - left])
     return found
 
 

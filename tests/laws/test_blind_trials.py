@@ -24,7 +24,17 @@ from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
 from litho_data.store import PrintedScan, open_store
-from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
+from litho_data.virtual_fab import (
+    KNOBS,
+    Fab,
+    Job,
+    KnobSetting,
+    Microscope,
+    Noise,
+    Printer,
+    scan_job,
+    simulate,
+)
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.boards.board import make_draws
 from litho_models.boards.draws import (
@@ -199,6 +209,15 @@ def test_a_strength_by_batch_or_field_is_the_cause_alone_at_that_strength():
     for at, lag, axis in ((0, 0.4, 0.0), (1, 0.4, 0.5), (2, 0.2, 0.0), (3, 0.2, 0.5)):
         alone = [set_to(cause("galvo-lag"), lag), set_to(cause("s-shaped-axis"), axis)]
         np.testing.assert_array_equal(together[at], noise_free_um(draw, alone, [jobs[at]])[0])
+
+
+@pytest.mark.parametrize("shape", [(64, 96), (96, 64)])
+def test_a_noise_free_scan_of_a_long_field_is_its_print(shape):
+    draw = drawn()
+    level = np.random.default_rng(0).integers(0, 13, shape).astype(np.uint8)
+    job = Job(id="P11", level=level, index=0, order=0.0)
+    printed_um = scan_job(fab_of(draw, [], job), job).clean_um
+    np.testing.assert_allclose(noise_free_um(draw, [], [job])[0], printed_um, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", sorted(FORMS))
