@@ -149,7 +149,10 @@ def command_loop(command: str) -> Loop:
         InputError: the command cannot be run. The returned function raises the same error if the exit code of
             the command is not 0 or if the answer is missing.
     """
-    words = shlex.split(command)
+    try:
+        words = shlex.split(command)
+    except ValueError:  # a quotation mark without its partner
+        words = []
     if not words or not shutil.which(words[0]):
         wanted = "a program that can be run, with its arguments"
         raise InputError("command that runs the loop", got=command or "nothing", wanted=wanted)

@@ -130,7 +130,13 @@ def test_a_plain_loop_names_a_strong_cause_by_its_command(board, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("command", "said"), [("no-such-program here", "a program"), (f"{sys.executable} -c 1/0", "exit code 1")]
+    ("command", "said"),
+    [
+        ("no-such-program here", "a program"),
+        ("'", "got ', wanted a program"),
+        (f"{sys.executable} '1", "a program"),
+        (f"{sys.executable} -c 1/0", "exit code 1"),
+    ],
 )
 def test_a_command_that_cannot_be_run_is_told(command, said, tmp_path):
     with pytest.raises(InputError, match=said):
