@@ -36,8 +36,9 @@ from litho_models.noise.variance import (
     place_maps,
     scale_nm,
 )
+from litho_models.scoring import like_layouts
 from litho_models.scoring.like_layouts import like_pixels
-from litho_models.scoring.noise_floor import estimated_floor
+from litho_models.scoring.noise_floor import estimated_floor, floor_of_residuals, freed_by_policy
 from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 
@@ -446,16 +447,21 @@ def heights_um(scans):
     return [printed_height_um(scan.layout_um) for scan in scans]
 
 
-def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
+def floor(scans, maps_um, *policies):
+    return floor_of_residuals("made", scans, freed_by_policy(scans, maps_um, policies=policies))
+
+
+def test_the_floor_is_the_planted_noise_whatever_the_model_lacks(monkeypatch):
     """Check that the floor does not include the error of a model with a wrong gain. This error is larger than
     the noise.
     """
+    monkeypatch.setattr(like_layouts, "_PIXELS_PER_SCAN", 1500)
     scans = make_scans(12, size_px=128, noise_um=0.020, datum_um=0.03, bow_um=0.02)
     wrong = [0.85 * height for height in heights_um(scans)]
-    found = estimated_floor("made", scans, wrong)
+    found = floor(scans, wrong, "none", "offset", "full")
     assert np.std([1e3 * (scan.height_um - height) for scan, height in zip(scans, wrong, strict=True)]) > 40
-    # With 3,000 pixels of each of 12 scans, σ² is known to a few times √(2/36,000), because partners are
-    # shared: below 2 %. Partners lie elsewhere in the field, so the bow adds 20 nm · √(4/45) = 6 nm in
+    # With 1,500 pixels of each of 12 scans, σ² is known to a few times √(2/18,000), because partners are
+    # shared: below 3 %. Partners lie elsewhere in the field, so the bow adds 20 nm · √(4/45) = 6 nm in
     # quadrature.
     bowed = float(np.hypot(20, 20 * np.sqrt(4 / 45)))
     for policy, sigma in (("offset", bowed), ("full", 20.0)):
@@ -464,8 +470,9 @@ def test_the_floor_is_the_planted_noise_whatever_the_model_lacks():
         assert row.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * sigma, rel=0.05)
         assert row.rmse_ci95_nm[0] < row.rmse_nm < row.rmse_ci95_nm[1]
     assert (found.mae_at("offset"), found.mae_at("none")) == (found.mae_nm, found.at("none").mae_nm)
-    # The datum of ±30 nm counts as noise if no scan term absorbs it.
-    assert found.at("none").rmse_nm == pytest.approx(np.hypot(bowed, 30), rel=0.05)
+    # The datum of ±30 nm counts as noise if no scan term absorbs it. Of the 11 other scans, 6 have the other
+    # sign, so two partners both have it in 3 of 11 pairs, and the variance is 4 · 3/11 · 30².
+    assert found.at("none").rmse_nm == pytest.approx(np.hypot(bowed, 30 * np.sqrt(12 / 11)), rel=0.05)
 
 
 def test_rough_places_keep_their_noise_though_their_partners_are_smooth(random):
@@ -503,13 +510,14 @@ def test_the_mean_absolute_noise_needs_no_gaussian(draw, random):
         replace(scan, height_um=(scan.height_um + own).astype(np.float32))
         for scan, own in zip(scans, noise, strict=True)
     ]
-    found = estimated_floor("made", noisy, heights_um(scans)).at("offset")
+    found = floor(noisy, heights_um(scans), "offset")
     # From 15,000 pixels with four partners each, the error is below 2 %.
     assert found.mae_nm == pytest.approx(1e3 * np.mean(np.abs(noise)), rel=0.025)
     assert found.rmse_nm == pytest.approx(1e3 * np.std(noise), rel=0.025)
 
 
-def test_changes_by_a_dose_do_not_count_as_noise_of_similar_layouts():
+def test_changes_by_a_dose_do_not_count_as_noise_of_similar_layouts(monkeypatch):
+    monkeypatch.setattr(like_layouts, "_PIXELS_PER_SCAN", 1500)
     plain = make_scans(10, size_px=128, noise_um=0.010, datum_um=0.0)
     dosed = [
         replace(
@@ -519,13 +527,13 @@ def test_changes_by_a_dose_do_not_count_as_noise_of_similar_layouts():
         )
         for scan, dose in zip(plain, (0.9, 1.1) * 5, strict=True)
     ]
-    found = estimated_floor("made", dosed, heights_um(dosed)).at("offset")
+    found = floor(dosed, heights_um(dosed), "offset")
     # All prints of one dose lack the same gain. This is a function of the layout, so it is not noise. Little
     # of it remains, because the surroundings of partners are similar but not equal.
     assert found.rmse_nm == pytest.approx(10, rel=0.15)
     one_dose = [replace(scan, dose=None) for scan in dosed]
     # If the doses were ignored, they would add noise of 10 % of about 110 nm rms to the 10 nm.
-    assert estimated_floor("made", one_dose, heights_um(dosed)).at("offset").rmse_nm > 14
+    assert floor(one_dose, heights_um(dosed), "offset").rmse_nm > 14
 
 
 def test_two_scans_have_no_floor():
@@ -623,7 +631,7 @@ def test_errors_larger_than_stated_are_found_in_all_groups_and_scans(random):
 
 
 def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():
-    scans, residuals, _ = planted_residuals(count=8)
+    scans, residuals, _ = planted_residuals(count=6, size_px=48)
     assert scans[0].print_id == scans[1].print_id != scans[2].print_id
     loud = [100 * residuals[0], 100 * residuals[1], *residuals[2:]]
     quiet = analyse_spread(Residuals("made", scans, [], residuals, True)).calibrations[1]
@@ -638,7 +646,7 @@ def test_the_spread_is_judged_on_prints_it_was_not_fitted_on():
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    return write_store(tmp_path_factory.mktemp("noise") / "made.zarr", make_scans(8, size_px=128))
+    return write_store(tmp_path_factory.mktemp("noise") / "made.zarr", make_scans(6, size_px=64))
 
 
 @pytest.mark.pictures
@@ -708,7 +716,7 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
     spread = result.spread
     assert (spread.model, spread.held_out) == ("linear", True)
     assert len(spread.calibrations) == 2
-    assert len(spread.calibrations[0].scans) == 7
+    assert len(spread.calibrations[0].scans) == 5
     # The planted noise is 4 nm. The model's own error adds to this.
     assert 3.9 < spread.residual_rms_nm < 12
     with (tmp_path / "out" / "calibration_scans.csv").open(newline="", encoding="utf-8") as file:
@@ -733,13 +741,13 @@ def test_residuals_of_a_frozen_model_state_which_scans_it_was_trained_on(store, 
     from litho_models.fitting.runs import train
     from litho_models.noise import analyse_noise
 
-    train(store, "linear", tmp_path / "run")
+    train(store, "affine", tmp_path / "run")
     result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "run" / "model")
     spread = result.spread
     assert not spread.held_out
     # Residuals of scans that the model was fitted to do not estimate the noise.
     assert (result.budget, result.noise_floor.kind) == (None, "unknown")
-    assert len(spread.calibrations[0].scans) == 7
+    assert len(spread.calibrations[0].scans) == 5
     with pytest.raises(InputError, match="with a frozen model"):
         analyse_noise(store, tmp_path / "none", residuals=tmp_path / "run" / "model", model="linear")
 
@@ -752,7 +760,7 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
     from litho_models.noise.residuals import read_residuals
 
     # Every scan has a bow of 30 nm, which would stay in a residual without the shared background.
-    bowed = write_store(tmp_path / "bowed.zarr", make_scans(6, size_px=64, bow_um=0.03))
+    bowed = write_store(tmp_path / "bowed.zarr", make_scans(4, size_px=64, bow_um=0.03))
     scored = benchmark(bowed, tmp_path / "b", models=("linear",), folds=2, policy="offset-gain", seed=3)
     train(bowed, "linear", tmp_path / "run")
     model = tmp_path / "run" / "model"
