@@ -33,7 +33,18 @@ SETTINGS = {"nuisance": "offset"}
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    return write_store(tmp_path_factory.mktemp("data") / "made.zarr", make_scans(8, size_px=64))
+    return write_store(tmp_path_factory.mktemp("data") / "made.zarr", make_scans(7, size_px=64))
+
+
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory):
+    """Return an analysis of a flat print with noise of 16 nm. A benchmark with it estimates no floor."""
+    from litho_models.noise import analyse_noise_of_files
+
+    folder = tmp_path_factory.mktemp("noise")
+    np.save(folder / "flat.npy", 0.016 * np.random.default_rng(0).standard_normal((64, 64)))
+    analyse_noise_of_files(folder / "out", flat=folder / "flat.npy", unit="um", size_um=(6.4, 6.4))
+    return folder / "out"
 
 
 @pytest.fixture(scope="module")
@@ -191,14 +202,14 @@ def test_a_model_of_the_same_prints_is_not_scored_on_locked_scans_unless_asked(s
     assert not set(run.lock_box) & {*shut.split.scored_ids, *(row.scan for row in shut.scores.scans)}
     opened = evaluate(model, store, tmp_path / "opened", open_lock_box=True)
     assert (opened.split.lock_box, opened.split.lock_box_opened) == (run.lock_box, True)
-    assert len(opened.scores.scans) == len(shut.scores.scans) + len(run.lock_box) == 8
+    assert len(opened.scores.scans) == len(shut.scores.scans) + len(run.lock_box) == 7
 
 
 def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_recorded(store, tmp_path):
     other = write_store(tmp_path / "other.zarr", make_scans(4, size_px=48), name="other")
     train(other, "identity", tmp_path / "run")
     scored = evaluate(tmp_path / "run" / "model", store, tmp_path / "out")
-    assert len(scored.scores.scans) == 8
+    assert len(scored.scores.scans) == 7
     assert len(scored.split.lock_box) == 1
     assert scored.split.lock_box_opened
     assert f"are scored too: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
@@ -295,28 +306,30 @@ def test_results_meet_by_scan_whatever_the_order_of_their_lists(result, tmp_path
     assert (table["p"] == 1).all()
 
 
-def test_other_folds_are_another_protocol_and_another_training_seed_is_not(result, store, tmp_path):
+def test_other_folds_are_another_protocol_and_another_training_seed_is_not(result, store, noise, tmp_path):
     _, out = result
-    benchmark(store, tmp_path / "two", models=["affine"], folds=2, settings=SETTINGS)
+    benchmark(store, tmp_path / "two", models=["affine"], folds=2, settings=SETTINGS, noise=noise)
     with pytest.raises(InputError, match=r"split differs.*'folds': 3.*'folds': 2"):
         compare(out, tmp_path / "two")
-    benchmark(store, tmp_path / "reseeded", models=["affine"], folds=3, settings={**SETTINGS, "seed": 1})
+    other = {**SETTINGS, "seed": 1}
+    benchmark(store, tmp_path / "reseeded", models=["affine"], folds=3, settings=other, noise=noise)
     assert list(compare(out, tmp_path / "reseeded")["first"]) == ["affine"]
 
 
-def test_first_folds_are_those_of_the_whole_and_never_replace_it(result, store, tmp_path):
+def test_first_folds_are_those_of_the_whole_and_never_replace_it(result, store, noise, tmp_path):
     whole, _ = result
-    part = benchmark(store, tmp_path / "part", models=["affine"], folds=3, first_folds=2, settings=SETTINGS)
+    same = {"models": ["affine"], "folds": 3, "settings": SETTINGS, "noise": noise}
+    part = benchmark(store, tmp_path / "part", first_folds=2, **same)
     of_all = {scan.scan: scan for scores in whole.scores if scores.model == "affine" for scan in scores.scans}
     assert all(scan == of_all[scan.scan] for scan in part.scores[0].scans)
     assert 0 < len(part.scores[0].scans) < len(of_all)
     assert (part.split.folds, part.split.first_folds, len(part.fits)) == (3, 2, 2)
     assert "Only 2 of 3 folds" in (tmp_path / "part" / "report.html").read_text()
     with pytest.raises(InputError, match=r"first folds.*got 4, wanted 1 to 3"):
-        benchmark(store, tmp_path / "none", models=["affine"], folds=3, first_folds=4, settings=SETTINGS)
-    benchmark(store, tmp_path / "part", models=["affine"], folds=3, settings=SETTINGS)
+        benchmark(store, tmp_path / "none", first_folds=4, **same)
+    benchmark(store, tmp_path / "part", **same)
     with pytest.raises(InputError, match=r"holds a benchmark that also contains \d+ other scans"):
-        benchmark(store, tmp_path / "part", models=["affine"], folds=3, first_folds=2, settings=SETTINGS)
+        benchmark(store, tmp_path / "part", first_folds=2, **same)
 
 
 def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
@@ -329,19 +342,16 @@ def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
         compare(tmp_path / "seen", tmp_path / "unseen")
 
 
-def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, tmp_path):
-    from litho_models.noise import NoiseAnalysis, analyse_noise_of_files
+def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, noise, tmp_path):
+    from litho_models.noise import NoiseAnalysis
 
-    flat = 0.016 * np.random.default_rng(0).standard_normal((64, 64))
-    np.save(tmp_path / "flat.npy", flat)
-    analyse_noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
-    scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=tmp_path / "noise")
+    scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=noise)
     assert scored.noise_floor.kind == "measured"
     # With 64² independent heights, the relative standard error of σ is 1/√(2 · 64²) = 1.1 %. Allow three.
     assert scored.noise_floor.rmse_nm == pytest.approx(16, rel=0.034)
     assert "flat print" in (tmp_path / "b" / "report.html").read_text()
     train(store, "identity", tmp_path / "run")
-    file = tmp_path / "noise" / "noise.json"
+    file = noise / "noise.json"
     assert (
         evaluate(tmp_path / "run" / "model", store, tmp_path / "e", noise=file).noise_floor
         == scored.noise_floor
