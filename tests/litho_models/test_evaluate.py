@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from examples import own_metric
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.results import Evaluation
 from litho_models.fitting.runs import train
 from litho_models.noise.residuals import read_residuals
+from litho_models.scoring import metric_registry
 from tests.litho_models.prints import make_scans, write_store
 from tests.tables import require_tables_equal_record
 
@@ -51,21 +50,20 @@ def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path)
         evaluate(tmp_path / "empty", store, tmp_path / "out")
 
 
-def test_the_example_with_a_metric_of_its_own_has_it_in_result_report_and_tables(trained, tmp_path):
-    store, _, folder = trained
-    example, out = Path(__file__).parents[2] / "examples" / "own_metric.py", tmp_path / "out"
-    done = subprocess.run(
-        [sys.executable, example, folder / "model", store, "--out", out],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+def test_the_example_with_a_metric_of_its_own_has_it_in_result_report_and_tables(
+    trained, tmp_path, monkeypatch, capsys
+):
+    (store, _, folder), out = trained, tmp_path / "out"
+    monkeypatch.setattr(metric_registry, "_MEASUREMENTS", [*metric_registry._MEASUREMENTS])
+    words = ["own_metric.py", folder / "model", store, "--out", out]
+    monkeypatch.setattr("sys.argv", [*map(str, words)])
+    own_metric.main()
     key = "off_by_half_a_level_percent"
     found = Evaluation.read(out).scores
     by_scan = [row.metrics[key] for row in found.scans]
     assert 0 < min(by_scan) <= max(by_scan) < 100
     assert found.metrics[key] == pytest.approx(np.mean(by_scan))
-    assert f"{found.metrics[key]:.1f} %" in done.stdout
+    assert f"{found.metrics[key]:.1f} %" in capsys.readouterr().out
     for name, values in (("metrics.csv", [found.metrics[key]]), ("scans.csv", by_scan)):
         with (out / name).open() as file:
             assert [float(row[key]) for row in csv.DictReader(file)] == pytest.approx(values, rel=1e-6)
