@@ -85,7 +85,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
         gain_init=0.7,
         bias_init_um=0.02,
     )
-    model = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset")).model
+    model = fit("physics", printed_by(printer, 2), TrainingConfig(nuisance="offset")).model
     unseen = make_scan(20)
     difference = predict_scan(model, unseen) - predict_scan(printer, unseen)
     # With noise of 4 nm, 9,000 pixels determine six parameters to well below 1 nm of height.
@@ -103,10 +103,10 @@ def test_a_fit_stops_at_a_bound_and_names_it():
     assert abs(float(fitted.model.tau.detach())) == pytest.approx(FLAT_FROM)
 
 
-def printed_by(printer):
-    """Return four scans of prints by a model, with datums of zero mean and noise of 4 nm."""
+def printed_by(printer, count=4):
+    """Return scans of prints by a model, with datums of zero mean and noise of 4 nm."""
     scans = []
-    for scan in make_scans(4, size_px=96):
+    for scan in make_scans(count, size_px=96):
         noise = np.random.default_rng(scan.order).normal(0, 0.004, scan.shape)
         height = predict_scan(printer, scan) + 0.03 * (-1) ** scan.order + noise
         scans.append(replace(scan, height_um=height.astype(np.float32)))
@@ -136,20 +136,24 @@ def test_a_network_learns_what_the_physics_of_its_start_lacks():
     assert fitted.history[-1].training_mae_nm < fitted.history[0].training_mae_nm
 
 
-def test_same_seed_same_weights_other_seed_other_weights():
-    scans = make_scans(4, size_px=64)
-    runs = [
-        fit("pbl", scans, TrainingConfig(**QUICK, seed=seed, model=SMALL_NETS)).model for seed in (1, 1, 2)
-    ]
-    states = [torch.cat([p.flatten() for p in run.parameters()]) for run in runs]
+@pytest.fixture(scope="module")
+def quick_run(tmp_path_factory):
+    """Return scans, the folder with the checkpoint of a small PBL trained on them, and this fit."""
+    scans, folder = make_scans(4, size_px=48), tmp_path_factory.mktemp("run")
+    return scans, folder, fit("pbl", scans, TrainingConfig(**QUICK, model=SMALL_NETS), checkpoint=folder)
+
+
+def test_same_seed_same_weights_other_seed_other_weights(quick_run):
+    scans, _, whole = quick_run
+    again = [fit("pbl", scans, TrainingConfig(**QUICK, seed=seed, model=SMALL_NETS)) for seed in (0, 1)]
+    states = [torch.cat([p.flatten() for p in run.model.parameters()]) for run in (whole, *again)]
     assert torch.equal(states[0], states[1])
     assert not torch.equal(states[0], states[2])
 
 
-def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
-    scans = make_scans(4, size_px=64)
+def test_a_killed_run_ends_where_an_unbroken_one_does(quick_run, tmp_path, monkeypatch):
+    scans, _, whole = quick_run
     config = TrainingConfig(**QUICK, model=SMALL_NETS)
-    whole = fit("pbl", scans, config)
 
     class Killed(Exception):
         pass
@@ -171,14 +175,6 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
     ):
         assert torch.equal(a, b), name
     assert [r.training_mae_nm for r in whole.history] == [r.training_mae_nm for r in resumed.history]
-
-
-@pytest.fixture(scope="module")
-def quick_run(tmp_path_factory):
-    """Return scans, and the folder with the checkpoint of a small PBL trained on them."""
-    scans, folder = make_scans(4, size_px=64), tmp_path_factory.mktemp("run")
-    fit("pbl", scans, TrainingConfig(**QUICK, model=SMALL_NETS), checkpoint=folder)
-    return scans, folder
 
 
 def with_one_pixel(scan, **arrays):
@@ -223,7 +219,7 @@ ANOTHER_RUN = {
 
 @pytest.mark.parametrize("what", list(ANOTHER_RUN))
 def test_a_checkpoint_of_another_run_is_refused(what, quick_run):
-    scans, folder = quick_run
+    scans, folder, _ = quick_run
     model, given, settings, fields = ANOTHER_RUN[what](scans)
     kept = {file.name: file.read_bytes() for file in folder.iterdir()}
     with pytest.raises(InputError, match="another model, configuration or dataset"):
@@ -232,7 +228,7 @@ def test_a_checkpoint_of_another_run_is_refused(what, quick_run):
 
 
 def test_the_checkpoint_is_chosen_on_inner_validation_scans_only():
-    fitted = fit("pbl", make_scans(8, size_px=64), TrainingConfig(**QUICK, model=SMALL_NETS))
+    fitted = fit("pbl", make_scans(8, size_px=32), TrainingConfig(**QUICK, model=SMALL_NETS))
     assert len(fitted.facts.validation_ids) == 2
     assert not set(fitted.facts.validation_ids) & set(fitted.facts.training_ids)
     assert all(entry.validation_mae_datum_free_nm is not None for entry in fitted.history)
