@@ -109,9 +109,9 @@ def test_no_fit_of_a_benchmark_takes_its_background_from_the_scans_that_it_is_ju
 def test_the_background_changes_only_errors_by_policies_without_smooth_terms(result, store, tmp_path):
     record, out = result
     assert record.nuisance.background == "training"
-    plain = benchmark(store, tmp_path / "plain", models=("identity", "affine"), folds=2, background="none")
+    plain = benchmark(store, tmp_path / "plain", models=("affine",), folds=2, background="none")
     assert plain.nuisance.background == "none"
-    for with_it, without in zip(record.scores, plain.scores, strict=True):
+    for with_it, without in zip(record.scores[1:], plain.scores, strict=True):
         assert without.without_background == []
         stated = {error.policy: error.mae_nm for error in with_it.without_background}
         assert stated == {e.policy: e.mae_nm for e in without.by_policy if e.policy not in SMOOTH}

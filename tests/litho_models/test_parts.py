@@ -195,7 +195,7 @@ def test_physics_is_a_printer_of_spot_threshold_shrinkage_and_transfer() -> None
 @pytest.mark.slow
 def test_one_batch_of_kernels_is_faster_than_one_convolution_after_the_other() -> None:
     lens = LENS._replace(kernels=12)
-    size = 1024
+    size = 512
     kernels = torch.fft.ifft2(torch.from_numpy(transfer_functions(lens, PITCH_UM, (64, 64))))
     spectra = torch.fft.fft2(kernels, s=(size, size)).to(torch.complex64)
     mask = torch.rand(1, 1, size, size)
