@@ -25,7 +25,7 @@ from litho_models.loop.bases import AUTO, bases_for
 from litho_models.loop.closing import Closed, close
 from litho_models.loop.errors import HeldOut, errors_of_others
 from litho_models.loop.fits import Study
-from litho_models.loop.marks import marks, rounding_step_um, with_marks
+from litho_models.loop.marks import rounding_step_um, with_marks
 from litho_models.loop.model import FoldedBase, is_refitted
 from litho_models.loop.planting import parse_planted, plant
 from litho_models.loop.record import CloseLoop, Decision, ErrorRow, ScanFinding
@@ -128,7 +128,7 @@ def close_loop(
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, study.scans, maps).findings()
-            alone = with_marks(terms, marks(study.scans, maps, _rounding_um(opened, development)))
+            alone = with_marks(terms, study.scans, maps, _rounding_um(opened, development))
         before = closed.final
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
         if closed.final is not before:
@@ -207,14 +207,14 @@ def _nested(
     return errors_of_others(anew(), scans, f"nested {nested}", study.seed)
 
 
-def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
-    """Return the step to which the heights in the raw file of each scan are rounded, µm, keyed by scan id.
-    Return None if the store has no raw files.
+def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
+    """Return the step to which the heights in the raw file of each scan are rounded, µm. The list is empty
+    if the store has no raw files.
     """
     try:
-        return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
+        return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
     except InputError:
-        return None
+        return []
 
 
 def save_laws(result: CloseLoop, folder: Path) -> None:

@@ -15,7 +15,6 @@ from itertools import permutations
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.roughness import line_period
 from litho_models.effects import get_effect
 from litho_models.loop.fits import Study
 from litho_models.loop.judging import CONFIRM_P, GROUPED_P, Judgement, evidence_nm2, judge
@@ -160,7 +159,7 @@ class SingleScans:
             found.append(
                 ScanFinding.of(
                     name,
-                    "; ".join([*reasons, f"offsets explain {taken}{self._period(name)}"]),
+                    "; ".join([*reasons, f"offsets explain {taken}"]),
                     seen=not reasons,
                     p=excess_p,
                     spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
@@ -186,27 +185,6 @@ class SingleScans:
             for i in own:
                 found[i] = found[i] + np.expand_dims(profile, axis)
         return found
-
-    def _period(self, name: str) -> str:
-        """Return a text that describes a period with which the line means of all scans repeat, such as the
-        period of mains hum. The text is empty if no such period is significant.
-
-        The test allows for the number of frequencies that are tried.
-        """
-        (term,) = line_terms(terms_of_effect(name))
-        assert term.lines is not None
-        means = []
-        for scan, residual in zip(self.scans, self._smooth_um, strict=True):
-            line, use = term.lines(scan.usable.shape, scan.line), scan.usable
-            count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
-            means.append(total / np.maximum(count, 1))
-        found = line_period(means, self.scans[0].stored.pitch_um)
-        if found is None or found.p > 1e-3:
-            return ""
-        return (
-            f"; the line means repeat every {found.period_um:.3g} µm, and this period explains "
-            f"{100 * found.share:.0f} % of the sum of their squares (p = {found.p:.1g})"
-        )
 
     @cached_property
     def _smooth_um(self) -> list[np.ndarray]:

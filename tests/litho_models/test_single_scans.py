@@ -158,34 +158,6 @@ def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes(of_prints
     assert one.spread["gain"].value == pytest.approx(np.std(gains, ddof=1), rel=0.05)
 
 
-# Mains hum: line offsets that repeat every 1.3 µm, with a different phase in each scan
-
-
-def humming(hum_um: float) -> Change:
-    lines = stripes(0.003)
-
-    def change(scan: PreparedScan, random: np.random.Generator) -> np.ndarray:
-        phase = 2 * np.pi * (np.arange(SIZE_PX) / 13 + random.random())
-        return hum_um * np.sin(phase)[:, None] + lines(scan, random)
-
-    return change
-
-
-def test_a_hum_is_found_with_its_period_and_its_share() -> None:
-    said = found_with(humming(0.004), seed=1)["scan-line-stripes"].evidence
-    period_um = float(said.split("repeat every ")[1].split(" µm")[0])
-    share = float(said.split("explains ")[-1].split(" %")[0]) / 100
-    # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide. The centroid is more accurate.
-    assert period_um == pytest.approx(1.3, abs=0.05)
-    # The hum has a variance of 4² / 2 = 8 nm², and the random part of 3² = 9 nm².
-    assert share == pytest.approx(8 / 17, abs=0.15)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_random_lines_have_no_period(seed: int) -> None:
-    assert "repeat" not in found_with(humming(0.0), seed=seed)["scan-line-stripes"].evidence
-
-
 def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_the_same() -> None:
     scans = [scan for size in (64, 80) for scan in planted(count=5, size_px=size, seed=size)]
     scans = [replace(scan, id=f"S{at}", order=at) for at, scan in enumerate(scans)]
