@@ -80,7 +80,7 @@ class Check:
                 f"{100 * share:.0f} % to its gain"
             )
             reason = f"it only resembles the true cause: {added}"
-        return replace(cause, reshaped_share=share, reason=reason, corrects=bool(larger))
+        return replace(cause, reason=reason, corrects=bool(larger))
 
     def _larger(self, cause: Cause, without: State) -> str:
         """Return the name of another law or cause in the model whose formula this cause may merely correct.

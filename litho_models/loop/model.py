@@ -297,36 +297,21 @@ class Twin:
         lowest, highest = self.room()
         return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
-    def at_bounds(self) -> dict[str, float]:
-        """Return the fitted parameters of the base and of the effects that lie on a bound. The result is
-        keyed by the name of the parameter, and its values are the bounds.
-        """
-        base = self.fitted_base
-        found = dict(base.at_bounds) if isinstance(base, Simulator) and self.own else {}
-        return found | {f"{slot.effect}: {slot.parameter}": bound for slot, bound in self._on_bounds()}
-
     def at_limits(self, name: str, kind: Kind) -> str:
         """Return the names, separated by commas, of the parameters of an effect that lie on a limit of their
         range in at least one group. If ``kind`` is ``amplitude``, only amplitudes are examined, and the null
         value of an amplitude does not count as a limit. If ``kind`` is ``shape``, only lengths, such as
         ranges and depths, are examined.
         """
-        own = ((one.parameter, one.facts, bound) for one, bound in self._on_bounds() if one.effect == name)
-        counted = (
-            parameter
-            for parameter, facts, bound in own
-            if facts.kind == kind
-            and (bound != facts.null if kind == "amplitude" else facts.unit in ("µm", "px"))
-        )
-        return ", ".join(dict.fromkeys(counted))
-
-    def _on_bounds(self) -> list[tuple[Slot, float]]:
-        return [
-            (slot, bound)
-            for slot, value in zip(self.slots, self.vector[self.own :].tolist(), strict=True)
-            for bound in (slot.facts.lower, slot.facts.upper)
-            if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound))
-        ]
+        found: dict[str, None] = {}
+        for slot, value in zip(self.slots, self.vector[self.own :].tolist(), strict=True):
+            facts = slot.facts
+            counts = kind == "amplitude" or facts.unit in ("µm", "px")
+            if slot.effect == name and facts.kind == kind and counts:
+                limits = {facts.lower, facts.upper} - ({facts.null} if kind == "amplitude" else set())
+                if any(abs(value - limit) < _AT_BOUND * max(1.0, abs(limit)) for limit in limits):
+                    found[slot.parameter] = None
+        return ", ".join(found)
 
 
 def is_refitted(base: nn.Module) -> bool:

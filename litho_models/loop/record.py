@@ -128,11 +128,11 @@ class FoundEffect(Record):
             candidates.
         group_p: p value of the grouping, computed by permuting the labels of the scans; None if the strength
             does not differ by group.
-        reshaped_share: further gain that would result if variants of the change that the effect makes were
-            added to the model, divided by the gain of the effect itself.
         left_out_nm: increase of the mean absolute error (k = 1) if the effect is removed from the model.
         survives_on: names of the other base models with which the search also found the effect.
     """
+
+    FORMER: ClassVar[frozenset[str]] = frozenset({"reshaped_share"})
 
     name: str
     title: str
@@ -150,7 +150,6 @@ class FoundEffect(Record):
     p_confirm: float
     family_p: float
     group_p: float | None
-    reshaped_share: float | None
     left_out_nm: float | None = None
     survives_on: list[str] = Field(default_factory=list)
 
@@ -278,7 +277,7 @@ class CloseLoop(Result):
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
     FILE_NAME: ClassVar[str] = "close_loop.json"
-    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen"})
+    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen", "at_bounds"})
 
     run: RunInfo
     dataset: DatasetId
@@ -286,7 +285,6 @@ class CloseLoop(Result):
     base_values: dict[str, float]
     corrected_values: dict[str, float]
     settings: dict[str, Any]
-    at_bounds: dict[str, float]
     split: Split
     errors: list[ErrorRow]
     gain_nm: float

@@ -67,7 +67,6 @@ def record(
         base_model=closed.base_name,
         base_values=_values(closed.base.twin),
         corrected_values=_values(final),
-        at_bounds=final.at_bounds(),
         errors=errors,
         gain_nm=float(np.mean(gains)),
         over_scans=over_units(gains, seed=study.seed),
@@ -146,7 +145,6 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         p_confirm=judgement.p,
         family_p=cause.family_p,
         group_p=cause.group_p,
-        reshaped_share=cause.reshaped_share,
         left_out_nm=left_out_nm,
         survives_on=survives_on(cause, closed.rivals),
     )

@@ -14,7 +14,6 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import run_info
-from litho_data.reports.page import filled
 from litho_data.sharing.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
@@ -35,7 +34,7 @@ from litho_models.loop.single_scans import SingleScans
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, leave_one_print_out
 
-MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
+MODEL_FOLDER, QUESTIONS_FILE = "model", "open_questions.json"
 Nested = Literal["folds", "prints"]
 # A function that receives a closed loop and its findings about per-scan terms. It returns the loop, which it
 # may have changed, the decisions on open questions, and a list of further records to write.
@@ -105,7 +104,7 @@ def close_loop(
     }  # fmt: skip
     facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "settings": settings}
     model_files = [f"{MODEL_FOLDER}/{name}" for name in MODEL_FILES]
-    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", *model_files, LAWS_FILE)
+    holds = (CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", *model_files)
     with (
         whole_folder(out, *holds, record=CloseLoop.FILE_NAME, facts=facts) as folder,
         kept_open(Workers(workers, dask)) as places,
@@ -156,7 +155,6 @@ def close_loop(
             written.write(folder)
         write_report(result, models.residuals(), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
-        save_laws(result, folder)
     return result
 
 
@@ -215,15 +213,6 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> list[float]:
         return [rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans]
     except InputError:
         return []
-
-
-def save_laws(result: CloseLoop, folder: Path) -> None:
-    """If laws were found, write a Python module that registers these laws as effects."""
-    laws = [one for one in result.effects if one.knowledge == "law"]
-    if not laws:
-        return
-    text = filled(Path(__file__).with_name(f"{LAWS_FILE}.jinja"), result=result, laws=laws)
-    (folder / LAWS_FILE).write_text(text, encoding="utf-8")
 
 
 def save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:

@@ -41,8 +41,6 @@ class Cause:
         family_p: p value of the effect in the screening of all candidates.
         group_p: p value of the grouping; None if the strength does not differ by group.
         values: for a table, the starting values of its parameters, keyed by group label.
-        reshaped_share: further gain that would result if variants of the change that the effect makes were
-            added to the model, divided by the gain of the effect itself.
         reason: reason why the effect was rejected as the cause; empty if it was not rejected.
         corrects: whether the effect was rejected because it may merely correct the formula of another effect.
         excluded: effects that look the same in these scans, but that later prints exclude.
@@ -56,7 +54,6 @@ class Cause:
     family_p: float
     group_p: float | None
     values: Values = field(default_factory=dict)
-    reshaped_share: float | None = None
     reason: str = ""
     corrects: bool = False
     excluded: tuple[str, ...] = ()

@@ -158,8 +158,6 @@ def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
     assert highest[2] == lowest[3] == 0
     assert list(ends.free()[2:4]) == [False, False]
     assert ends.free()[:2].all()
-    # Both groups are at a bound, and so is the other axis, which is off.
-    assert set(ends.at_bounds()) == {f"{THINNING}: along_x_um", f"{THINNING}: along_y_um"}
     # An amplitude at its null does not count as a limit.
     assert ends.at_limits(THINNING, "amplitude") == "along_x_um"
     vector[3] = facts["along_x_um"].upper
