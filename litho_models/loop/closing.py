@@ -296,7 +296,10 @@ def _checked(start: State, named: Found, rest: Callable[[State], Rest]) -> tuple
         study.report("searching for tables that describe the residual")
         described = describe(lawful.state, tables, 2, secants)
         if named.causes:
-            in_place = _with_larger_table(lawful.state, described, start.mse_nm2 - named.state.mse_nm2)
+            in_place = lawful.state
+            # A table can fit almost anything, so it must gain more than all causes together.
+            if described and described[0].judgement.gain_nm2 > start.mse_nm2 - named.state.mse_nm2:
+                in_place = with_table(in_place, described[0])
             others = [*named.causes, *lawful.causes]
             check = Check(in_place, others, laws, tables, rest(in_place).mean_nm2, secants)
             named.causes = [check.of(cause) for cause in named.causes]
@@ -327,15 +330,3 @@ def _in_model(state: State, described: Sequence[Cause]) -> Found:
             found.state = fitted
             found.causes.append(replace(table, judgement=judgement))
     return found
-
-
-def _with_larger_table(state: State, described: Sequence[Cause], named_nm2: float) -> State:
-    """Add the table with the largest gain to the model if this gain exceeds ``named_nm2``, the gain of all
-    causes together.
-
-    A table can fit almost anything, so a gain that is larger than that of a single cause would not be enough.
-    """
-    table = max(described, key=lambda one: one.judgement.gain_nm2, default=None)
-    if table is None or table.judgement.gain_nm2 <= named_nm2:
-        return state
-    return with_table(state, table)

@@ -187,22 +187,21 @@ class TwinProblem:
         here = self._twin.at(vector)
         steps = here.steps()
         moved = [here.at(vector + one) for one in np.diag(steps)]
-        return [self._of_window(here, moved, steps, window) for window in self._windows]
-
-    def _of_window(
-        self, twin: Twin, moved: Sequence[Twin], steps: np.ndarray, window: PreparedScan
-    ) -> Linearised:
-        fields: Fields = {}
-        prediction = twin.height(window, known=fields)
-        value = window.at_sample(prediction)
-        rows = np.zeros((len(steps), len(window.sample)))
-        for at, (other, slot) in enumerate(zip(moved, [None] * twin.own + [*twin.slots], strict=True)):
-            if slot is None or twin.is_of(slot, window):
-                # With cached fields, only the effect whose parameter changed and the effects after it are
-                # computed again.
-                there = other.height(window, known=ChainMap({}, fields))
-                rows[at] = (window.at_sample(there) - value) / steps[at]
-        return Linearised(window.height - value, rows, window.free_basis(prediction, FREE_TERMS).T)
+        linear = []
+        for window in self._windows:
+            fields: Fields = {}
+            prediction = here.height(window, known=fields)
+            value = window.at_sample(prediction)
+            rows = np.zeros((len(steps), len(window.sample)))
+            for at, (other, slot) in enumerate(zip(moved, [None] * here.own + here.slots, strict=True)):
+                if slot is None or here.is_of(slot, window):
+                    # With cached fields, only the effect whose parameter changed and the effects after it are
+                    # computed again.
+                    there = other.height(window, known=ChainMap({}, fields))
+                    rows[at] = (window.at_sample(there) - value) / steps[at]
+            basis = window.free_basis(prediction, FREE_TERMS).T
+            linear.append(Linearised(window.height - value, rows, basis))
+        return linear
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Return the measured minus the predicted heights of all windows at the given parameters, µm."""

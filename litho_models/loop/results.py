@@ -5,6 +5,7 @@ found, with confidence intervals, and the reasons why the other effects were rej
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ from litho_models.loop.record import (
 )
 from litho_models.loop.screening import SMALLEST_RETAINED
 from litho_models.loop.search import Cause, separating
-from litho_models.scan_terms.grouped import label_of
 from litho_models.scoring.statistics import over_prints, over_units
 from litho_models.simulator import Simulator
 
@@ -156,29 +156,29 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     or if only one print has this strength. A strength of a single scan has no interval.
     """
     twin, scans = closed.final.twin, closed.study.scans
-    by = twin.effects[name].by
     kinds = [independent(scans), [scan.id for scan in scans]]
-    reaches = [_reach(closed.final.linear, units)[twin.own :].tolist() for units in kinds]
-
-    def half_width(label: str | None, *reach: float) -> float:
-        # A fit makes the scores of a strength add up to zero, so a single unit would show no scatter.
-        own = [label in (None, label_of(scan.stored, by)) for scan in scans]
-        counts = [len({unit for unit, one in zip(units, own, strict=True) if one}) for units in kinds]
-        return next((one for one, count in zip(reach, counts, strict=True) if count > 1), 0.0)
-
-    fitted = zip(twin.slots, twin.vector[twin.own :].tolist(), *reaches, strict=True)
-    numbers = [
-        (one.parameter, one.label or "", value, half_width(one.label, *reach))
-        for one, value, *reach in fitted
-        if one.effect == name
-    ]
-    facts, values = get_effect(name).parameters, twin.values()[name]
-    numbers += [(key, "", value, 0.0) for key, value in values.items() if facts[key].kind == "choice"]
+    reaches = [_reach(closed.final.linear, units) for units in kinds]
+    facts = get_effect(name).parameters
     found = dict[str, list[Strength]]()
-    for key, label, value, half in numbers:
-        ci95 = (value - half, value + half) if half else None
+
+    def add(key: str, value: float, label: str = "", reach: float = 0.0) -> None:
+        ci95 = (value - reach, value + reach) if reach else None
         own = Strength(label=label, value=value, unit=facts[key].unit, ci95=ci95)
         found.setdefault(key, []).append(own)
+
+    for at, slot in enumerate(twin.slots, twin.own):
+        if slot.effect == name:
+            own = [twin.is_of(slot, scan) for scan in scans]
+            # A fit makes the scores of a strength add up to zero, so a single unit would show no scatter.
+            known = (
+                reach[at]
+                for reach, units in zip(reaches, kinds, strict=True)
+                if len({*compress(units, own)}) > 1
+            )
+            add(slot.parameter, float(twin.vector[at]), slot.label or "", float(next(known, 0.0)))
+    for key, value in twin.values()[name].items():
+        if facts[key].kind == "choice":
+            add(key, value)
     return found
 
 

@@ -21,7 +21,7 @@ from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.judging import GROUPED_P, Judgement, judge, judge_states, told_apart
 from litho_models.loop.model import Twin, Values
 from litho_models.loop.screening import Screened, Screening, Secants
-from litho_models.scan_terms.grouped import ALL, Labels
+from litho_models.scan_terms.grouped import ALL
 
 # Two effects count as indistinguishable if the cosine between the changes that they make to the predictions
 # is at least this large.
@@ -100,23 +100,17 @@ def search(
         most: largest number of effects in the result.
         secants: changes that the candidates make to the predictions of a similar model, which saves computing
             them. By default, these changes are computed for the current model.
-        seed: result of the same search with another base model. If it is given, the search starts with the
-            effects in this result.
+        seed: result of the same search with another base model. If it is given, the search starts with those
+            effects in this result that are confirmed with this base model, too.
     """
-    found = _seeded(start, seed) if seed and seed.causes else Found(start)
+    found = Found(start)
+    if seed and seed.causes:
+        twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
+        found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
+        _test_again(found)
     while len(found.causes) < most and _add_one(found, candidates, secants):
         pass
     _defend(found)
-    return found
-
-
-def _seeded(start: State, seed: Found) -> Found:
-    """Start a search with all effects that the search with another base model has found. Effects that are not
-    confirmed with this base model are removed.
-    """
-    twin = replace(start.twin, effects={**start.twin.effects, **seed.state.twin.effects})
-    found = Found(fit_state(twin, start.study), list(seed.causes), dict(seed.first))
-    _test_again(found)
     return found
 
 
@@ -184,36 +178,27 @@ def _regroup(found: Found, name: str) -> None:
     if cause.by != ALL:
         return
     slots = {
-        at: slot
+        1 + at: slot
         for at, slot in enumerate(twin.slots, twin.own)
         if slot.effect == name and slot.facts.kind == "amplitude"
     }
     # Parameters that are the same in all scans cannot explain a difference between groups, so the changes
     # that they can make are not projected out.
     screening = Screening(found.state, (), beside_own=False)
-
-    def gained(labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return screening.gains_by(labels, [1 + at for at in slots])
-
+    gained = {by: screening.gains_by(own, [*slots]) for by, own in study.groups.items() if by != ALL}
     best = screening.best_grouping(
-        {
-            by: (float(gained(labels)[0].mean()), len(set(labels)))
-            for by, labels in study.groups.items()
-            if by != ALL
-        },
-        lambda _, labels: gained(labels)[0],
+        {by: (float(gains.mean()), len(steps)) for by, (gains, steps) in gained.items()},
+        lambda _, labels: screening.gains_by(labels, [*slots])[0],
     )
     if best is None:
         return
-    (by, p), known = best, twin.values()[name]
-    starts = {
-        label: known
-        | {
-            slot.parameter: min(max(known[slot.parameter] + step, slot.facts.lower), slot.facts.upper)
-            for slot, step in zip(slots.values(), steps.tolist(), strict=True)
-        }
-        for label, steps in gained(study.groups[by])[1].items()
-    }
+    by, p = best
+    known, starts = twin.values()[name], {}
+    for label, steps in gained[by][1].items():
+        starts[label] = dict(known)
+        for slot, step in zip(slots.values(), steps.tolist(), strict=True):
+            moved = known[slot.parameter] + step
+            starts[label][slot.parameter] = min(max(moved, slot.facts.lower), slot.facts.upper)
     state = fit_state(twin.without(name).with_effect(name, by, starts), study, from_here=True)
     if judge_states(found.state, state).p <= GROUPED_P:
         study.report(f"the strength of {name} differs by {by}")
@@ -275,11 +260,8 @@ def same_change(before: State, one: State, other: State) -> bool:
 
 
 def _defend(found: Found) -> None:
-    """Test each cause again in the model with all other causes, and remove it if held-out scans no longer
-    confirm it.
-
-    Before these tests, test for each cause again whether its strength differs by group, because such a
-    difference may become visible only when the other causes are in the model.
+    """Test again for each cause whether its strength differs by group, because such a difference may become
+    visible only when the other causes are in the model. Then test each cause again.
     """
     if len(found.causes) > 1:
         for name in found.names:
@@ -291,18 +273,17 @@ def _test_again(found: Found) -> None:
     """Judge the gain of each cause in the model with all other causes, and remove each cause that held-out
     scans do not confirm.
     """
-    study = found.state.study
-    for cause in list(found.causes):
-        study.report(f"testing {cause.name} again")
+    kept = []
+    for cause in found.causes:
+        found.state.study.report(f"testing {cause.name} again")
         without = found.state.without(cause.name)
         judgement = judge_states(without, found.state)
-        at = found.causes.index(cause)
-        if not judgement.reason(cause.by):
-            found.causes[at] = replace(cause, judgement=judgement)
-        else:
-            found.causes.pop(at)
+        if judgement.reason(cause.by):
             found.refused[cause.name] = "not needed after the other effects were added"
             found.state = without
+        else:
+            kept.append(replace(cause, judgement=judgement))
+    found.causes = kept
 
 
 def untestable(study: Study) -> dict[str, str]:

@@ -19,7 +19,7 @@ from litho_models.loop import learner as module
 from litho_models.loop.fits import Study
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
-from litho_models.loop.prepared import PreparedScan, sample_border_px
+from litho_models.loop.prepared import PreparedScan, prepare_scans, sample_border_px
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import base_model, planted, study_of
 
@@ -148,11 +148,13 @@ def test_a_shift_of_the_registration_is_nothing_to_learn(scene) -> None:
 def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scene, rest_without) -> None:
     study, predictions, _ = scene
     tilted = [
-        replace(scan, height=scan.height + 1e-3 * (scan.sample % scan.stored.shape[1]) + 0.02 * number)
-        for number, scan in enumerate(study.scans)
+        replace(
+            scan.stored, height_um=scan.stored.height_um + 1e-3 * np.arange(scan.stored.shape[1]) + 0.02 * at
+        )
+        for at, scan in enumerate(study.scans)
     ]
     plain = rest_without(None)
-    moved = Learner(replace(study, scans=tilted), predictions).rest(predictions)
+    moved = Learner(replace(study, scans=prepare_scans(tilted)), predictions).rest(predictions)
     assert moved.squares_nm2 == pytest.approx(plain.squares_nm2, rel=1e-6)
     # The residual is white noise.
     assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(NOISE_UM * NM_PER_UM, rel=0.03)

@@ -34,7 +34,7 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
-from litho_models.loop import bases
+from litho_models.loop import bases, prepared
 from litho_models.loop.closing import Closed
 from litho_models.loop.fits import RULES, TwinProblem, fit_state
 from litho_models.loop.judging import judge_states
@@ -787,10 +787,14 @@ def test_two_names_of_one_model_end_in_one_optimum() -> None:
     assert other == pytest.approx(best, rel=1e-3)
 
 
-def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_the_sample() -> None:
+def test_the_information_of_the_prints_is_known_for_all_their_pixels_whatever_the_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     name = "slope-thinning"
     scans = prepare_scans(planted([(name, ALL, {"": SLOPE[name]})], count=4))
-    few = [replace(scan, sample=scan.sample[::4], height=scan.height[::4]) for scan in scans]
+    assert {len(scan.sample) for scan in scans} == {36 * 36}
+    monkeypatch.setattr(prepared, "_SAMPLED_PX", len(scans[0].sample) // 4)
+    few = prepare_scans([scan.stored for scan in scans])
     known = []
     for study in (scans, few):
         own = SimpleNamespace(windows=study, scans=scans, report=lambda message: None)
