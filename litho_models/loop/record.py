@@ -132,13 +132,12 @@ class FoundEffect(Record):
         survives_on: names of the other base models with which the search also found the effect.
     """
 
-    FORMER: ClassVar[frozenset[str]] = frozenset({"reshaped_share"})
+    FORMER: ClassVar[frozenset[str]] = frozenset({"stage", "reshaped_share"})
 
     name: str
     title: str
     knowledge: Knowledge
     role: Role
-    stage: str
     verdict: EffectVerdict
     by: str
     strengths: dict[str, list[Strength]]
@@ -269,15 +268,13 @@ class CloseLoop(Result):
             scans.
         gain_nm: the headline error of the base model minus that of the corrected model (see
             ``ErrorRow.is_headline``). ``over_scans`` and ``over_prints`` contain its confidence intervals.
-        confounded: pairs of parameters that these scans cannot determine separately, each with the
-            correlation of the two parameters.
         decisions: decisions on the open questions of this store. They are based on the prints of further
             stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
     FILE_NAME: ClassVar[str] = "close_loop.json"
-    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen", "at_bounds"})
+    FORMER: ClassVar[frozenset[str]] = frozenset({"groups", "chosen", "at_bounds", "confounded"})
 
     run: RunInfo
     dataset: DatasetId
@@ -294,7 +291,6 @@ class CloseLoop(Result):
     candidates: list[Candidate]
     single_scans: list[ScanFinding] = Field(default_factory=list)
     planted: list[Planted] = Field(default_factory=list)
-    confounded: list[tuple[str, str, float]] = Field(default_factory=list)
     measurement: MeasurementModel
     explained: list[Explained]
     decisions: list[Decision] = Field(default_factory=list)

@@ -95,11 +95,6 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
             "planted.csv",
             digits=3,
         )
-    if result.confounded:
-        page.paragraph(
-            "These scans cannot determine the two parameters of each of the following pairs separately: "
-            f"{'; '.join(f'{a} and {b}' for a, b, _ in result.confounded)}."
-        )
     page.heading("Every other candidate", folded=True)
     page.table(result.candidates, "Why each candidate was not added.", "candidates.csv")
     return page.write(folder)

@@ -13,9 +13,9 @@ from scipy.stats import t
 
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.effect import Knowledge
-from litho_models.fitting.least_squares import Linearised, eliminated, eliminated_sum
+from litho_models.fitting.least_squares import Linearised, eliminated
 from litho_models.loop.closing import Closed, survives_on
-from litho_models.loop.fits import RULES, State
+from litho_models.loop.fits import RULES
 from litho_models.loop.judging import FAMILY_P, FEWEST_SCANS
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
@@ -74,7 +74,6 @@ def record(
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),
         single_scans=single_scans,
-        confounded=confounded(closed.final),
         explained=[
             Explained(
                 stage=stage,
@@ -133,7 +132,6 @@ def _found(closed: Closed, cause: Cause, left_out_nm: float) -> FoundEffect:
         title=effect.title,
         knowledge=knowledge,
         role=cause.role or (effect.role if len(roles) == 1 else "undetermined"),
-        stage=effect.stage,
         verdict="explained" if cause.role else verdicts.get(knowledge, unnamed),
         by=cause.by,
         strengths=_strengths(closed, cause.name),
@@ -213,24 +211,6 @@ def clustered_covariance(linear: Sequence[Linearised], units: Sequence[str]) -> 
         [np.sum([p[1] for p, own in zip(parts, units, strict=True) if own == name], axis=0) for name in names]
     )
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
-
-
-def confounded(state: State) -> list[tuple[str, str, float]]:
-    """Return the pairs of fitted parameters that the scans cannot determine separately, each with the
-    correlation of the two parameters. A pair is returned if the absolute correlation is at least 0.95.
-    """
-    twin = state.twin
-    normal = eliminated_sum(state.linear, RULES.term_weight)[0]
-    free = np.flatnonzero(np.diag(normal) > 0)
-    covariance = np.linalg.pinv(normal[np.ix_(free, free)], rcond=1e-10, hermitian=True)
-    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = np.triu(covariance / np.outer(sd, sd), 1)
-    own = [*_values(twin)]
-    if len(own) != twin.own:
-        own = [f"base {i}" for i in range(twin.own)]
-    names = [*own, *(" ".join(filter(None, (s.effect, s.parameter, s.label))) for s in twin.slots)]
-    pairs = np.argwhere(np.abs(correlation) >= 0.95).tolist()
-    return [(names[free[i]], names[free[j]], float(correlation[i, j])) for i, j in pairs]
 
 
 def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:

@@ -126,7 +126,7 @@ def close_loop(
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
-            terms = SingleScans(study, study.scans, maps).findings()
+            terms = SingleScans(study, maps).findings()
             alone = with_marks(terms, study.scans, maps, _rounding_um(opened, development))
         before = closed.final
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())

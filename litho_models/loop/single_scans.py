@@ -41,14 +41,13 @@ class SingleScans:
     and subtracted from the pixels that are scored.
 
     Args:
-        study: the study, which provides the seed and the folds.
-        scans: the original scans.
+        study: the original scans with their folds, and the seed.
         maps_um: map that each scan is expected to show, µm, of shape (ny, nx). It is predicted by a model of
             the printer and a measurement model, both of which were fitted without this scan.
     """
 
-    def __init__(self, study: Study, scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]):
-        self.study, self.scans, self.maps_um = study, scans, maps_um
+    def __init__(self, study: Study, maps_um: Sequence[np.ndarray]):
+        self.study, self.scans, self.maps_um = study, study.scans, maps_um
         self.freed = cache(lambda terms: self._freed(maps_um, terms))
 
     def findings(self) -> list[ScanFinding]:
@@ -77,12 +76,15 @@ class SingleScans:
         effect, own = get_effect(name), terms_of_effect(name)
         before, after = self.freed(accepted - own), self.freed(accepted | own)
         judgement = _as_variance(before, after, self.study)
-        values = self.coefficients(own, accepted | own)
-        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
+        values = coefficients(self.scans, self.maps_um, own, accepted | own)
+        count, seed = len(values), self.study.seed
+        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], seed)
         # If the term agrees between the scans of one print, the printer may be its cause instead of the
         # microscope.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
-        spread = zip(effect.parameters.items(), values.T, strict=True)
+        draws = np.random.default_rng(seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
+        ends = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975], axis=0)
+        spreads = zip(effect.parameters.items(), values.std(axis=0, ddof=1).tolist(), ends.T, strict=True)
         few, many = (np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after))
         was, now = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
@@ -95,32 +97,11 @@ class SingleScans:
             role="undetermined" if unclear else effect.role,
             seen=not judgement.reason(),
             p=judgement.p,
-            spread={parameter: self._spread(own, facts.unit) for (parameter, facts), own in spread},
+            spread={
+                parameter: Strength(label="", value=value, unit=facts.unit, ci95=(float(low), float(high)))
+                for (parameter, facts), value, (low, high) in spreads
+            },
         )
-
-    def coefficients(self, own: Terms, terms: Terms) -> np.ndarray:
-        """Fit all ``terms`` to each scan, and return the k coefficients of those terms that are in ``own``.
-        The result has shape (scans, k).
-
-        Coefficients of displacements are in µm.
-        """
-        found = []
-        lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
-        for scan, prediction in zip(self.scans, self.maps_um, strict=True):
-            design = scan.terms_at_sample(prediction, terms)
-            fitted = least_squares(design, scan.height - scan.at_sample(prediction))
-            fitted[lengths] *= scan.context.pitch_um
-            found.append(fitted[_columns_of(own, terms)])
-        return np.stack(found)
-
-    def _spread(self, values: np.ndarray, unit: str) -> Strength:
-        """Return the standard deviation over scans of the given values (one per scan), with its bootstrap
-        confidence interval.
-        """
-        count = len(values)
-        draws = np.random.default_rng(self.study.seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
-        low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975]).tolist()
-        return Strength(label="", value=float(values.std(ddof=1)), unit=unit, ci95=(low, high))
 
     def _of_lines(self, names: Sequence[str], accepted: Terms) -> list[ScanFinding]:
         """Test whether the scan lines, or the rows of the layout, have height offsets.
@@ -197,6 +178,24 @@ class SingleScans:
             freed_um(scan.stored.height_um, own, scan.usable, frozenset({"offset", "bow"}))
             for scan, own in zip(self.scans, self.maps_um, strict=True)
         ]
+
+
+def coefficients(
+    scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray], own: Terms, terms: Terms
+) -> np.ndarray:
+    """Fit all ``terms`` to each scan, and return the k coefficients of those terms that are in ``own``. The
+    result has shape (scans, k).
+
+    Coefficients of displacements are in µm.
+    """
+    found = []
+    lengths = _columns_of((term.name for term in chosen_terms(own) if term.unit == "px"), terms)
+    for scan, expected in zip(scans, maps_um, strict=True):
+        design = scan.terms_at_sample(expected, terms)
+        fitted = least_squares(design, scan.height - scan.at_sample(expected))
+        fitted[lengths] *= scan.context.pitch_um
+        found.append(fitted[_columns_of(own, terms)])
+    return np.stack(found)
 
 
 def _as_variance(before: Sequence[CrossFit], after: Sequence[CrossFit], study: Study) -> Judgement:

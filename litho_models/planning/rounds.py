@@ -34,7 +34,7 @@ from litho_models.loop.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision, ScanFinding
-from litho_models.loop.single_scans import SingleScans
+from litho_models.loop.single_scans import coefficients
 from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.open_questions import open_questions
 from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals, left_nm
@@ -182,9 +182,9 @@ class Judge:
         variance of the term between prints with its variance between the scans of one print.
         """
         own = terms_of_effect(question.name)
-        scans = SingleScans(self.study, self.new, [self.twin.height(scan) for scan in self.new])
+        maps = [self.twin.height(scan) for scan in self.new]
         by_print: dict[str, list[np.ndarray]] = {}
-        found = scans.coefficients(own, own | {"offset", "gain", "bow"})
+        found = coefficients(self.new, maps, own, own | {"offset", "gain", "bow"})
         for scan, values in zip(self.new, found, strict=True):
             by_print.setdefault(scan.stored.print_id, []).append(values)
         repeated = [np.array(one) for one in by_print.values() if len(one) > 1]

@@ -12,15 +12,13 @@ from litho_models.effects import get_effect
 from litho_models.loop.fits import TwinProblem, fit_state, without_terms
 from litho_models.loop.model import Slot, Twin, Values
 from litho_models.loop.prepared import LARGE_PX, prepare_scans, prepared_among
-from litho_models.loop.results import clustered_covariance, confounded
-from litho_models.models import build_model
+from litho_models.loop.results import clustered_covariance
 from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import (
     BLUR_UM,
     PITCH_UM,
     bare_state,
     base_model,
-    blank_scan,
     blank_scans,
     planted,
     study_of,
@@ -265,57 +263,3 @@ def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
         # Centres are computed in float32 µm, with a relative error of 2e-6.
         assert np.allclose(y[:, 0], full_y[row : row + len(y), 0], atol=1e-4)
         assert np.allclose(x[0], full_x[0, column : column + x.shape[1]], atol=1e-4)
-
-
-def test_of_two_blurs_only_the_sum_is_known(study) -> None:
-    """Check two successive blurs, one by the resist and one by the microscope. Only their sum is
-    determined.
-    """
-    blurs = [(name, {"variance_um2": 0.02}) for name in ("diffusion-blur", "resampling-blur")]
-    alike = study_of(planted([(name, ALL, {"": values}) for name, values in blurs]))
-    twin = Twin.bare(base_model())
-    for name, values in blurs:
-        twin = twin.with_effect(name, ALL, {"": values})
-    pairs = {frozenset(pair): value for *pair, value in confounded(fit_state(twin, alike))}
-    assert set(pairs) == {frozenset(f"{name} variance_um2" for name, _ in blurs)}
-    assert -1 <= min(pairs.values()) < -0.95
-    # A blur can be told from a loss on slopes, and the gain of the base from its offset.
-    (name, values), _ = blurs
-    apart = Twin.bare(base_model()).with_effect(name, ALL, {"": values})
-    assert confounded(fit_state(apart.with_effect(THINNING, ALL, {"": thinning(0.15)}), study)) == []
-
-
-def test_without_fitted_numbers_nothing_is_confounded(study) -> None:
-    frozen = Twin.bare(base_model().requires_grad_(False))
-    assert confounded(fit_state(frozen, study)) == []
-
-
-@pytest.mark.parametrize("depth_um", [0.1, 0.25])
-def test_an_effect_that_the_base_partly_absorbed_can_be_fitted(depth_um: float) -> None:
-    """Check two starts. From one of them, a fit of a single base would end at an error of 24 nm (fresh base)
-    or 8 nm (fitted base).
-    """
-    effect = get_effect("interface-offset")
-    deep = effect.with_values({"depth_um": 0.6, "shrinkage": 0.4, "substrate_um": 0.05})
-    made = build_model(
-        "physics", sigma_diffusion_init_um=0.3, alpha_init=2.0, eta_init=0.4, bias_init_um=0.03
-    )
-    study = study_of(planted([(effect.name, ALL, {"": deep})], count=4, seed=3, base=made), folds=2)
-    fitted = fit_state(Twin.bare(build_model("physics")), study)
-    shallow = effect.with_values({"depth_um": depth_um})
-    state = fit_state(fitted.twin.with_effect(effect.name, ALL, {"": shallow}), study)
-    # The residual is the white noise of 4 nm.
-    assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.08)
-
-
-def test_effects_use_what_the_record_of_a_scan_states() -> None:
-    facts = {"field_y_um": -4.0, "field_x_um": 3.0, "direction": -1, "tip": 2, "pixel_size": 2.0, "dose": 1.5}
-    write = {"field_um": 100.0, "slow_axis": "x"}
-    (known,) = (one.context for one in prepare_scans([blank_scan(0, 24, write=write, **facts)]))
-    assert known.field_centre_um == (-4, 3)
-    assert (known.field_radius_um, known.slow_axis) == (50, "x")
-    assert (known.backward, known.new_tip, known.pixel_size, known.dose) == (True, True, 2, 1.5)
-    (unsaid,) = (one.context for one in prepare_scans([blank_scan(0, 24)]))
-    assert unsaid.field_centre_um == (0, 0)
-    assert (unsaid.field_radius_um, unsaid.slow_axis) == (None, "y")
-    assert (unsaid.backward, unsaid.new_tip, unsaid.pixel_size, unsaid.dose) == (False, False, 1, 1)

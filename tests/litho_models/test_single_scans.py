@@ -53,7 +53,7 @@ def found_with(
     if shared_known:
         learned = learn_measurement(scans, maps)
         maps = [learned.expected_um(scan, own) for scan, own in zip(scans, maps, strict=True)]
-    return {one.name: one for one in SingleScans(study, study.scans, maps).findings()}
+    return {one.name: one for one in SingleScans(study, maps).findings()}
 
 
 def seen(found: dict[str, ScanFinding]) -> set[str]:
@@ -162,7 +162,7 @@ def test_scans_of_different_sizes_have_no_profile_in_common_and_are_judged_all_t
     scans = [scan for size in (64, 80) for scan in planted(count=5, size_px=size, seed=size)]
     scans = [replace(scan, id=f"S{at}", order=at) for at, scan in enumerate(scans)]
     study = study_of(scans)
-    found = SingleScans(study, study.scans, truths(study.scans)).findings()
+    found = SingleScans(study, truths(study.scans)).findings()
     assert {one.name for one in found if one.seen} == {"datum-offset"}
 
 
@@ -177,7 +177,7 @@ def test_the_lines_to_which_a_scan_is_compared_are_of_other_folds(axis: int) -> 
         for one, fold in zip(scans, study.fold_of, strict=True)
     ]
     both = [
-        SingleScans(study, prepare_scans(own), maps)._with_profile(axis)
+        SingleScans(replace(study, scans=prepare_scans(own)), maps)._with_profile(axis)
         for own in (scans, with_heights(scans, other))
     ]
     for fold, before, after in zip(study.fold_of, *both, strict=True):
