@@ -160,7 +160,7 @@ class HeldOut:
         for name, state in {"base": self.closed.base, "causes": causes, **self.ends}.items():
             if name == "causes" and causes in self.ends.values():
                 continue
-            self.study.report("scoring the base" if name == "base" else f"scoring {name}")
+            self.study.report(f"scoring the model: {name}")
             rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
         if 1 < len(set(prints)) < len(prints) and is_refitted(self.closed.base.twin.base):
@@ -195,22 +195,6 @@ class HeldOut:
             self.study.report(f"leaving out {name}")
             found[name] = error_nm(model.without(name)) - error_nm(model)
         return found
-
-    def residuals(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Return for each scan its id, its residual map before the correction of the model, and its residual
-        map after the correction. The maps are in nm and have shape (ny, nx), and their medians have been
-        subtracted.
-        """
-
-        def left_nm(scan: PrintedScan, own: np.ndarray) -> np.ndarray:
-            left = np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan)
-            return left - np.nanmedian(left)
-
-        maps = map(self.maps_um, self.ends.values())
-        return [
-            (scan.id, left_nm(scan, before), left_nm(scan, after))
-            for scan, before, after in zip(self.scans, *maps, strict=True)
-        ]
 
     def _rows(self, maps: Maps, numbers: tuple[int, int], model: Stage, **terms: str) -> list[ErrorRow]:
         return error_rows(self.scans, maps, numbers, self.study.seed, model=model, **terms)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.fitting.least_squares import gram_inside, orthonormal
+from litho_models.fitting.least_squares import gram, orthonormal
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop.fits import ALL_FREE, Study
 from litho_models.loop.judging import SMALLEST_SHARE
@@ -92,7 +92,12 @@ class Learner:
 
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
-        model = _all_features(study.scans[0])
+        # These are the layout features that the models of the zoo use for such scans.
+        first = study.scans[0].stored
+        config = RandomFeaturesConfig.of_variant(
+            pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
+        )
+        model = Features(FeaturesConfig(**config.model_dump(include=set(FeaturesConfig.model_fields))))
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
         # The facts about each scan are its position in the writing order and the deviation of its dose from
@@ -108,9 +113,7 @@ class Learner:
             for scan, own in zip(study.scans, predictions, strict=True)
         ]
         pairs = zip(self._rows_of, self._bases, strict=True)
-        self._grams = np.stack(
-            [(_gram(own) - gram_inside(own.T, basis)) / len(basis) for own, basis in pairs]
-        )
+        self._grams = np.stack([gram(own.T.astype(np.float64), basis) / len(basis) for own, basis in pairs])
 
     def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """Explain the residual of each scan (measured minus predicted height) by a ridge regression that is
@@ -124,11 +127,11 @@ class Learner:
         grams = np.zeros((len(scans), 1 + count, 1 + count))
         grams[:, 1:, 1:] = self._grams
         parts = zip(scans, predictions, self._rows_of, self._bases, grams, strict=True)
-        for scan, own, rows, basis, gram in parts:
+        for scan, own, rows, basis, products in parts:
             residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
-            gram[0, 0] = np.mean(residual**2)
-            gram[0, 1:] = gram[1:, 0] = rows @ residual / len(residual)
+            products[0, 0] = np.mean(residual**2)
+            products[0, 1:] = products[1:, 0] = rows @ residual / len(residual)
         left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
         squares = grams[:, 0, 0] * NM_PER_UM**2
         return Rest(squares - left, squares)
@@ -137,9 +140,13 @@ class Learner:
         """Return the m features at n pixels of a scan: the features of layout and position, some of their
         products, and products of some features with the writing order and the dose. The result has shape (m,
         n).
+
+        The features of position are the 25 products of five splines along y and five splines along x.
         """
-        at = scan.sample[:: self._every]
-        of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
+        at, (ny, nx) = scan.sample[:: self._every], scan.stored.shape
+        y, x = np.divmod(at, nx)
+        of_place = (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
+        of_layout = feature_rows(model, scan.stored, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
         # Products of the height, ∂y and ∂x with the position represent a gain and a displacement that depend
         # on the position.
@@ -148,11 +155,6 @@ class Learner:
         for value in varied:
             columns += [value * varying, *((value > step) * varying for step in (-0.25, 0.0, 0.25))]
         return np.concatenate(columns).astype(np.float32)
-
-
-def _gram(rows: np.ndarray) -> np.ndarray:
-    exact = rows.astype(np.float64)
-    return exact @ exact.T
 
 
 def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
@@ -176,25 +178,6 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
             block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
         left[own] = products.squares([block], products.strengths([block], rest), own)
     return left
-
-
-def _all_features(scan: PreparedScan) -> Features:
-    """Return the layout features that the models of the zoo use for scans like this one, except the
-    random features.
-    """
-    first = scan.stored
-    config = RandomFeaturesConfig.of_variant(
-        pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
-    )
-    return Features(FeaturesConfig(**config.model_dump(include=set(FeaturesConfig.model_fields))))
-
-
-def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
-    """Return the 25 products of five splines along y and five splines along x, at the n given flat indices of
-    a scan. The result has shape (25, n).
-    """
-    (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
-    return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
 
 
 def _splines(size: int) -> np.ndarray:

@@ -47,10 +47,6 @@ class FoldedBase(nn.Module):
         # would change their rounding.
         self.eval()
 
-    def of_fold(self, fold: int) -> nn.Module:
-        """Return the model that was trained without the scans of this fold."""
-        return self.models[fold]
-
     def of_scan(self, scan_id: str) -> nn.Module:
         """Return the model that was trained without this scan. For a scan that belongs to no fold, return the
         common model.
@@ -167,7 +163,7 @@ class Twin:
         has the base that was trained without this fold. Otherwise, it is the twin itself.
         """
         base = self.base
-        return replace(self, base=base.of_fold(fold)) if isinstance(base, FoldedBase) else self
+        return replace(self, base=base.models[fold]) if isinstance(base, FoldedBase) else self
 
     def with_effect(self, name: str, by: str, values: Values) -> Twin:
         """Return the twin with a further effect. ``by`` is the grouping by which its strength differs.

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.page import Page, sentences
 from litho_data.reports.pictures import colour_bar_png, coloured_png, thumbnail
+from litho_data.store import PrintedScan
 from litho_models.loop.record import CloseLoop, FoundEffect
 
-Maps = Sequence[tuple[str, np.ndarray, np.ndarray]]
 
-
-def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
+def write_report(
+    result: CloseLoop, scans: Sequence[PrintedScan], maps_um: Iterable[Sequence[np.ndarray]], folder: Path
+) -> Path:
     """Write ``report.html`` and its tables.
 
     Args:
         result: the record of the loop.
-        maps: for each scan, its name, its residual map before the correction of the model, and its residual
-            map after the correction. The maps are in nm and have shape (ny, nx).
+        scans: the scans for development.
+        maps_um: the maps that these scans are expected to show, µm, of shape (ny, nx): first those before the
+            correction of the model, then those after it.
         folder: folder to which the files are written.
     """
     page = Page(
@@ -64,7 +67,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
         page.heading("What the new prints decide")
         page.points([said("decision", one) for one in result.decisions])
     page.heading("Where the residual lies")
-    _residuals(page, maps)
+    _residuals(page, scans, maps_um)
     page.table(
         result.explained,
         "Squared error on held-out scans after each stage of the loop, and the part of it that a ridge "
@@ -107,15 +110,19 @@ def said(about: str, one: object) -> str:
     return sentences(Path(__file__).with_name("sentences.jinja"), about, one)
 
 
-def _residuals(page: Page, maps: Maps) -> None:
-    limit_nm = 2.5 * float(np.sqrt(np.mean([np.nanmean(before**2) for _, before, _ in maps])))
+def _residuals(page: Page, scans: Sequence[PrintedScan], maps_um: Iterable[Sequence[np.ndarray]]) -> None:
+    pairs = []
+    for scan, *expected in zip(scans, *maps_um, strict=True):
+        left = [np.where(scan.usable, NM_PER_UM * (scan.height_um - own), np.nan) for own in expected]
+        pairs.append([own - np.nanmedian(own) for own in left])
+    limit_nm = 2.5 * float(np.sqrt(np.mean([np.nanmean(before**2) for before, _ in pairs])))
     bar = colour_bar_png("RdBu_r")
     titles = [(f"{when}, {-limit_nm:.0f} … {limit_nm:.0f} nm", bar) for when in ("before", "after")]
     rows = []
-    for name, *pair in maps:
+    for scan, pair in zip(scans, pairs, strict=True):
         errors = " → ".join(f"{np.nanmean(np.abs(own)):.1f}" for own in pair)
         shown = [coloured_png(thumbnail(own), "RdBu_r", -limit_nm, limit_nm) for own in pair]
-        rows.append((f"{name}: {errors} nm", shown))
+        rows.append((f"{scan.id}: {errors} nm", shown))
     page.gallery(
         titles,
         rows,

@@ -155,7 +155,11 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """
     twin, scans = closed.final.twin, closed.study.scans
     kinds = [independent(scans), [scan.id for scan in scans]]
-    reaches = [_reach(closed.final.linear, units) for units in kinds]
+    # Half the widths of the intervals of all fitted parameters, for each kind of units.
+    reaches = []
+    for units in kinds:
+        sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
+        reaches.append(t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd)
     facts = get_effect(name).parameters
     found = dict[str, list[Strength]]()
 
@@ -178,14 +182,6 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
         if facts[key].kind == "choice":
             add(key, value)
     return found
-
-
-def _reach(linear: Sequence[Linearised], units: Sequence[str]) -> np.ndarray:
-    """Return half the width of the 95 % confidence interval of each of the p fitted parameters, of shape
-    (p,). The arguments are those of ``clustered_covariance``.
-    """
-    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(linear, units)), 0.0))
-    return np.asarray(t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd)
 
 
 def independent(scans: Sequence[PreparedScan]) -> list[str]:

@@ -96,7 +96,12 @@ def close_loop(
     """
     wanted = [parse_planted(text) for text in inject]
     opened = open_store(store)
-    development, locked, dropped = _usable_scans(opened)
+    usable, dropped = measured_scans(opened)
+    locked = [scan for scan in usable if scan.id in opened.locked_ids]
+    development = [scan for scan in usable if scan.id not in opened.locked_ids]
+    if len(development) < 2:
+        got = f"{len(development)} that can be used and are not locked"
+        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
     settings = {
         "base": base, "base_settings": dict(base_settings), "folds": folds, "nested": nested,
         "inject": list(inject), "steps": steps,
@@ -153,25 +158,9 @@ def close_loop(
         )  # fmt: skip
         for written in (result, *beside):
             written.write(folder)
-        write_report(result, models.residuals(), folder)
+        write_report(result, study.stored, map(models.maps_um, models.ends.values()), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
     return result
-
-
-def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
-    """Return three lists: the scans for development, the locked scans, and texts that state which scans are
-    excluded and why.
-
-    Raises:
-        InputError: there are fewer than two scans for development.
-    """
-    usable, dropped = measured_scans(store)
-    locked = [scan for scan in usable if scan.id in store.locked_ids]
-    development = [scan for scan in usable if scan.id not in store.locked_ids]
-    if len(development) < 2:
-        got = f"{len(development)} that can be used and are not locked"
-        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
-    return development, locked, dropped
 
 
 def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:

@@ -158,16 +158,13 @@ class Secants:
         for effect, values in ((trial.effect, own) for trial in trials for own in trial.sets):
             key = effect.name, *values.items()
             if key not in self._known:
-                self._known[key] = self._changes(effect, values)
+                extra, changes = {effect.name: effect.with_values(values)}, []
+                for window, known, here in zip(self._windows, self._fields, self._heights_um, strict=True):
+                    moved = self._twin.height(window, extra, ChainMap({}, known))
+                    changes.append(window.at_sample(moved - here).astype(np.float32))
+                self._known[key] = changes
             rows.append(self._known[key])
         return [[row[at] for row in rows] for at in range(len(self._windows))]
-
-    def _changes(self, effect: Effect, values: Mapping[str, float]) -> list[NDArray[np.float32]]:
-        extra, found = {effect.name: effect.with_values(values)}, []
-        for window, known, here in zip(self._windows, self._fields, self._heights_um, strict=True):
-            moved = self._twin.height(window, extra, ChainMap({}, known))
-            found.append(window.at_sample(moved - here).astype(np.float32))
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,8 +261,18 @@ class Screening:
         found: dict[str, dict[str, Screened]] = {}
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
-            for by in self.study.groups:
-                one, best = self._candidate(trial, by), own.get(by)
+            for by, labels in self.study.groups.items():
+                gains, multiples = self._gains(trial, labels)
+                one = Screened(
+                    trial=trial,
+                    by=by,
+                    gains_nm2=gains,
+                    multiples=multiples,
+                    allowed=trial.allowed(np.stack([*multiples.values()])),
+                    retained=float(self._retained[trial.columns].max()),
+                    beside_base=float(self._beside_base[trial.columns].max()),
+                )
+                best = own.get(by)
                 if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
                     own[by] = one
         common = np.array([own[ALL].gains_nm2 for own in found.values()]).T
@@ -322,18 +329,6 @@ class Screening:
             own[:, one.trial.columns] = [one.multiples[label] for label in self.study.groups[one.by]]
         inner = np.einsum("asi,sij,bsj->ab", factors, self.freed, factors, optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
-
-    def _candidate(self, trial: Trial, by: str) -> Screened:
-        gains, multiples = self._gains(trial, self.study.groups[by])
-        return Screened(
-            trial=trial,
-            by=by,
-            gains_nm2=gains,
-            multiples=multiples,
-            allowed=trial.allowed(np.stack([*multiples.values()])),
-            retained=float(self._retained[trial.columns].max()),
-            beside_base=float(self._beside_base[trial.columns].max()),
-        )
 
     def _gains(self, trial: Trial, labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         return self.gains_by(labels, trial.columns, lambda own: trial.allowed(own) * trial.reach(own))
