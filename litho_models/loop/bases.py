@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import Any
 
@@ -108,14 +109,10 @@ def train_folds(
         workers: pool of processes.
     """
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
+    count = max(fold.values()) + 1
     # The last model is trained on all scans.
-    last = max(fold.values()) + 1
-    jobs = [(out, trainer, [one for one in scans if fold[one.id] != out]) for out in range(last + 1)]
-    done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")
-    trained = {out: model for (out, *_), model in progress(done, "training the base model", len(jobs))}
-    return FoldedBase([trained[out] for out in range(last)], fold, trained[last])
-
-
-def _train(job: tuple[int, Trainer, Sequence[PrintedScan]]) -> nn.Module:
-    _, trainer, scans = job
-    return trainer(scans)
+    jobs = [partial(trainer, [one for one in scans if fold[one.id] != out]) for out in range(count + 1)]
+    done = run_jobs(call, jobs, workers, name=lambda job: f"fold {jobs.index(job)}")
+    trained = dict(progress(done, "training the base model", len(jobs)))
+    *models, common = (trained[job] for job in jobs)
+    return FoldedBase(models, fold, common)

@@ -193,7 +193,7 @@ class TwinProblem:
             prediction = here.height(window, known=fields)
             value = window.at_sample(prediction)
             rows = np.zeros((len(steps), len(window.sample)))
-            for at, (other, slot) in enumerate(zip(moved, [None] * here.own + here.slots, strict=True)):
+            for at, (other, slot) in enumerate(zip(moved, [None] * here.own + [*here.slots], strict=True)):
                 if slot is None or here.is_of(slot, window):
                     # With cached fields, only the effect whose parameter changed and the effects after it are
                     # computed again.

@@ -37,7 +37,7 @@ from litho_models.loop.record import CloseLoop, Comparison, Decided, Decision, S
 from litho_models.loop.single_scans import coefficients
 from litho_models.planning.answers import PRINT_SHARE, Z_DECIDED, surely_better
 from litho_models.planning.open_questions import open_questions
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival, fit_rivals, left_nm
+from litho_models.planning.questions import OpenQuestions, Owner, Question, fit_rivals, left_nm
 from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
@@ -70,10 +70,14 @@ def close_loop(
         InputError: as in ``loop.run.close_loop``. The error is also raised if a further store is of another
             printer, or if the orientation of a scan differs from the one that its dataset card states.
     """
-    first, further = open_store(store), [open_store(path) for path in new_prints]
-    checked = [new_scans(first, one) for one in further]
-    new = [scan for scans, _ in checked for scan in scans]
-    dropped = [text for _, texts in checked for text in texts]
+    first = open_store(store)
+    new, dropped, used = list[PrintedScan](), list[str](), list[str]()
+    for path in new_prints:
+        further = open_store(path)
+        scans, texts = new_scans(first, further)
+        new += scans
+        dropped += texts
+        used.append(further.sha256)
 
     def asked(
         closed: Closed, single_scans: Sequence[ScanFinding]
@@ -82,7 +86,6 @@ def close_loop(
         decisions = decide(closed, open_, new) if new else []
         return with_decisions(closed, open_, decisions), decisions, [open_]
 
-    used = [one.sha256 for one in further]
     return run.close_loop(store, out, further=asked, decided_by=used, left_out=dropped, **settings)
 
 
@@ -232,36 +235,30 @@ def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Dec
     """
     questions = {one.name: one for one in open_.questions}
     for decision in decisions:
-        rivals = questions[decision.question].rivals
+        name, rivals = decision.question, questions[decision.question].rivals
         left = [one for one in rivals if one.name in decision.left]
-        if left and decision.verdict != NONE:
-            closed = _answered(closed, decision.question, rivals, left)
+        cause = next((one for one in closed.traced if one.name == name), None)
+        if not left or decision.verdict == NONE or (cause is None and len(left) > 1):
+            continue
+        # The cause keeps its name if it remains.
+        best = min(left, key=lambda one: one.effect != name)
+        if best.effect != name and best.effect in closed.final.twin.names:
+            continue
+        remain = {one.effect for one in left}
+        excluded = dict.fromkeys(one.effect for one in rivals if one.effect not in remain)
+        role, alike = None, (name, *cause.alike) if cause else ()
+        if len(left) == 1:
+            role, alike = _ROLES.get(best.owner, get_effect(best.effect).role), ()
+        closed = with_answer(
+            closed,
+            cause,
+            best.effect,
+            best.effects[best.effect],
+            alike=tuple(one for one in alike if one not in {best.effect, *excluded}),
+            excluded=tuple(excluded),
+            role=role,
+        )
     return closed
-
-
-def _answered(closed: Closed, name: str, rivals: Sequence[Rival], left: Sequence[Rival]) -> Closed:
-    """Return the loop if only the rivals ``left`` of the question about the effect ``name`` remain."""
-    cause = next((one for one in closed.traced if one.name == name), None)
-    if cause is None and len(left) > 1:
-        return closed
-    # The cause keeps its name if it remains.
-    best = min(left, key=lambda one: one.effect != name)
-    if best.effect != name and best.effect in closed.final.twin.names:
-        return closed
-    remain = {one.effect for one in left}
-    excluded = dict.fromkeys(one.effect for one in rivals if one.effect not in remain)
-    role, alike = None, (name, *cause.alike) if cause else ()
-    if len(left) == 1:
-        role, alike = _ROLES.get(best.owner, get_effect(best.effect).role), ()
-    return with_answer(
-        closed,
-        cause,
-        best.effect,
-        best.effects[best.effect],
-        alike=tuple(one for one in alike if one not in {best.effect, *excluded}),
-        excluded=tuple(excluded),
-        role=role,
-    )
 
 
 def compared(
