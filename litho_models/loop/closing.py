@@ -28,6 +28,7 @@ from litho_models.loop.judging import SMALLEST_SHARE, judge_states
 from litho_models.loop.learner import Learner, Rest
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.record import Stage
 from litho_models.loop.screening import Secants
 from litho_models.loop.search import Cause, Found, describe, search, untestable, with_table
 from litho_models.scan_terms.grouped import ALL
@@ -84,6 +85,11 @@ class Closed:
     def final(self) -> State:
         """Return the corrected model, with causes, laws and tables."""
         return self.described.state
+
+    @property
+    def ends(self) -> dict[Stage, State]:
+        """Return the models at the start and at the end of the loop."""
+        return {"base": self.base, "all": self.final}
 
     @property
     def traced(self) -> list[Cause]:

@@ -15,7 +15,7 @@ from litho_data.sharing.workers import run_jobs
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.closing import Closed
-from litho_models.loop.fits import RULES, State, TwinProblem
+from litho_models.loop.fits import RULES, State, Study, TwinProblem
 from litho_models.loop.model import Twin, is_refitted
 from litho_models.loop.prepared import PreparedScan, prepared_among
 from litho_models.loop.record import ErrorRow, Stage
@@ -121,50 +121,41 @@ def error_rows(
 
 
 class HeldOut:
-    """The errors of the models of a loop on scans to which these models were not fitted. Each model is fitted
-    again, together with a measurement model.
+    """Predictions of the scans of a study by models that are fitted again, together with a measurement model,
+    to other scans of the study.
 
     Args:
-        closed: the loop, as returned by ``close``.
+        study: the original scans with their folds.
     """
 
-    def __init__(self, closed: Closed):
-        self.closed, self.study = closed, closed.given
-        self.scans = self.study.stored
+    def __init__(self, study: Study):
+        self.study, self.scans = study, study.stored
         self._by_fold = cache(self._without_folds)
-        self.fit = cache(lambda state: fit_with_measurement(state.twin, self.study.scans, self.study.seed))
+        self.fit = cache(lambda state: fit_with_measurement(state.twin, study.scans, study.seed))
 
-    @property
-    def ends(self) -> dict[Stage, State]:
-        """Return the models at the start and at the end of the loop: the base model (``base``) and the
-        corrected model (``all``).
-        """
-        return {"base": self.closed.base, "all": self.closed.final}
-
-    def errors(self) -> list[ErrorRow]:
-        """Return the errors of three models: the base model, the base model with the causes, and the
-        corrected model.
+    def errors(self, closed: Closed) -> list[ErrorRow]:
+        """Return the errors of three models of a loop: the base model, the base model with the causes, and
+        the corrected model.
 
         Each scan is predicted by a fit to the scans outside its fold. If the base is refitted and prints were
         scanned several times, the base model and the corrected model are scored a second time. Each scan is
         then predicted by a fit that leaves out all scans of the same print. The base model with the causes is
         listed only if it differs from both other models.
         """
-        plain, causes = self.closed.plain, self.closed.named.state
+        plain, causes = closed.plain, closed.named.state
         numbers = len(plain.twin.vector)
         maps = plain.maps_um(self.study.scans)
         rows = self._rows(maps, (numbers, 0), "base", measurement="print alone")
         if not self.study.of_films:
             # A smooth background has five coefficients.
-            rows += self._rows(self._published(maps), (numbers, 5), "base", measurement="published")
-        for name, state in {"base": self.closed.base, "causes": causes, **self.ends}.items():
-            if name == "causes" and causes in self.ends.values():
-                continue
-            self.study.report(f"scoring the model: {name}")
-            rows += self._rows(*self._by_fold(state), name)
+            rows += self._rows(self._published(plain, maps), (numbers, 5), "base", measurement="published")
+        for name, state in {"base": closed.base, "causes": causes, **closed.ends}.items():
+            if name != "causes" or causes not in closed.ends.values():
+                self.study.report(f"scoring the model: {name}")
+                rows += self._rows(*self._by_fold(state), name)
         prints = [scan.print_id for scan in self.scans]
-        if 1 < len(set(prints)) < len(prints) and is_refitted(self.closed.base.twin.base):
-            for name, state in self.ends.items():
+        if 1 < len(set(prints)) < len(prints) and is_refitted(closed.base.twin.base):
+            for name, state in closed.ends.items():
                 self.study.report(f"leaving out whole prints: {name}")
                 starts = dict.fromkeys(sorted(set(prints)), state.twin)
                 rows += self._rows(*self._without_parts(starts, prints), name, held_out="prints")
@@ -176,10 +167,9 @@ class HeldOut:
         """
         return self._by_fold(state)[0]
 
-    def left_out_nm(self) -> dict[str, float]:
+    def left_out_nm(self, model: State) -> dict[str, float]:
         """Return by how much the headline error (see ``ErrorRow.is_headline``) grows, nm, when an effect is
-        removed from the corrected model and the model is refitted. The result is keyed by the name of the
-        effect.
+        removed from a model and the model is refitted. The result is keyed by the name of the effect.
 
         After this refit, the measurement model is fitted again, while the parameters of the printer model are
         held fixed.
@@ -190,7 +180,7 @@ class HeldOut:
             rows = self._rows(*self._by_fold(state, refit=False), "all")
             return next(row.leading_nm for row in rows if row.is_headline)
 
-        model, found = self.closed.final, {}
+        found = {}
         for name in model.twin.names:
             self.study.report(f"leaving out {name}")
             found[name] = error_nm(model.without(name)) - error_nm(model)
@@ -222,12 +212,12 @@ class HeldOut:
         maps = [fits[part].expected_um(scan) for scan, part in zip(scans, part_of, strict=True)]
         return maps, max(fit.numbers for fit in fits.values())
 
-    def _published(self, maps: Maps) -> Maps:
+    def _published(self, plain: State, maps: Maps) -> Maps:
         """Add to each predicted map the smooth background that is learned from the scans outside the same
         fold, as in the published protocol.
         """
         found = list(maps)
-        for twin, (rest, own) in zip(self.closed.plain.per_fold, self.study.folds, strict=True):
+        for twin, (rest, own) in zip(plain.per_fold, self.study.folds, strict=True):
             heights = [twin.height(self.study.scans[i]) for i in rest]
             learned = learn_background([self.scans[i] for i in rest], heights)
             for i in own:
@@ -240,7 +230,7 @@ def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, bool]) -> Fit:
 
 
 def errors_of_others(
-    found: Iterable[tuple[HeldOut, Sequence[PrintedScan]]],
+    found: Iterable[tuple[HeldOut, Closed, Sequence[PrintedScan]]],
     scans: Sequence[PrintedScan],
     held_out: str,
     seed: int,
@@ -249,16 +239,16 @@ def errors_of_others(
     choosing nor for fitting these models.
 
     Args:
-        found: pairs that each consist of the models of a loop and the scans that this loop did not use.
-        scans: all scans of these pairs, in the order in which they are reported.
+        found: loops, each with the predictions of its models and the scans that it did not use.
+        scans: all these scans, in the order in which they are reported.
         held_out: a word that states what was held out; see ``ErrorRow.held_out``.
         seed: seed of the calibration blocks.
     """
     maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
     numbers = dict.fromkeys(maps, (0, 0))
-    for models, out in found:
+    for models, closed, out in found:
         prepared = prepared_among(out, models.study.scans)
-        for stage, state in models.ends.items():
+        for stage, state in closed.ends.items():
             fit = models.fit(state)
             maps[stage] |= {scan.id: fit.expected_um(scan) for scan in prepared}
             numbers[stage] = max(fit.numbers, numbers[stage])

@@ -126,23 +126,20 @@ def close_loop(
         def close_again(scans: Sequence[PrintedScan], named: Collection[str] = bases.keys()) -> Closed:
             return close(Study.dealt(scans, folds, seed, places), {name: bases[name] for name in named})
 
-        models = HeldOut(closed)
+        models = HeldOut(study)
         alone: list[ScanFinding] = []
         if not study.of_films:
             report("looking for terms that differ from scan to scan")
             maps = models.maps_um(closed.final)
             terms = SingleScans(study, maps).findings()
             alone = with_marks(terms, study.scans, maps, _rounding_um(opened, development))
-        before = closed.final
         closed, decisions, beside = further(closed, alone) if further else (closed, [], ())
-        if closed.final is not before:
-            models = HeldOut(closed)
-        errors, left_out_nm = models.errors(), models.left_out_nm()
+        errors, left_out_nm = models.errors(closed), models.left_out_nm(closed.final)
         planted = [plant(*one, closed, close_again) for one in wanted]
         if nested:
             errors += _nested(study, nested, partial(close_again, named=[closed.base_name]))
         if open_lock_box and locked:
-            errors += errors_of_others([(models, locked)], locked, "locked", seed)
+            errors += errors_of_others([(models, closed, locked)], locked, "locked", seed)
         result = record(
             closed,
             errors,
@@ -158,7 +155,7 @@ def close_loop(
         )  # fmt: skip
         for written in (result, *beside):
             written.write(folder)
-        write_report(result, study.stored, map(models.maps_um, models.ends.values()), folder)
+        write_report(result, study.stored, map(models.maps_um, closed.ends.values()), folder)
         save_model(closed, result, opened, folder / MODEL_FOLDER)
     return result
 
@@ -185,11 +182,11 @@ def _nested(
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
 
-    def anew() -> Iterator[tuple[HeldOut, list[PrintedScan]]]:
+    def anew() -> Iterator[tuple[HeldOut, Closed, list[PrintedScan]]]:
         for number, out in enumerate(progress(parts, "repeating all choices"), 1):
             study.report(f"leaving out {', '.join(out)} and repeating all choices ({number} of {len(parts)})")
             closed = close_again([scan for scan in scans if scan.id not in out])
-            yield HeldOut(closed), [scan for scan in scans if scan.id in out]
+            yield HeldOut(closed.given), closed, [scan for scan in scans if scan.id in out]
 
     return errors_of_others(anew(), scans, f"nested {nested}", study.seed)
 

@@ -173,8 +173,7 @@ def test_candidates_and_fits_without_folds_are_the_same_to_the_bit(address: str,
             (a.vector == b.vector).all() for a, b in zip(own.per_fold, other[name].per_fold, strict=True)
         )
         assert (own.freed_nm2 == other[name].freed_nm2).all()
-    found = [SimpleNamespace(given=study) for study in studies]
-    maps = [HeldOut(one).maps_um(state) for one in found]
+    maps = [HeldOut(study).maps_um(state) for study in studies]
     assert all((own == its).all() for own, its in zip(*maps, strict=True))
     bases = [
         bases_for("features", study, cache=tmp_path / name)["features"]

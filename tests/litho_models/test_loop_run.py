@@ -307,7 +307,7 @@ def test_a_strength_of_one_print_is_unknown_where_this_print_is_left_out() -> No
     for last_um in (0.16, 0.4):
         state = _losses(last_um)[1]
         prints = [scan.print_id for scan in state.study.stored]
-        models = HeldOut(cast(Closed, SimpleNamespace(given=state.study)))
+        models = HeldOut(state.study)
         maps, _ = models._without_parts(dict.fromkeys(sorted(set(prints)), state.twin), prints)
         expected.append(maps[-1] - maps[-1].mean())
     # The fit starts from the fit to all scans. Each scan has its own datum and gain, so the gain of the model
@@ -421,7 +421,7 @@ def test_scans_of_different_sizes_are_taken_together(quick: None) -> None:
     single = [planted(count=1, size_px=size)[0] for size in (48, 56, 64, 48)]
     scans = [replace(scan, id=f"S{number}", order=number) for number, scan in enumerate(single)]
     found = close(study_of(scans, 2), {BASE: base_model()})
-    rows = HeldOut(found).errors()
+    rows = HeldOut(found.given).errors(found)
     assert {tuple(row.by_scan_nm) for row in rows} == {tuple(scan.id for scan in scans)}
     assert np.isfinite([row.mae_nm for row in rows]).all()
 
