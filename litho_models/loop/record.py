@@ -102,10 +102,10 @@ class Strength(Record):
     the label of the group; it is empty if the value holds for all scans.
     """
 
-    label: str
+    label: str = ""
     value: float
     unit: str
-    ci95: tuple[float, float] | None
+    ci95: tuple[float, float] | None = None
 
 
 class FoundEffect(Record):

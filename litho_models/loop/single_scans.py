@@ -33,7 +33,7 @@ from litho_models.scan_terms import (
     parameter_names,
     terms_of_effect,
 )
-from litho_models.scoring.statistics import BOOTSTRAP_DRAWS, by_print, one_sided_flip_p
+from litho_models.scoring.statistics import by_print, one_sided_flip_p
 
 
 class SingleScans:
@@ -77,14 +77,11 @@ class SingleScans:
         before, after = self.freed(accepted - own), self.freed(accepted | own)
         judgement = _as_variance(before, after, self.study)
         values = coefficients(self.scans, self.maps_um, own, accepted | own)
-        count, seed = len(values), self.study.seed
-        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], seed)
+        grouped = by_print(values, [scan.stored.print_id for scan in self.scans], self.study.seed)
         # If the term agrees between the scans of one print, the printer may be its cause instead of the
         # microscope.
         unclear = effect.role == "measurement" and grouped is not None and grouped.p <= GROUPED_P
-        draws = np.random.default_rng(seed).integers(0, count, (BOOTSTRAP_DRAWS, count))
-        ends = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975], axis=0)
-        spreads = zip(effect.parameters.items(), values.std(axis=0, ddof=1).tolist(), ends.T, strict=True)
+        spreads = zip(effect.parameters.items(), values.std(axis=0, ddof=1).tolist(), strict=True)
         few, many = (np.mean([fit.degrees_of_freedom for fit in fits]) for fits in (before, after))
         was, now = np.sqrt([judgement.before_nm2, judgement.before_nm2 - judgement.gain_nm2])
         told = (
@@ -98,8 +95,7 @@ class SingleScans:
             seen=not judgement.reason(),
             p=judgement.p,
             spread={
-                parameter: Strength(label="", value=value, unit=facts.unit, ci95=(float(low), float(high)))
-                for (parameter, facts), value, (low, high) in spreads
+                parameter: Strength(value=value, unit=facts.unit) for (parameter, facts), value in spreads
             },
         )
 
@@ -143,7 +139,7 @@ class SingleScans:
                     "; ".join([*reasons, f"offsets explain {taken}"]),
                     seen=not reasons,
                     p=excess_p,
-                    spread={"sd_um": Strength(label="", value=float(deviation), unit="µm", ci95=None)},
+                    spread={"sd_um": Strength(value=float(deviation), unit="µm")},
                     confusable_with=[] if beaten or better else [other],
                 )
             )

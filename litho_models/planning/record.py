@@ -82,13 +82,14 @@ class NextPrint(Result):
     """A plan: the prints, their scans, and the questions that the prints and scans are meant to decide.
 
     ``settings`` contains the settings with which the user made the plan. ``levels`` is a pair: the lowest and
-    the highest level number that the layouts may contain. ``cutoff_per_um`` is the highest spatial frequency
-    in the layouts, cycles/µm.
+    the highest level number that the layouts may contain.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/2"
     FILE_NAME: ClassVar[str] = "plan.json"
-    FORMER: ClassVar[frozenset[str]] = frozenset({"smallest_feature_um", "level_distance", "starts"})
+    FORMER: ClassVar[frozenset[str]] = frozenset(
+        {"smallest_feature_um", "level_distance", "starts", "cutoff_per_um"}
+    )
 
     run: RunInfo
     dataset: DatasetId
@@ -96,6 +97,5 @@ class NextPrint(Result):
     prints: int
     field_um: float
     levels: tuple[int, int]
-    cutoff_per_um: float
     scans: list[PlannedScan]
     questions: list[PlannedQuestion]

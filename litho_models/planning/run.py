@@ -194,7 +194,6 @@ def next_print(
             prints=len(planned),
             field_um=field_um,
             levels=(limits.lowest, limits.highest),
-            cutoff_per_um=limits.cutoff_per_um,
             scans=scans,
             questions=questions,
         )

@@ -79,7 +79,6 @@ def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     assert seen(found) == {"datum-offset"}
     assert set(found) == {term.effect for term in SCAN_TERMS.values() if term.effect}
     spread = found["datum-offset"].spread["offset_um"]
-    assert spread.ci95 is not None
     # Compute the drawn datums. The offset of the base is the same for all scans.
     scans = planted(size_px=SMALL_PX)
     drawn = [
@@ -87,7 +86,6 @@ def test_the_datum_is_recognised_with_its_spread_and_nothing_else() -> None:
     ]
     # White noise of 4 nm gives the mean of 4,096 pixels an error of 0.06 nm.
     assert spread.value == pytest.approx(np.std(drawn, ddof=1), rel=0.02)
-    assert spread.ci95[0] < spread.value < spread.ci95[1]
 
 
 def test_stripes_are_told_from_columns_and_not_from_the_rows_that_they_lie_on() -> None:
