@@ -100,20 +100,16 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
 
 
 def _values(twin: Twin) -> dict[str, float]:
-    """Return the fitted values of the parameters of the base model, keyed by name. The values are in physical
-    units if these are known. The result is empty if the base model was not fitted.
+    """Return the fitted values of the single parameters of the base model, keyed by name. The values are in
+    physical units if these are known. The result is empty if the base model was not fitted.
     """
-    base = twin.fitted_base
-    if not twin.own or not isinstance(base, Simulator):
-        return {}
-    found = {}
-    for name, parameter in base.named_parameters():
-        if known := base.ranges.get(name):
-            found[known.name] = float(known.value(parameter.detach()))
-        else:
-            numbers = parameter.detach().reshape(-1).tolist()
-            names = [f"{name} {i}" for i in range(len(numbers))] if len(numbers) > 1 else [name]
-            found |= zip(names, numbers, strict=True)
+    base, found = twin.fitted_base, {}
+    if twin.own and isinstance(base, Simulator):
+        for name, parameter in base.named_parameters():
+            if parameter.numel() == 1:
+                known = base.ranges.get(name)
+                value = known.value(parameter) if known else parameter
+                found[known.name if known else name] = value.item()
     return found
 
 
