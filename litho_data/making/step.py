@@ -9,11 +9,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from litho_data.foundation import Array, Facts, InputError, array_sha256, file_sha256, record_sha256
 from litho_data.foundation.hashes import source_sha256
 from litho_data.store.schema import VARIABLES
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 PACKAGE = Path(__file__).parents[1]
 Arrays = dict[str, Array]
@@ -128,16 +131,23 @@ def _one_thread() -> Iterator[None]:
     the number of cores, and parallel workers do not compete for cores.
     """
     import cv2
-    import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded
-    from threadpoolctl import threadpool_limits
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with threadpool_limits(limits=1):
+        with _libraries().limit(limits=1):
             yield
     finally:
         cv2.setNumThreads(threads)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Return the control of the numerical libraries' threads. To find the libraries takes 10 ms."""
+    import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def _described(name: str, array: Array) -> dict[str, Any]:

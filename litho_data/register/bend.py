@@ -149,8 +149,7 @@ class Bend:
 def _terms(u: Array, v: Array, degree: int) -> list[Array]:
     terms = [u * u - 1 / 3, u * v, v * v - 1 / 3]
     for k in range(3, degree + 1):
-        polynomial = np.polynomial.legendre.Legendre.basis(k)
-        terms += [polynomial(u), polynomial(v)]
+        terms += [np.polynomial.legendre.legval(one, [0.0] * k + [1.0]) for one in (u, v)]
     return terms
 
 

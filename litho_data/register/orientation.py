@@ -2,7 +2,9 @@
 cross-correlation over all shifts.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -42,10 +44,10 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
     """
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
+    oriented = [orient(small_scan, orientation) for orientation in ORIENTATIONS]
+    correlations = _correlations(small_topography, oriented)
     found = []
-    for orientation in ORIENTATIONS:
-        moving = orient(small_scan, orientation)
-        correlation, overlap = masked_correlation(small_topography, moving)
+    for orientation, moving, (correlation, overlap) in zip(ORIENTATIONS, oriented, correlations, strict=True):
         if np.isnan(correlation).all():
             continue
         # On a layout that repeats itself, several shifts have nearly equal correlation. This term prefers the
@@ -97,8 +99,8 @@ def rival_orientation(registered: Array, topography: Array) -> float:
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
     rivals = []
-    for orientation in ORIENTATIONS:
-        correlation, _ = masked_correlation(small, orient(scan, orientation))
+    correlations = _correlations(small, (orient(scan, orientation) for orientation in ORIENTATIONS))
+    for orientation, (correlation, _) in zip(ORIENTATIONS, correlations, strict=True):
         if not np.isnan(correlation).all():
             rivals.append(-np.nanmin(correlation))
             if orientation != "identity":
@@ -132,39 +134,56 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
         shift modulo their shape. The correlation is NaN if less than the share ``MIN_OVERLAP`` of the smaller
         image overlaps, or if one image is constant in the overlap.
     """
-    from scipy.fft import irfft2, next_fast_len
-
-    ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
-    shape = (ny, nx)
-    (mask1, height1, square1), (mask2, height2, square2) = (_spectra(one, shape) for one in (fixed, moving))
-
-    def summed(one: Array, other: Array) -> Array:
-        return irfft2(np.conj(one) * other, shape)
-
-    overlap = np.maximum(np.rint(summed(mask1, mask2)), 1.0)
-    total1, total2 = summed(height1, mask2), summed(mask1, height2)
-    variance1 = summed(square1, mask2) - total1**2 / overlap
-    variance2 = summed(mask1, square2) - total2**2 / overlap
-    covariance = summed(height1, height2) - total1 * total2 / overlap
-    least = MIN_OVERLAP * min(np.isfinite(one).sum() for one in (fixed, moving))
-    # Rounding errors are about 1e-12 of the energy of the whole image. An overlap that contains less than
-    # 1e-6 of this energy per pixel is taken as having no structure.
-    usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
-    product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
-    return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+    return next(_correlations(fixed, [moving]))
 
 
-def _spectra(image: Array, shape: Shape) -> list[Array]:
-    """Return the spectra of three images: the mask of measured pixels, the heights, and the squared heights.
-    The heights are centred and scaled to a mean square of one.
+def _correlations(fixed: Array, moving: Iterable[Array]) -> Iterator[tuple[Array, Array]]:
+    """Yield ``masked_correlation(fixed, one)`` for each of several images. What depends on the fixed image
+    and on the mask alone is computed once for all images with the same shape and mask.
     """
-    from scipy.fft import rfft2
+    from scipy.fft import irfft2, next_fast_len, rfft2
 
+    known: dict[Any, Any] = {}
+    for image in moving:
+        ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, image.shape, strict=True))
+        shape = (ny, nx)
+
+        def summed(one: Array, other: Array, shape: Shape = shape) -> Array:
+            return irfft2(np.conj(one) * other, shape)
+
+        if shape not in known:
+            measured1, *values1 = _masked(fixed)
+            known[shape] = [rfft2(one, shape) for one in (measured1.astype(float), *values1)]
+        mask1, height1, square1 = known[shape]
+        measured2, *values2 = _masked(image)
+        height2, square2 = (rfft2(one, shape) for one in values2)
+        key = image.shape, measured2.tobytes()
+        if key not in known:
+            mask2 = rfft2(measured2.astype(float), shape)
+            overlap = np.maximum(np.rint(summed(mask1, mask2)), 1.0)
+            total1 = summed(height1, mask2)
+            known[key] = overlap, total1, summed(square1, mask2) - total1**2 / overlap
+        overlap, total1, variance1 = known[key]
+        total2 = summed(mask1, height2)
+        variance2 = summed(mask1, square2) - total2**2 / overlap
+        covariance = summed(height1, height2) - total1 * total2 / overlap
+        least = MIN_OVERLAP * min(np.isfinite(fixed).sum(), measured2.sum())
+        # Rounding errors are about 1e-12 of the energy of the whole image. An overlap that contains less than
+        # 1e-6 of this energy per pixel is taken as having no structure.
+        usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
+        product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
+        yield np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+
+
+def _masked(image: Array) -> list[Array]:
+    """Return three images: the mask of measured pixels, the heights, and the squared heights. The heights are
+    centred and scaled to a mean square of one.
+    """
     measured = np.isfinite(image)
     mean = image[measured].mean() if measured.any() else 0.0
     values = np.where(measured, image - mean, 0.0)
     values /= max(float(np.sqrt((values**2).mean())), 1e-300)
-    return [rfft2(one, shape) for one in (measured.astype(float), values, values**2)]
+    return [measured, values, values**2]
 
 
 def _cut_off(orientation: str, shape: Shape, factor: int) -> tuple[int, int]:

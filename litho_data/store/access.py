@@ -82,7 +82,7 @@ def values_of(parent: zarr.Group, name: str) -> Array:
     Raises:
         InputError: there is no such array, or a stored chunk cannot be decoded.
     """
-    return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
+    return _all_of(parent, name, array_of(parent, name))
 
 
 def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
@@ -120,13 +120,18 @@ def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
     import pandas as pd
     import zarr
 
-    names = [name for name, child in _children(group).items() if isinstance(child, zarr.Array)]
-    columns = {name: _plain(values_of(group, name)) for name in sorted(names, key=lambda n: (n != first, n))}
+    arrays = {name: child for name, child in _children(group).items() if isinstance(child, zarr.Array)}
+    names = sorted(arrays, key=lambda name: (name != first, name))
+    columns = {name: _plain(_all_of(group, name, arrays[name])) for name in names}
     if len({values.shape for values in columns.values()}) > 1:
         raise InputError(
             f"table {group.store_path}", got="columns of different lengths", wanted="equal lengths"
         )
     return pd.DataFrame(columns)
+
+
+def _all_of(parent: zarr.Group, name: str, array: zarr.Array[Any]) -> Array:
+    return decoded(array, ..., f"{name} of {parent.store_path}")
 
 
 def _children(parent: zarr.Group) -> dict[str, Any]:
