@@ -175,7 +175,7 @@ def read_text(path: Path) -> str:
 
 def without_quotes(text: str) -> str:
     """Remove the quotation marks around the cells of a text, except around cells that contain a comma."""
-    return _QUOTED.sub(r"\1\2", text)
+    return _QUOTED.sub(r"\1\2", text) if '"' in text else text
 
 
 def blocks_of(text: str) -> list[Block]:

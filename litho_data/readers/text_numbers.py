@@ -17,6 +17,7 @@ _FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")
 _AROUND_COMMA = re.compile(r"(?<![ \t])[ \t]*,[ \t]*(?=[^\s,]|\n|$)")
 _OTHER_SEPARATOR = re.compile(r"[^\s;,][;\t ]+[^\s;,]")
 _AT_COMMA, _WHOLE = re.compile(r"(\d*),(\d*)"), re.compile(r"(?<![\d,])\d+(?![\d,])")
+_CELL = re.compile(r"[^\t\n]+")
 _THOUSANDS = re.compile(r"-?\d{1,3}( \d{3})+([.,]\d*)?")
 _SHOWN_CHARACTERS, _SHOWN_ROWS = 40, 2
 _TRUNCATED = "the file may be truncated"
@@ -109,7 +110,7 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
                     wanted="no thousands separators",
                 )
             text = text.replace(",", ".")
-    if "\t" in text and all(_THOUSANDS.fullmatch(cell.strip()) for cell in re.split(r"[\t\n]", text) if cell):
+    if "\t" in text and all(_THOUSANDS.fullmatch(one[0].strip()) for one in _CELL.finditer(text)):
         got = repr(text[:_SHOWN_CHARACTERS])
         raise InputError(f"line {first_line}", got=got, wanted="no thousands separators")
     if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):

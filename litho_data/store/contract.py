@@ -100,9 +100,9 @@ def file_names(path: Path) -> set[str]:
         InputError: a name in the zip file points outside the store.
     """
     if path.is_dir():
-        found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
+        found = (os.path.join(folder, name) for folder, _, names in os.walk(path) for name in names)
         # A dangling link does not count as a file.
-        return {file.relative_to(path).as_posix() for file in found if file.is_file()}
+        return {os.path.relpath(file, path).replace(os.sep, "/") for file in found if os.path.isfile(file)}
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
     for name in names:
