@@ -104,7 +104,6 @@ def test_a_worker_of_other_software_or_other_files_is_refused(
 
 def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=2)
-    alone = build_dataset(card, tmp_path / "alone.zarr")
     killed: list[int] = []
 
     def and_kill(*given: Any, **named: Any) -> Iterator[Any]:
@@ -116,8 +115,9 @@ def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: P
             yield one
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("litho_data.making.build.run_jobs", and_kill)
         patched.setattr("litho_data.making.build.write_report", lambda *_: None)
+        alone = build_dataset(card, tmp_path / "alone.zarr")
+        patched.setattr("litho_data.making.build.run_jobs", and_kill)
         result = build_dataset(card, tmp_path / "prints.zarr", dask=address)
     assert killed
     assert result.dataset.sha256 == alone.dataset.sha256

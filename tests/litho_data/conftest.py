@@ -23,6 +23,14 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write no report of a build, for tests that look only at the store. The report takes a fifth of the
+    time.
+    """
+    monkeypatch.setattr("litho_data.making.build.write_report", lambda *_: None)
+
+
+@pytest.fixture
 def own_campaign(campaign: Path, tmp_path: Path) -> Path:
     """Return a copy of ``campaign`` that a test may change or damage."""
     return Path(shutil.copytree(campaign, tmp_path / "campaign"))

@@ -91,7 +91,7 @@ def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
         assert scan.usable.mean() > 0.8
 
 
-def test_shifted_edges_are_not_taken_for_defects_or_for_a_scale(tmp_path: Path) -> None:
+def test_shifted_edges_are_not_taken_for_defects_or_for_a_scale(tmp_path: Path, without_report: None) -> None:
     """Check a film whose edges are all shifted by 2.5 px, which is many times the usual misfit."""
     knobs = FilmKnobs(etch_bias_um=0.01)
     card = simulate_films(tmp_path / "fab", "e-beam", count=1, size_px=208, seed=303, knobs=knobs)

@@ -22,6 +22,7 @@ from litho_data.level import (
     zero_mean,
 )
 from litho_data.readers import read_scan
+from litho_data.scan import Scan
 
 pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore::litho_data.level.LevellingWarning")]
 
@@ -112,20 +113,21 @@ def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> No
     _compare_samples(oracles, f"synA__rows_{name}_{masking}", name, height_um, pitch_um, mask, masking)
 
 
-@pytest.mark.measured
-@pytest.mark.parametrize("factor", ["e6", "e0"])
-@pytest.mark.parametrize("name", SAMPLED)
-def test_sampled_rows_of_a_measured_scan(
-    oracles: Path, measured_prints: Path, tmp_path: Path, name: str, factor: str
-) -> None:
-    """Compare levelling of a measured scan read in metres, and of the same digits read in micrometres."""
+@pytest.fixture(scope="module", params=["e6", "e0"])
+def scan(measured_prints: Path, tmp_path_factory: pytest.TempPathFactory, request: Any) -> Scan:
+    """Return a measured scan read in metres, and the same digits read in micrometres."""
     path = measured_prints / "afm_ug" / "FOV11.txt"
-    if factor == "e6":
-        scan = read_scan(path, unit="m", size_um=(54, 54))
-    else:
-        text = re.sub(r"e([-+]\d+)", lambda found: f"e{int(found[1]) + 6:+d}", path.read_text())
-        (tmp_path / "scan.txt").write_text(text)
-        scan = read_scan(tmp_path / "scan.txt", unit="um", size_um=(54, 54))
+    if request.param == "e6":
+        return read_scan(path, unit="m", size_um=(54, 54))
+    text = re.sub(r"e([-+]\d+)", lambda found: f"e{int(found[1]) + 6:+d}", path.read_text())
+    changed = tmp_path_factory.mktemp("digits") / "scan.txt"
+    changed.write_text(text)
+    return read_scan(changed, unit="um", size_um=(54, 54))
+
+
+@pytest.mark.measured
+@pytest.mark.parametrize("name", SAMPLED)
+def test_sampled_rows_of_a_measured_scan(oracles: Path, scan: Scan, name: str) -> None:
     key = f"FOV11__rows_{name}_ignore"
     _compare_samples(oracles, key, name, scan.height_um, scan.require_pitch(), None, "exclude")
 

@@ -25,7 +25,7 @@ BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
 # The line jitter of 6 nm and the noise give a mean absolute error of 4.8 nm. A limit of 8 nm leaves room for
 # levelling errors.
 MOST_NM = 8.0
-FEW = ("A1", "A2", "B1", "B2")
+FEW = ("A1", "A2", "B1")
 
 
 def lab(folder: Path, ids: tuple[str, ...] = IDS, **changed: str) -> Path:
@@ -42,7 +42,8 @@ def first_box(card: Path) -> str:
 
 
 def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
-    card = lab(tmp_path)
+    # These five have the five formats. A3 has the format of B2.
+    card = lab(tmp_path, tuple(one for one in IDS if one != "A3"))
     found = suggest_recipe(card, tmp_path / "levelling")
     assert found.recipe == "plane and bow"
     # The heights that the layout does not explain are small compared with a level.
@@ -55,7 +56,7 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     build = CliRunner().invoke(app, ["build", str(found.card), "--out", str(out)])
     assert build.exit_code == 0
     store = open_store(out)
-    assert len(store) == 6
+    assert len(store) == 5
     errors = errors_nm(store)
     assert max(errors.values()) < MOST_NM, errors
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.partial import PartialStore, Piece
+from tests.litho_data.campaigns import write_campaign
 
 
 def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_path: Path) -> None:
@@ -36,16 +38,11 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
     assert verify(tmp_path / "back.zarr").findings == ()
 
 
-@pytest.mark.parametrize(
-    "other",
-    [{"pitch_um": 0.2}, {"level_height_um": 0.2}, {"levels": 14}, {"name": "others"}],
-    ids=lambda one: next(iter(one)),
-)
-def test_an_import_begun_with_other_options_is_not_continued(
-    other: dict[str, Any], campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Check this because continuing such an import would mix fields with two pitches in one store."""
-    export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
+@pytest.fixture(scope="module")
+def begun(campaign: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with exported pairs, and with an import of them that was stopped after two fields."""
+    folder = tmp_path_factory.mktemp("begun")
+    export_pairs(campaign / "prints.zarr", folder / "pairs")
     add, added = PartialStore.add, []
 
     def add_two(partial: PartialStore, piece: Piece) -> None:
@@ -54,25 +51,47 @@ def test_an_import_begun_with_other_options_is_not_continued(
         added.append(piece.record["id"])
         add(partial, piece)
 
-    monkeypatch.setattr(PartialStore, "add", add_two)
-    with pytest.raises(KeyboardInterrupt):
-        import_pairs(tmp_path / "pairs", tmp_path / "mixed.zarr")
-    monkeypatch.undo()
-    result = import_pairs(tmp_path / "pairs", tmp_path / "mixed.zarr", **other)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(PartialStore, "add", add_two)
+        with pytest.raises(KeyboardInterrupt):
+            import_pairs(folder / "pairs", folder / "mixed.zarr")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"pitch_um": 0.2}, {"level_height_um": 0.2}, {"levels": 14}, {"name": "others"}],
+    ids=lambda one: next(iter(one)),
+)
+def test_an_import_begun_with_other_options_is_not_continued(
+    other: dict[str, Any], begun: Path, tmp_path: Path, without_report: None
+) -> None:
+    """Check this because continuing such an import would mix fields with two pitches in one store."""
+    own = shutil.copytree(begun, tmp_path / "own")
+    result = import_pairs(own / "pairs", own / "mixed.zarr", **other)
     assert result.reused == 0
-    assert not verify(tmp_path / "mixed.zarr").findings
+    assert not verify(own / "mixed.zarr").findings
 
 
-def test_gaps_are_filled_with_a_note(own_campaign: Path, tmp_path: Path) -> None:
-    scan = own_campaign / "scans" / "P12.txt"
+def test_an_import_begun_with_the_same_options_is_continued(
+    begun: Path, tmp_path: Path, without_report: None
+) -> None:
+    own = shutil.copytree(begun, tmp_path / "own")
+    assert import_pairs(own / "pairs", own / "mixed.zarr").reused == 2
+
+
+def test_gaps_are_filled_with_a_note(tmp_path: Path, without_report: None) -> None:
+    card = write_campaign(tmp_path, count=1)
+    scan = tmp_path / "scans" / "P11.txt"
     rows = [line.split() for line in scan.read_text().splitlines()]
     rows[60][60] = "nan"
     scan.write_text("\n".join("\t".join(row) for row in rows))
-    build_dataset(own_campaign / "card.toml", own_campaign / "prints.zarr")
-    gaps = int(np.isnan(open_store(own_campaign / "prints.zarr").scan("P12").height_um).sum())
-    notes = export_pairs(own_campaign / "prints.zarr", tmp_path / "pairs")
+    build_dataset(card, tmp_path / "prints.zarr")
+    gaps = int(np.isnan(open_store(tmp_path / "prints.zarr").scan("P11").height_um).sum())
+    assert gaps
+    notes = export_pairs(tmp_path / "prints.zarr", tmp_path / "pairs")
     assert [note.split(",")[0] for note in notes if "became" in note] == [
-        f"P12: {gaps} unmeasured pixels became 0"
+        f"P11: {gaps} unmeasured pixels became 0"
     ]
 
 

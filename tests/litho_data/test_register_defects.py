@@ -61,7 +61,7 @@ def test_a_clean_print_has_no_defects_and_keeps_its_warp(snr: float) -> None:
     assert rms_error_px(found, warp) < 0.02
 
 
-@pytest.mark.parametrize(("creep_um", "slow"), [(0.5, 1), (1.5, 1), (1.0, 0)])
+@pytest.mark.parametrize(("creep_um", "slow"), [(0.5, 1), (1.5, 0)])
 def test_creep_along_the_slow_axis_is_corrected(creep_um: float, slow: int) -> None:
     layout, warp = print_of(seed=3)
     scan, seen = creeping(layout, warp, creep_um, slow)
@@ -98,7 +98,7 @@ def test_creep_is_determined_by_points_and_undone() -> None:
     assert bend.kind == "creep"
 
 
-def test_a_defect_is_stored_and_not_valid(tmp_path: Path) -> None:
+def test_a_defect_is_stored_and_not_valid(tmp_path: Path, without_report: None) -> None:
     shape = (224, 224)
     card = write_campaign(tmp_path, count=1, shape=shape)
     height_um = height_of(layout_of(0, shape), 0)

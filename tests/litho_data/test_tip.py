@@ -283,7 +283,7 @@ def test_the_command_prints_the_tip_and_writes_its_maps(tmp_path) -> None:
 # In a build
 
 
-def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path) -> None:
+def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path, without_report) -> None:
     card = write_campaign(tmp_path / "raw", count=1)
     plain = open_store(_built(card, tmp_path / "plain.zarr"))
     store = open_store(_built(card, tmp_path / "blunt.zarr", tip=0.1))
@@ -309,7 +309,7 @@ def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path) ->
     assert store.computed_sha256() == store.sha256
 
 
-def test_a_blind_tip_is_the_same_for_all_scans(tmp_path, capsys) -> None:
+def test_a_blind_tip_is_the_same_for_all_scans(tmp_path, capsys, without_report) -> None:
     card = write_campaign(tmp_path / "raw", count=2, more='[process]\ntip = "blind"')
     store = open_store(_built(card, tmp_path / "prints.zarr"))
     assert "tip: radius at most" in capsys.readouterr().err

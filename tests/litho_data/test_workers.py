@@ -173,7 +173,7 @@ def test_zero_workers_is_bad_input() -> None:
 
 
 def test_a_build_without_its_cluster_keeps_what_is_finished(
-    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_report: None
 ) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(module, "_CONNECT_S", 0.3)
