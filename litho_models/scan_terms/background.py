@@ -8,7 +8,8 @@ part of the printer and is not used in a design.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import ConfigDict
@@ -25,12 +26,22 @@ from litho_models.scan_terms.term import FloatMap, smooth_shapes
 _SAME_SIZE = 0.01
 
 
+@dataclass(frozen=True, repr=False)
+class ScanPart(PrintedScan):
+    """A rectangular part of a scan. ``whole`` is the shape (ny, nx) of the scan, and ``corner`` is the row
+    and the column of the part's first pixel in the scan.
+    """
+
+    whole: tuple[int, int] = (0, 0)
+    corner: tuple[int, int] = (0, 0)
+
+
 class Background(Record):
     """The coefficients, in nm, of a background with the terms x, y, x², xy and y². They are averaged over the
-    training scans, and ``scans`` is the number of these scans.
+    training scans, and ``scans`` is the number of these scans or parts of scans.
 
-    x and y run from -1 to 1 over a field whose size (y, x) is ``field_um``. Each term has zero mean, so a
-    background does not change the datum.
+    x and y run from -1 to 1 over a whole field whose size (y, x) is ``field_um``. Each term has zero mean, so
+    a background does not change the datum.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -54,8 +65,19 @@ class Background(Record):
 
 
 def field_um(scan: PrintedScan) -> tuple[float, float]:
-    """Return the size (y, x) of a scan's field, µm."""
-    return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um
+    """Return the size (y, x) of a scan's field, µm. For a part, this is the size of the whole field."""
+    ny, nx = scan.whole if isinstance(scan, ScanPart) else scan.shape
+    return ny * scan.pitch_um, nx * scan.pitch_um
+
+
+def on_field(scan: PrintedScan, maps: Callable[[tuple[int, int]], FloatMap]) -> FloatMap:
+    """Return maps of the whole field at the pixels of a scan, which may be a part of the field. ``maps``
+    returns them for the shape of the field; the last two axes are y and x.
+    """
+    if not isinstance(scan, ScanPart):
+        return maps(scan.shape)
+    (top, left), (ny, nx) = scan.corner, scan.shape
+    return maps(scan.whole)[..., top : top + ny, left : left + nx]
 
 
 def usual_field_um(scans: Sequence[PrintedScan]) -> tuple[float, float]:
@@ -72,8 +94,9 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
     """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
     All terms of policy ``full``, including offset and gain, are fitted to the valid pixels of each scan. The
-    background is the mean over the scans of the five smooth terms (tilt and bow). If the fields of the scans
-    differ in size, only the scans with the most frequent field size are used.
+    background is the least-squares fit to the five smooth terms (tilt and bow) of all scans: for whole scans
+    the mean of their coefficients, for parts a surface over the whole field with a free offset in each part.
+    If the fields of the scans differ in size, only the scans with the most frequent field size are used.
 
     Args:
         scans: training scans.
@@ -81,12 +104,14 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
             are in the order of ``scans``.
     """
     usual_um = usual_field_um(scans)
-    coefficients = [
-        fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]
-        for scan, prediction in zip(scans, predictions_um, strict=True)
-        if is_of_size(scan, usual_um)
-    ]
-    x, y, xx, xy, yy = (NM_PER_UM * np.mean(coefficients, axis=0)[2:]).tolist()
-    return Background(
-        x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=usual_um, scans=len(coefficients)
-    )
+    pairs = [one for one in zip(scans, predictions_um, strict=True) if is_of_size(one[0], usual_um)]
+    products, seen = np.zeros((5, 5)), np.zeros(5)
+    for scan, prediction in pairs:
+        coefficients, _ = fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])
+        own = np.tensordot(coefficients[2:], smooth_shapes(scan.shape), axes=1)
+        shapes = on_field(scan, smooth_shapes).reshape(5, -1)
+        shapes = shapes - shapes.mean(axis=1, keepdims=True)
+        products += shapes @ shapes.T
+        seen += shapes @ own.ravel()
+    x, y, xx, xy, yy = (NM_PER_UM * np.linalg.lstsq(products, seen, rcond=1e-12)[0]).tolist()
+    return Background(x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=usual_um, scans=len(pairs))

@@ -7,7 +7,7 @@ same ids and the same seed always give the same split.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field
@@ -16,6 +16,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key, require_unique
+from litho_models.scan_terms.background import ScanPart
 
 SplitKind = Literal["grouped", "paper", "leave-one-print-out"]
 GROUPED_FOLDS = 5
@@ -187,12 +188,13 @@ def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]
 
 
 def _quadrant(scan: PrintedScan, crop: Crop) -> PrintedScan:
-    area = crop.slices(scan.shape)
-    return replace(
-        scan,
-        id=f"{scan.id}/{crop.quadrant}",
-        mask_level=scan.mask_level[area],
-        height_um=scan.height_um[area],
-        valid=scan.valid[area],
-        height_sigma_um=None if scan.height_sigma_um is None else scan.height_sigma_um[area],
-    )
+    rows, columns = area = crop.slices(scan.shape)
+    sigma_um = scan.height_sigma_um
+    cut = {
+        "id": f"{scan.id}/{crop.quadrant}",
+        "mask_level": scan.mask_level[area],
+        "height_um": scan.height_um[area],
+        "valid": scan.valid[area],
+        "height_sigma_um": None if sigma_um is None else sigma_um[area],
+    }
+    return ScanPart(**(vars(scan) | cut), whole=scan.shape, corner=(rows.start, columns.start))

@@ -23,7 +23,10 @@ from litho_models.frozen.card import ModelCard
 from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
 from litho_models.scan_terms import NuisanceProtocol
-from litho_models.scan_terms.background import Background, learn_background
+from litho_models.scan_terms.background import Background, learn_background, on_field
+from litho_models.scan_terms.grouped import ALL
+from litho_models.scan_terms.measurement import MeasurementModel, SharedPart
+from litho_models.scan_terms.measurement_fit import learn_measurement
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import plan_folds
@@ -84,6 +87,31 @@ def test_a_background_is_that_of_the_most_frequent_size(scans):
     learned = some_background()
     assert Prediction.beside(learned, pieces[0], truth(pieces[0])).background_um is None
     assert Prediction.beside(learned, scans[0], truth(scans[0])).background_um is not None
+
+
+def test_quadrants_show_the_background_of_their_whole_field():
+    planted = some_background(x_nm=10, y_nm=-20, xx_nm=30, xy_nm=-15, yy_nm=40)
+    whole = make_scans(8, size_px=65, noise_um=0.001)
+    bowed = [replace(one, height_um=one.height_um + planted.map_um(one.shape)) for one in whole]
+    (fold,) = plan_folds(bowed, [], "paper")
+    prints = {scan.id: truth(scan) for scan in whole}
+
+    def printed(part):
+        return on_field(part, lambda _: prints[part.id.split("/")[0]])
+
+    heights = [printed(part) for part in fold.training]
+    learned = learn_background(fold.training, heights)
+    assert learned.field_um == pytest.approx((6.5, 6.5))
+    for name in ("x_nm", "y_nm", "xx_nm", "xy_nm", "yy_nm"):
+        assert getattr(learned, name) == pytest.approx(getattr(planted, name), abs=0.2)
+    bow = SharedPart(what="background", by=ALL, degree=2, shrinking=1e-6, coefficients={})
+    like = MeasurementModel(levelling="none", parts=[bow], field_um=learned.field_um, scans=0)
+    measured = learn_measurement(fold.training, heights, like=like)
+    for part in fold.held_out:
+        own = printed(part)
+        for seen in (Prediction.beside(learned, part, own), Prediction.seen(measured, part, own)):
+            # Only the datum and the noise of 1 nm are left. The background has at least 10 nm rms.
+            assert np.std(part.height_um - seen.map_um) == pytest.approx(0.001, rel=0.06)
 
 
 def test_a_background_has_zero_mean_and_is_the_sum_of_its_terms():
