@@ -84,6 +84,6 @@ def check(
             new_scans=found.new,
             notes=wording.notes(found.reference, found.new, judged, parameters),
         )
-        write_check_report(result, begun.folder)
+        write_check_report(result, begun.folder, between=found.between)
         result.write(begun.folder)
     return result

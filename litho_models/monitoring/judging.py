@@ -18,8 +18,8 @@ from litho_models.monitoring.prints import (
     Alarm,
     Figure,
     FigureCheck,
-    in_order,
     print_values,
+    printing_order,
     spread_of,
 )
 from litho_models.scoring.printer_state import ScanFigures
@@ -123,10 +123,7 @@ def _judged(
     step, p = likeliest_step(Series(old.values, now.values, *variances))
     noticeable = spread.sd * noticeable_step(*variances, rate)
     allowed = tolerance if tolerance is not None else TOLERANCE_SPREADS * spread.sd
-    order = np.arange(len(old.names) + len(now.names))
-    if between:
-        names = [*old.names, *now.names]
-        order = np.array([names.index(name) for name in in_order([*reference, *new])])
+    order = printing_order(reference, new, between=between)
     values, variance = np.concatenate([old.values, now.values])[order], np.concatenate(variances)[order]
     trend = forecast(values, variance, order < len(old.names), allowed)
     return FigureCheck(

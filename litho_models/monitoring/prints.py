@@ -99,6 +99,18 @@ def in_order(rows: Sequence[ScanFigures]) -> list[str]:
     return [*dict.fromkeys(row.print for row in sorted(rows, key=lambda row: (row.order, row.print)))]
 
 
+def printing_order(
+    reference: Sequence[ScanFigures], new: Sequence[ScanFigures], *, between: bool
+) -> np.ndarray:
+    """Return the printing order of all prints, as indices into the list of the reference prints followed by
+    the new prints. ``between`` is that of ``judge``.
+    """
+    names = [*in_order(reference), *in_order(new)]
+    if not between:
+        return np.arange(len(names))
+    return np.array([names.index(name) for name in in_order([*reference, *new])])
+
+
 def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
     """Return the value of a monitored quantity for each print, in printing order."""
     names = in_order(rows)

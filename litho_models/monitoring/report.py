@@ -11,7 +11,7 @@ import numpy as np
 
 from litho_data.reports.page import Page
 from litho_data.reports.pictures import LIGHT, new_figure
-from litho_models.monitoring.prints import WATCHED, Check, FigureCheck, print_values
+from litho_models.monitoring.prints import WATCHED, Check, FigureCheck, print_values, printing_order
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,12 +22,14 @@ _COLUMNS = (
 )
 
 
-def write_check_report(result: Check, out: str | Path) -> Path:
-    """Write the report of a check into the folder ``out``, and return the path of the report."""
+def write_check_report(result: Check, out: str | Path, *, between: bool) -> Path:
+    """Write the report of a check into the folder ``out``, and return the path of the report. ``between`` is
+    True if new prints may have been made between reference prints.
+    """
     page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
     page.verdict(result.verdict[0])
     for one in result.figures:
-        page.figure(control_chart(result, one), _chart_text(one))
+        page.figure(control_chart(result, one, between=between), _chart_text(one))
     for sentence in result.verdict[1:]:
         page.paragraph(sentence)
     page.note(*result.notes)
@@ -51,36 +53,39 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     return page.write(out)
 
 
-def control_chart(result: Check, one: FigureCheck) -> Figure:
+def control_chart(result: Check, one: FigureCheck, *, between: bool) -> Figure:
     """Draw one monitored quantity of all prints, relative to the mean of the reference prints. Large dots are
     prints and small dots are scans. One band shows the spread of the reference prints. If there is an alarm,
-    a second band marks the changed prints.
+    another band marks each changed print. A dotted line separates reference and new prints, unless new prints
+    may have been made between reference prints.
     """
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(8.5, 3.4)
     axes = figure.subplots()
     watched = WATCHED[one.name]
-    start = 0
-    for rows, colour, label in (
-        (result.reference_scans, LIGHT["soft"], "reference"),
-        (result.new_scans, LIGHT["accent"], "new"),
+    order = printing_order(result.reference_scans, result.new_scans, between=between)
+    places = np.split(np.argsort(order), [one.reference_prints])
+    for place, rows, colour, label in (
+        (places[0], result.reference_scans, LIGHT["soft"], "reference"),
+        (places[1], result.new_scans, LIGHT["accent"], "new"),
     ):
         prints = print_values(rows, watched)
-        place = np.arange(start, start + len(prints.values))
         of_scans = [(place[prints.names.index(row.print)], _relative(watched.of(row), one)) for row in rows]
         axes.plot(*np.array(of_scans).T, ".", color=colour, alpha=0.6, ms=5)
         axes.plot(place, _relative(prints.values, one), "o", color=colour, label=label)
         if rows is result.new_scans and one.alarm is not None:
-            since = start + prints.names.index(one.alarm.since)
-            axes.axvspan(since - 0.5, place[-1] + 0.5, color="#c23b22", alpha=0.12, label="changed")
-        start = place[-1] + 1
+            changed = place[prints.names.index(one.alarm.since) :]
+            for number, at in enumerate(changed):
+                told = "" if number else "changed"
+                axes.axvspan(at - 0.5, at + 0.5, color="#c23b22", alpha=0.12, lw=0, label=told)
     spread = 100 * one.spread
     axes.axhline(0, color=LIGHT["ink"], lw=0.8)
     axes.axhspan(-spread, spread, color="#9aa7b5", alpha=0.25, label="spread of the reference")
     for sign in (-1, 1):
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
-    axes.axvline(one.reference_prints - 0.5, color=LIGHT["ink"], lw=0.8, ls=":")
+    if not between:
+        axes.axvline(one.reference_prints - 0.5, color=LIGHT["ink"], lw=0.8, ls=":")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="print, in printing order", ylabel="difference from the reference, %")
     axes.set_title(watched.words, fontsize=10)

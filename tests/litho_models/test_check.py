@@ -25,8 +25,10 @@ from litho_models.monitoring.change_point import (
     shares,
     step_statistics,
 )
-from litho_models.monitoring.judging import DEFAULT_RATE, forecast, rates
+from litho_models.monitoring.judging import DEFAULT_RATE, forecast, judge, rates
 from litho_models.monitoring.prints import FIGURES, Check, print_values, spread_of
+from litho_models.monitoring.report import control_chart
+from litho_models.monitoring.wording import notes
 from litho_models.scan_terms import POLICIES
 from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scoring.printer_state import ScanFigures, scan_figures
@@ -190,6 +192,23 @@ def test_prints_of_one_scan_beside_prints_of_four_keep_the_rate(between, within)
         alarms += likeliest_step(Series(parts[0].values, parts[1].values, *variances))[1] <= rate
     # The tolerance of 0.031 is four standard errors. The variances are estimated too.
     assert alarms / draws <= rate + 0.031
+
+
+@pytest.mark.parametrize(("scans", "said"), [(1, "does not account"), (2, "accounts")])
+def test_the_spread_within_prints_is_accounted_for_only_if_it_is_known(scans, said):
+    old, new = _scans(1 + 0.01 * np.arange(6 * scans).reshape(6, scans)), _scans(np.ones((2, 4)), 6)
+    assert (spread_of(old, GAIN).within is None) == (scans == 1)
+    assert any(f"the comparison {said} for this difference" in note for note in notes(old, new, []))
+
+
+def test_the_chart_shows_prints_of_one_store_in_printing_order():
+    rows = _scans(1 + 0.01 * np.arange(8.0)[:, None])
+    for between, places in ((True, [1, 2]), (False, [6, 7])):
+        shown = Check.model_construct(reference_scans=[rows[0], *rows[3:]], new_scans=rows[1:3])
+        one = judge(shown.reference_scans, shown.new_scans, between=between)[0]
+        axes = control_chart(shown, one, between=between).axes[0]
+        new = next(line for line in axes.lines if line.get_label() == "new")
+        assert list(new.get_xdata()) == places
 
 
 def test_a_steady_drift_reaches_the_tolerance_when_it_must():
