@@ -17,6 +17,7 @@ from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.tasks.design import Design
 from litho_design.tasks.task import registered_task
+from litho_models.fitting.runs import TrainingRun
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "gap.md", DOCS / "results" / "gap"
@@ -38,6 +39,7 @@ def write_results(out: Path, plan: Plan, tasks: Sequence[Task]) -> Path:
         "plan": plan.model_dump(mode="json", by_alias=True, exclude={"corrected"}),
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
         **origin(),
+        "training_scans": len(TrainingRun.read(out / "runs" / ARMS[1]).training_ids),
         "models": _models(out),
         "tasks": {
             name: {

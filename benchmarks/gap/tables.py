@@ -40,8 +40,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
         f"Strengths of the fab's effects (10 nm rms each): {knobs}. The models were trained on "
-        f"{effort['scans']} scans of its prints, each {effort['scan_px']} px wide; the networks for "
-        f"{effort['training_steps']:,} steps. "
+        f"{record['training_scans']} of {effort['scans']} scans of its prints, each {effort['scan_px']} px "
+        f"wide; the networks for {effort['training_steps']:,} steps. "
         f"{_precision_text(effort['search_precision'])} In the tables of designs, a cell contains the score "
         "that the design predicted for itself, an arrow, and the score after printing, with ± half its 95 % "
         "interval (Student's t) over seeds.\n\n" + _model_table(record["models"])

@@ -141,6 +141,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     pair = {"judge": "fab", "figure": "si_psnr_db", "arm": "pbl", "against": "none", "mean": 2.0}
     record = {
         "plan": {"effort": Effort().model_dump(), "print_knobs": PRINT_KNOBS},
+        "training_scans": 20,
         "models": {"pbl": {"offset": 20.0, "full": 17.0}},
         "tasks": {
             "hoe": {
@@ -152,6 +153,8 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
         "summary": rows,
     }  # fmt: skip
     text = as_markdown(record)
+    # The locked scans are not used.
+    assert "trained on 20 of 24 scans" in text
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
     # The scores are 6 and 4 dB below the ceiling, so errors are 10^(6/20) and 10^(4/20) times as large.
     assert "| 100 % |" in text
