@@ -116,6 +116,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         )
         for row in record["models"]
     ]
+    clock = "processor" if record["device"] == "CPU" else "wall-clock"
     heads = (
         "model",
         "training on 20 scans",
@@ -128,7 +129,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         rows,
         f"The layouts have {size_px} × {size_px} px. The times were measured in float32 on the "
         f"{record['device']} with {record['threads']} thread{'s' * (record['threads'] > 1)} and torch "
-        f"{record['versions']['torch']}. They are processor times and medians of {REPEATS} runs. The times "
+        f"{record['versions']['torch']}. They are {clock} times and medians of {REPEATS} runs. The times "
         "of training are wall-clock times on a computer that did other work at the same time.",
     )
 
