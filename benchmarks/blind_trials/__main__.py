@@ -19,6 +19,7 @@ from typing import get_args
 
 from benchmarks.blind_trials.campaign import finished, open_campaign, run_campaign, run_one
 from benchmarks.blind_trials.publishing import publish_scoreboard
+from benchmarks.record import options
 from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.sharing.workers import Workers
@@ -78,7 +79,8 @@ def _campaign(arguments: argparse.Namespace) -> None:
         options=options,
     )
     settings = (
-        f"--board {board} --seed {seed} --scans {draws.n_scans} --size-px {draws.size_px} --base {base}"
+        f"--out {out} --board {board} --seed {seed} --scans {draws.n_scans} --size-px {draws.size_px} "
+        f"--base {base}{f' --measured {measured}' * bool(measured)}"
     )
     scoreboard = make_scoreboard(draws, finished(out, draws), f"python -m benchmarks.blind_trials {settings}")
     scoreboard.write(out)
@@ -91,11 +93,8 @@ def _campaign(arguments: argparse.Namespace) -> None:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.blind_trials",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = options(__doc__, "write the results into docs/blind_trials.md")
+    parser.prog = "python -m benchmarks.blind_trials"
     add = parser.add_argument
     add("--out", type=Path, required=True, help="folder of the trials")
     add(
@@ -114,7 +113,6 @@ def _arguments() -> argparse.Namespace:
     add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
     add("--timeout-s", type=float, default=3600.0, help="time limit of a trial in seconds (default 3600)")
     add("--keep-data", action="store_true", help="keep the raw files and stores of the trials")
-    add("--publish", action="store_true", help="write the results into docs/blind_trials.md")
     add("--run-one", type=int, help=argparse.SUPPRESS)
     return parser.parse_args()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from collections import Counter
@@ -15,6 +16,7 @@ import pandas as pd
 import pytest
 from scipy.optimize import curve_fit
 
+from benchmarks.blind_trials import __main__ as trials
 from benchmarks.blind_trials import campaign
 from benchmarks.blind_trials.__main__ import PAGE, RESULTS, main
 from benchmarks.blind_trials.measured import inject, measured_jobs, middle
@@ -670,6 +672,19 @@ def test_measured_prints_that_are_not_given_are_asked_for_before_the_first_trial
         main()
     assert "--measured STORE" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_command_of_a_scoreboard_makes_the_same_scoreboard(tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "run_campaign", lambda *_, **__: None)
+    words = ["trials", "--out", str(tmp_path), "--board", "mixtures", "--measured", "prints.zarr"]
+    boards = []
+    for _ in range(2):
+        monkeypatch.setattr(sys, "argv", words)
+        main()
+        boards.append(Scoreboard.read(tmp_path))
+        words = shlex.split(boards[-1].command)[2:]
+    assert boards[0].command == boards[1].command
+    assert boards[0].pending == boards[1].pending
 
 
 def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
