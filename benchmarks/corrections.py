@@ -17,8 +17,8 @@ interrupted run continues when it is run again.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ import torch
 
 from benchmarks.gap.plan import PRINT_KNOBS, SCAN_KNOBS
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, options, origin, write_record
+from benchmarks.record import conclude, kept, options, origin, place_for
 from litho_data import build_dataset, simulate
 from litho_data.commands.progress import run_script
 from litho_design import Task, correct, load_design
@@ -65,11 +65,9 @@ def main() -> None:
     rows = []
     for seed, models, judge in _printers(given.out, settings):
         for relief in RELIEFS:
-            place = given.out / f"{judge.name}-{seed}" / relief
-            kept = place.with_suffix(".json")
-            if not kept.is_file():
-                write_record(kept, corrected(relief, seed, models, judge, place, settings))
-            rows.append(json.loads(kept.read_text(encoding="utf-8")))
+            place = place_for(given.out / f"{judge.name}-{seed}", relief, size_px=given.size)
+            make = partial(corrected, relief, seed, models, judge, place, settings)
+            rows.append(kept(place.with_suffix(".json"), make))
     record = {
         "schema": "litho-design/benchmark-corrections/1",
         "size_px": given.size,

@@ -10,9 +10,9 @@ the score of the true print. An interrupted run resumes.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, options, origin, write_record
+from benchmarks.record import conclude, kept, options, origin
 from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings, load_design, load_printer
@@ -226,12 +226,10 @@ def main() -> None:
     for number in range(given.count):
         for place, kind in enumerate(KINDS):
             file = given.cache / f"{given.seed}" / f"{kind}-{number}.json"
-            if not file.exists():
-                rng = np.random.default_rng([given.seed, number, place])
-                file.parent.mkdir(parents=True, exist_ok=True)
-                own = loaded[TARGETS[number % len(TARGETS)]]
-                write_record(file, measure(kind, own, rng, printers, file.parent))
-            rows.append(json.loads(file.read_text(encoding="utf-8")))
+            rng = np.random.default_rng([given.seed, number, place])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            own = loaded[TARGETS[number % len(TARGETS)]]
+            rows.append(kept(file, partial(measure, kind, own, rng, printers, file.parent)))
             print(number, rows[-1], flush=True)
     record = {"run": origin(), "seed": given.seed, "rows": rows}
     conclude(record, text_of(record), given.out, PAGE, "coverage", published=given.publish)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, options, origin
+from benchmarks.record import conclude, options, origin, place_for
 from benchmarks.second_machine import PAGE, judged
 from benchmarks.second_machine import RESULT as MACHINE
 from litho_data.commands.progress import run_script
@@ -57,11 +57,12 @@ def main() -> None:
     )
     given = parser.parse_args()
     torch.set_num_threads(1)
-    scan = open_store(given.store).scan(PATTERN)
+    store = open_store(given.store)
+    scan, cache = store.scan(PATTERN), place_for(given.cache, store.name, dataset=store.sha256)
     settings = settings_for(scan)
     film = wanted_film(scan)
-    printers = {name: printer(name, given.store, given.cache, settings) for name in (DESIGNER, *JUDGES)}
-    out = given.cache / "design"
+    printers = {name: printer(name, given.store, cache, settings) for name in (DESIGNER, *JUDGES)}
+    out = cache / "design"
     if not (out / "design.json").is_file():
         correct(film.height_um, printers[DESIGNER], out, settings=settings, robust=False, announce=False)
     layouts = {

@@ -10,17 +10,17 @@ process and a threshold. An interrupted run continues when it is run again.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, options, origin, write_record
+from benchmarks.record import conclude, kept, options, origin
 from benchmarks.second_machine import PAGE
 from benchmarks.second_machine import RESULT as MACHINE
 from litho_data.commands.progress import run_script
@@ -151,11 +151,8 @@ def main() -> None:
         folder = given.cache / f"{process}-{given.seed}"
         for trial in draw(process, given.seed):
             file = folder / f"{trial.number}.json"
-            if trial.number in wanted and not file.exists():
-                file.parent.mkdir(parents=True, exist_ok=True)
-                write_record(file, run(trial, process, given.seed, folder))
-            if file.exists():
-                row = json.loads(file.read_text(encoding="utf-8"))
+            if trial.number in wanted or file.exists():
+                row = kept(file, partial(run, trial, process, given.seed, folder))
                 processes.setdefault(process, []).append(row)
                 print(process, line_of(row), flush=True)
     record = {"run": origin(), "seed": given.seed, "films": COUNT, "size_px": SIZE_PX, "processes": processes}

@@ -8,7 +8,6 @@ All tables on the pages are written from the copied records. A test checks that 
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 from benchmarks.measured_figures import draw_prediction
 from benchmarks.measured_models import benchmark_table, headline_table, in_one, noise_table
-from benchmarks.record import publish
+from benchmarks.record import options, publish
 from examples.demo import PAPER_SEEDS
 from litho_data.commands.progress import run_script
 
@@ -70,9 +69,7 @@ def _found(folder: Path, file: str) -> dict[str, Any]:
 
 def main() -> None:
     """Copy the records, draw the figure, and write the tables into the pages."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument(
         "runs", type=Path, help="folder that `make demo DATASET=neural-lithography` has written"
     )

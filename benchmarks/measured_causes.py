@@ -6,7 +6,6 @@ python -m benchmarks.measured_causes runs/causes
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.record import publish
+from benchmarks.record import options, publish
 from litho_data.commands.progress import run_script
 from litho_data.reports.pictures import new_figure
 from litho_models.effects.laws import TABLES
@@ -148,9 +147,7 @@ def picture(result: CloseLoop) -> Figure:
 
 def main() -> None:
     """Copy the record, draw the picture, and write the tables into the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("run", type=Path, help="folder that `litho-models close-loop` has written")
     run = parser.parse_args().run
     FOLDER.mkdir(parents=True, exist_ok=True)

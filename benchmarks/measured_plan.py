@@ -11,12 +11,11 @@ written anew.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from pathlib import Path
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import publish
+from benchmarks.record import options, publish
 from litho_data.commands.progress import run_script
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_data.readers.layout import read_layout
@@ -30,9 +29,7 @@ _LEFT_OUT = ("report.html", "*.csv")
 
 def main() -> None:
     """Copy the plan, draw its layouts, and write the tables into the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument(
         "plan", type=Path, help="folder of the plan that was made from the closed loop on the measured prints"
     )

@@ -47,7 +47,7 @@ FOLDS, FIRST_SEED = 5, 7000
 
 def main() -> None:
     """Run the loop on the stores that have no result yet, write the record, and print the result."""
-    parser = options(__doc__, "write the result into docs/closing_the_loop.md")
+    parser = options(__doc__, "write the result into docs/closing_the_loop.md", RESULT)
     parser.add_argument("--stores", type=int, default=40, help="number of stores")
     parser.add_argument("--workers", type=int, default=2, help="number of local processes")
     parser.add_argument(
@@ -59,10 +59,8 @@ def main() -> None:
         default=Path("runs/null-calibration"),
         help="folder with a result file for each store",
     )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    arguments.cache.mkdir(parents=True, exist_ok=True)
     if arguments.one is not None:
         write_record(_file(arguments.cache, arguments.one), calibrate_one(arguments.one))
         return

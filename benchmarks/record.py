@@ -5,21 +5,22 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from litho_data.commands.progress import command_line
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.run_facts import run_facts
 
 NOT_MEASURED = "Not measured yet."
 
 
-def options(doc: str | None, publishing: str, out: Path | None = None) -> argparse.ArgumentParser:
-    """Return a parser of options for a benchmark. It has the option ``--publish``, and ``--out`` if ``out``
-    is given.
+def options(doc: str | None, publishing: str = "", out: Path | None = None) -> argparse.ArgumentParser:
+    """Return a parser of options for a benchmark. It has the option ``--publish`` if ``publishing`` is given,
+    and ``--out`` if ``out`` is given.
 
     Args:
         doc: description of the benchmark.
@@ -29,7 +30,8 @@ def options(doc: str | None, publishing: str, out: Path | None = None) -> argpar
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if out is not None:
         parser.add_argument("--out", type=Path, default=out, help="JSON file to write")
-    parser.add_argument("--publish", action="store_true", help=publishing)
+    if publishing:
+        parser.add_argument("--publish", action="store_true", help=publishing)
     return parser
 
 
@@ -47,6 +49,20 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
     """Write the record of a result as JSON."""
     with atomic_file(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def place_for(folder: Path, name: str, **made_of: Any) -> Path:
+    """Return the place in a folder at which a result is kept. Its name contains a hash of ``made_of``, the
+    options and data on which the result depends, so a result that was made of others is not used.
+    """
+    return folder / f"{name}-{record_sha256(made_of)[:12]}"
+
+
+def kept(file: Path, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the record in a file. If the file does not exist, the record is made and written first."""
+    if not file.exists():
+        write_record(file, make())
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
 def conclude(

@@ -11,16 +11,17 @@ a threshold. An interrupted run continues when it is run again.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.record import conclude, options, origin, write_record
+from benchmarks.record import conclude, kept, options, origin, place_for
 from litho_data.commands.progress import progress, run_script
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.reports.pictures import new_figure
 from litho_data.store import PrintedScan, Store, open_store
@@ -78,15 +79,18 @@ def main() -> None:
     arguments = parser.parse_args()
     store = open_store(arguments.store)
     folds = [fold for fold in plan_folds(store.scans(), store.locked_ids, "grouped") if not fold.locked]
-    bench = Bench(folds, arguments.cache)
+    cache = place_for(arguments.cache, store.name, dataset=store.sha256)
+    bench = Bench(folds, cache)
     learned = [name for name in LEARNED if name in arguments.learned.split(",")]
     tables = {name: bench.rows(name) for name in (*BASELINES, BASE, WHOLE, *learned)}
-    folder = arguments.loop or arguments.cache / "loop"
+    folder = arguments.loop or cache / "loop"
     loop = (
         CloseLoop.read(folder)
         if (folder / CloseLoop.FILE_NAME).exists()
         else close_loop(arguments.store, folder, base="e-beam", base_settings=BARE, report=print)
     )
+    if loop.dataset != store.dataset_id:
+        raise InputError(f"loop in {folder}", got=loop.dataset, wanted=store.dataset_id)
     record = {
         "run": origin(),
         "dataset": store.dataset_id.model_dump(),
@@ -107,7 +111,6 @@ class Bench:
 
     def __init__(self, folds: Sequence[Fold], cache: Path):
         self.folds, self._cache = folds, cache
-        cache.mkdir(parents=True, exist_ok=True)
 
     def rows(self, name: str) -> list[Row]:
         """Return the scores of a model on every pattern, each from the fit that did not use the pattern."""
@@ -123,10 +126,8 @@ class Bench:
         fold.
         """
         file = self._cache / f"{name.replace(' ', '-')}-{fold.number}.json"
-        if not file.exists():
-            bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
-            write_record(file, fit_and_judge(name, fold, bare))
-        return json.loads(file.read_text(encoding="utf-8"))
+        bare = self.fit(BASE, fold)["values"] if name == WHOLE else {}
+        return kept(file, partial(fit_and_judge, name, fold, bare))
 
 
 def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str, Any]:

@@ -16,9 +16,8 @@ a result file and a table of its own. An interrupted run continues when it is ru
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -27,9 +26,8 @@ import torch
 from scipy.stats import binomtest
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin, write_record
+from benchmarks.record import conclude, kept, options, origin, place_for
 from litho_data.commands.progress import run_script
-from litho_data.foundation.errors import InputError
 from litho_data.making.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
@@ -69,9 +67,7 @@ ARMS: tuple[Arm, ...] = get_args(Arm)
 
 def main() -> None:
     """Run the trials that have no result yet, write the record of all trials, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write the table into docs/next_print.md")
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
     parser.add_argument("--seed", type=int, default=20271, help="seed of all random draws")
@@ -89,23 +85,13 @@ def main() -> None:
         "--arms", nargs="+", choices=ARMS, default=ARMS, help="kinds of layouts printed in the second round"
     )
     parser.add_argument("--size", type=int, default=192, help="side of each layout in pixels")
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/next_print.md")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
     for draw in draws(arguments.trials, arguments.seed, arguments.knobs, arguments.rms_nm):
-        folder = arguments.out / f"{draw['number']:02d}"
-        kept = folder / "trial.json"
-        if not kept.is_file():
-            write_record(kept, run_trial(draw, folder, arguments.size, arguments.arms, print))
-        trials.append(json.loads(kept.read_text(encoding="utf-8")))
-        if not draw.items() <= trials[-1].items():
-            raise InputError(
-                f"trial {draw['number']} in {arguments.out}",
-                got=f"{trials[-1]['knob']}, seed {trials[-1]['seed']}",
-                wanted=f"{draw['knob']}, seed {draw['seed']}",
-                hint="give another --out",
-            )
+        size, arms = arguments.size, arguments.arms
+        folder = place_for(arguments.out, f"{draw['number']:02d}", draw=draw, size_px=size, arms=arms)
+        trials.append(kept(folder / "trial.json", partial(run_trial, draw, folder, size, arms, print)))
         print(line_of(trials[-1]), flush=True)
     record = {**origin(), "seed": arguments.seed, "size_px": arguments.size, "trials": trials}
     out = (RESULTS if arguments.publish else arguments.out) / f"{arguments.seed}.json"

@@ -15,11 +15,10 @@ The texts on the page are written from the copied records. A test checks that th
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.record import publish
+from benchmarks.record import options, publish
 from litho_data.commands.progress import run_script
 from litho_data.virtual_fab.settings import Noise
 from litho_models.noise import NoiseAnalysis
@@ -90,9 +89,7 @@ def planted_text(found: NoiseAnalysis) -> str:
 
 def main() -> None:
     """Copy the records, and write the texts into the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     for name in (DOSES, REFERENCES):
         parser.add_argument(name, type=Path, help="folder with a result of litho-models noise")
     given = vars(parser.parse_args())

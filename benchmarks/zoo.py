@@ -11,12 +11,12 @@ each of them to fewer scans.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measured import FOLDER, ROOT, in_table
+from benchmarks.record import options
 from litho_data import build_dataset
 from litho_data.commands.progress import run_script
 from litho_data.foundation.errors import InputError
@@ -64,8 +64,8 @@ def make_zoo(
         models: names of the models to make; by default, all models of the table.
 
     Raises:
-        InputError: the table belongs to another dataset or split, a model was trained with other settings
-            than in the table, or the zoo is too large.
+        InputError: the table belongs to another dataset or split, a model was trained on other data or with
+            other settings than in the table, or the zoo is too large.
     """
     dataset = open_store(store)
     if (table.dataset.sha256, table.split.kind) != (dataset.sha256, "grouped"):
@@ -80,7 +80,8 @@ def make_zoo(
     for name in models or scores:
         run, folder = Path(runs) / name, Path(root) / name
         trained = TrainingRun.read(run) if (run / TrainingRun.FILE_NAME).exists() else train(store, name, run)
-        _require_settings(name, trained.config.model_dump(mode="json"), table.training[name])
+        settings = trained.config.model_dump(mode="json") | {"dataset": trained.dataset.sha256}
+        _require_settings(name, settings, table.training[name] | {"dataset": dataset.sha256})
         card = freeze(run, folder, WHOLE.get(name))
         protocol, own = _scored(folder, scans)
         described: dict[str, Any] = {
@@ -140,7 +141,7 @@ def _scored(folder: Path, scans: Sequence[PrintedScan]) -> tuple[NuisanceProtoco
 
 
 def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Check that a model was trained with the settings in the table.
+    """Check that a model was trained on the data and with the settings of the table.
 
     Raises:
         InputError: a setting differs.
@@ -153,9 +154,7 @@ def _require_settings(name: str, trained: Mapping[str, Any], wanted: Mapping[str
 
 def main() -> None:
     """Build the store if it does not exist, make the models, and print their errors."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("runs", type=Path, help="folder of the store and of the training runs")
     parser.add_argument(
         "--models", help="names of the models, separated by commas; by default, all models of the table"

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from benchmarks import film_design, film_trials
+from benchmarks import film_design, film_trials, second_machine
 from benchmarks.record import NOT_MEASURED, published
 from benchmarks.second_machine import BASE, PAGE, RESULT, WHOLE, compared, judged, made, started, text_of
+from litho_data.foundation.errors import InputError
+from litho_data.store.schema import DatasetId
 from litho_models.models.printers import Printer
+from litho_models.splits.folds import Fold
 from tests.litho_models.prints import make_scan
 
 GEOMETRY: dict[str, Any] = {"pitch_um": 0.004, "levels": 17, "level_height_um": 0.01375}
@@ -57,6 +62,55 @@ def test_the_error_of_a_print_is_the_displacement_of_its_edges() -> None:
     assert judged(film, 0 * film.height_um)["missing"] == 1
     layout = film_design.settings_for(scan, 64).layout
     assert (layout.pitch_um, layout.cell_um, layout.levels) == (scan.pitch_um, scan.pitch_um, scan.levels)
+
+
+def store_of(sha256: str) -> SimpleNamespace:
+    dataset = DatasetId(name="made", sha256=sha256)
+    scan = make_scan(0, 64)
+    return SimpleNamespace(
+        name="made", sha256=sha256, dataset_id=dataset, locked_ids=[], scans=list, scan=lambda _: scan
+    )
+
+
+def test_results_of_another_store_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def loop(store: Path, *_: Any, **__: Any) -> SimpleNamespace:
+        return SimpleNamespace(dataset=store_of(store.name).dataset_id)
+
+    def fit(*_: Any) -> dict[str, Any]:
+        return {"values": {}, "rows": [{"scan": sys.argv[1]}]}
+
+    empty = {"text_of": lambda _: "", "summary": lambda *_: {}, "of_loop": lambda *_: {}}
+    own = {"open_store": lambda path: store_of(path.name), "close_loop": loop, "fit_and_judge": fit}
+    for name, function in {**empty, **own, "plan_folds": lambda *_: [Fold(0, [], [])]}.items():
+        monkeypatch.setattr(second_machine, name, function)
+    for name in ("a", "b"):
+        out = tmp_path / f"{name}.json"
+        words = [name, "--out", str(out), "--cache", str(tmp_path / "cache")]
+        monkeypatch.setattr(sys, "argv", ["second_machine", *words])
+        second_machine.main()
+        assert json.loads(out.read_text())["rows"][BASE] == [{"scan": name}]
+    monkeypatch.setattr(second_machine, "close_loop", lambda *_, **__: loop(Path("a")))
+    with pytest.raises(InputError, match="loop in"):
+        second_machine.main()
+
+
+def test_films_are_corrected_with_models_of_their_own_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = []
+
+    def printer(name: str, _store: Path, cache: Path, _settings: Any) -> None:
+        places.append(cache / name)
+        raise InputError("no training in this test")
+
+    monkeypatch.setattr(film_design, "printer", printer)
+    monkeypatch.setattr(film_design, "wanted_film", lambda scan: scan)
+    monkeypatch.setattr(film_design, "open_store", lambda path: store_of(path.name))
+    for name in ("a", "b"):
+        monkeypatch.setattr(sys, "argv", ["film_design", name, "--cache", str(tmp_path)])
+        with pytest.raises(InputError, match="no training"):
+            film_design.main()
+    assert len(set(places)) == 2
 
 
 @pytest.mark.parametrize(

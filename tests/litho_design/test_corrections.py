@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from benchmarks import corrections
 from benchmarks.corrections import ALLOWED, RELIEFS, as_markdown, corrected, holds, over_idle, wanted_um
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import own_error_um
@@ -111,6 +114,21 @@ def test_a_relief_is_corrected_for_the_expected_error_over_its_models():
     assert float(together.objective(level)[0]) == pytest.approx(
         math.sqrt(np.mean(np.square(alone))), rel=1e-5
     )
+
+
+def test_a_correction_of_another_size_is_not_used(tmp_path, monkeypatch):
+    def sized(relief, seed, _models, judge, _place, settings):
+        errors = dict.fromkeys(corrections.COLUMNS, settings.layout.size_px)
+        judged = {"relief": relief, "seed": seed, "judge": judge.name, "between_nm": [0, 999]}
+        return judged | {"printed_nm": errors}
+
+    monkeypatch.setattr(corrections, "corrected", sized)
+    monkeypatch.setattr(corrections, "_printers", lambda *_: [(5, [], SimpleNamespace(name="fab"))])
+    for size in (64, 128):
+        monkeypatch.setattr("sys.argv", ["corrections", "--out", str(tmp_path), "--size", str(size)])
+        corrections.main()
+        record = json.loads((tmp_path / "corrections.json").read_text())
+        assert {row["printed_nm"]["corrected"] for row in record["rows"]} == {record["size_px"]} == {size}
 
 
 def test_the_table_says_which_corrections_are_worse(rows):

@@ -959,6 +959,22 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         assert told["wrong"] is wrong
 
 
+def test_a_trial_of_another_size_or_with_other_layouts_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(draw: dict[str, Any], _folder: Path, *made_with: Any) -> dict[str, Any]:
+        size_px, arms, _ = made_with
+        return {**draw, "size_px": size_px, "answers": {arm: [] for arm in arms}}
+
+    monkeypatch.setattr(two_rounds, "run_trial", run)
+    for size, arms in ((96, ["optimised"]), (96, ["optimised", "random"]), (192, ["optimised", "random"])):
+        words = ["--out", str(tmp_path), "--trials", "2", "--size", str(size), "--arms", *arms]
+        monkeypatch.setattr("sys.argv", ["two_rounds", *words])
+        two_rounds.main()
+        trials = json.loads((tmp_path / "20271.json").read_text())["trials"]
+        assert [(one["size_px"], [*one["answers"]]) for one in trials] == [(size, arms)] * 2
+
+
 def test_the_page_quotes_a_board_of_two_rounds() -> None:
     board = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))
     assert published(two_rounds.PAGE, "two-rounds-20273") == two_rounds.summary(board["trials"])

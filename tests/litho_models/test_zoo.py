@@ -19,6 +19,7 @@ from litho_data.store import open_store
 from litho_models import load_frozen, save_frozen
 from litho_models.cli.app import app
 from litho_models.evaluation.results import Benchmark
+from litho_models.fitting.runs import TrainingRun
 from litho_models.frozen import zoo
 from litho_models.frozen.card import OUT_OF_FOLD, TRAINED_ON, ModelCard
 from litho_models.frozen.on_store import predict_frozen
@@ -222,6 +223,15 @@ def test_a_model_of_other_settings_than_the_tables_is_refused(made, store):
     other = scored.model_copy(update={"training": {"affine": {**scored.training["affine"], "seed": 7}}})
     with pytest.raises(InputError, match="seed of affine, got 0, wanted 7"):
         make_zoo(store, folder / "runs", other, folder / "other", models=["affine"])
+
+
+def test_a_model_of_another_store_than_the_tables_is_refused(made, store, tmp_path):
+    scored, folder, _ = made
+    run = TrainingRun.read(folder / "runs" / "affine")
+    other = run.dataset.model_copy(update={"sha256": "other"})
+    run.model_copy(update={"dataset": other}).write(tmp_path / "affine")
+    with pytest.raises(InputError, match="dataset of affine, got other"):
+        make_zoo(store, tmp_path, scored, tmp_path / "zoo", models=["affine"])
 
 
 def test_the_command_in_the_card_makes_the_same_weights(made, store, tmp_path):
