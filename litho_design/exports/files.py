@@ -86,7 +86,8 @@ def export(
     Args:
         design: a design (its folder, or the result of ``load_design``), an ``Element``, an array of shape
             (ny, nx), or a file NAME.npy with such an array. Arrays of integers are levels. Arrays of floats
-            are heights in µm, which are rounded to the nearest level.
+            are heights in µm, which are rounded to the nearest level. Floats that are all whole numbers are
+            refused, because they could be either.
         format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; it may already hold exports of the same layout in other formats.
         pitch_um, level_height_um: side of a pixel and height of a level, used only for arrays. Designs and
@@ -207,6 +208,14 @@ def _levels(array: Any, level_height_um: float) -> np.ndarray:
         got = f"{array.dtype} of shape {array.shape}"
         raise InputError("array to export", got=got, wanted="a map of finite levels or heights in µm")
     levels = np.rint(array / level_height_um) if array.dtype.kind == "f" else array
+    if (levels != array).any() and (array == np.rint(array)).all():
+        raise InputError(
+            "array to export",
+            got=f"{array.dtype} with whole numbers from {array.min():g} to {array.max():g}",
+            wanted="integers for levels, or heights in µm that are not all whole numbers",
+            hint="make levels integers with astype(int); divide heights by the level height and round them "
+            "to integer levels",
+        )
     if levels.min() < 0 or levels.max() > 255:
         got = f"levels from {levels.min():g} to {levels.max():g}"
         raise InputError(

@@ -531,6 +531,20 @@ def test_bare_levels_heights_and_elements_are_exported(tmp_path, kind):
         export_design(object(), kind, tmp_path / "bad")
 
 
+def test_floats_that_could_be_levels_or_heights_are_refused(tmp_path):
+    """Check that no array is exported ten times too high. An array that means the same as levels and as
+    heights is accepted.
+    """
+    levels = LETTER * 12
+    np.save(tmp_path / "levels.npy", levels.astype(float))
+    for given in (levels.astype(np.float32), tmp_path / "levels.npy"):
+        with pytest.raises(InputError, match=r"whole numbers from 0 to 12, wanted integers for levels"):
+            export_design(given, "png16", tmp_path / "refused")
+    for given, step_um in ((levels * 0.0, 0.1), (levels * 1.0, 1.0)):
+        file = export_design(given, "png16", tmp_path / f"{step_um}", level_height_um=step_um)
+        assert np.array_equal(import_levels(file)[0], given)
+
+
 def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
     """Check a quadratic dose curve: height = (grey / 100)^2 / 4 + 0.5 µm."""
     grey = np.arange(0, 256, 5)
