@@ -45,8 +45,8 @@ class FabSimulator(nn.Module):
     """
 
     name = "fab"
-    # The reach is 0, so that the printer adds no guard ring; the print job itself adds a frame of level 0.
-    reach_um = 0.0
+    # The printer adds no guard ring, because the print job itself adds a frame of level 0.
+    guard_um = 0.0
 
     def __init__(self, truth: Truth):
         super().__init__()

@@ -18,8 +18,6 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_design.printers.fab import FabSimulator
 from litho_design.printers.layout import LayoutSettings
 
-_GUARD_UM = 6.4
-
 Precision = Literal["float32", "bfloat16"]
 
 
@@ -248,7 +246,7 @@ class Printer(nn.Module):
         return printed
 
 
-def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
+def _borders_px(simulator: Any, pitch_um: float) -> tuple[int, int, int]:
     """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
     strip.
 
@@ -256,9 +254,8 @@ def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
     narrower halo: its two rows lie where the model blends two rows of tiles, and the mean of two tiles has a
     smaller error there than a single tile.
     """
-    reach_um = getattr(simulator, "reach_um", None)
-    # The reach is a whole number of pixels times the pitch, up to rounding.
-    guard = math.ceil((_GUARD_UM if reach_um is None else float(reach_um)) / pitch_um - 1e-6)
+    # The guard ring is a whole number of pixels wide, up to rounding.
+    guard = math.ceil(simulator.guard_um / pitch_um - 1e-6)
     tile = getattr(simulator, "tile", None)
     if tile is None:
         return guard, guard, guard

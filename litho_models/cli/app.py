@@ -233,14 +233,17 @@ def predict(
 ) -> None:
     """Predict the printed height of a layout. The layout must be sampled at the pitch of the model.
 
+    An exported element is surrounded by level 0. Any other layout is continued by its outermost levels.
+
     Example: litho-models predict zoo:pbl layout.png --out height.gsf
     """
     from litho_models.frozen.on_store import predict_file
 
     frozen = litho_models.load_frozen(model, extrapolate=extrapolate)
-    height = predict_file(frozen, layout, out)
-    lowest, highest = height.min(), height.max()
-    typer.echo(f"{height.shape[0]} x {height.shape[1]} px, {lowest:.3f} to {highest:.3f} µm high: {out}")
+    height, surround = predict_file(frozen, layout, out)
+    rows, columns = height.shape
+    typer.echo(f"layout of {rows} x {columns} px, {surround}")
+    typer.echo(f"print {height.min():.3f} to {height.max():.3f} µm high: {out}")
 
 
 @app.command()

@@ -2,10 +2,12 @@
 trained.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from litho_data.level.scan import write_heights
 from litho_data.readers.exported import export_of
@@ -15,9 +17,12 @@ from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scan_terms.background import Background
 
 
-def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) -> np.ndarray:
+def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) -> tuple[np.ndarray, str]:
     """Predict the print of a layout file, and write its height to ``out``. Return the height in µm, as an
-    array of shape (ny, nx).
+    array of shape (ny, nx), and a phrase that says what was assumed beyond the edge of the layout.
+
+    A file that ``litho-design`` exported contains an element that stands alone on the substrate, as in the
+    design, so level 0 surrounds it. Every other layout is continued by its outermost levels.
 
     Args:
         layout: TIFF, PNG, BMP or NPY file, sampled at the pitch of the model. The file contains the level
@@ -32,11 +37,14 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """
     pitch_um = model.pitch_um
     levels = read_layout(layout, levels=model.card["levels"])
-    says = {"pitch_um": pitch_um, "level_height_um": model.card["level_height_um"], **export_of(Path(layout))}
+    exported = export_of(Path(layout))
+    says = {"pitch_um": pitch_um, "level_height_um": model.card["level_height_um"], **exported}
     model.check_geometry(says["pitch_um"], says["level_height_um"])
-    height = model.predict(levels * np.float32(says["level_height_um"]))
+    around_px = math.ceil(model.guard_um / pitch_um - 1e-6) if exported else 0
+    nominal_um = np.pad(levels.astype(np.float32) * np.float32(says["level_height_um"]), around_px)
+    height = model.inside(torch.from_numpy(nominal_um)[None, None], around_px)[0, 0].numpy()
     write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")
-    return height
+    return height, "surrounded by level 0" if exported else "continued by its outermost levels"
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:

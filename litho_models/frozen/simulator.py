@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 # The next level would exceed the range by a whole level height (100 nm in the first prints), which is far
 # more than this tolerance.
 _ROUNDING_UM = 1e-5
+# Width of the border of level 0 around an element, for a model whose prints depend on the whole layout.
+_WIDEST_GUARD_UM = 6.4
 
 
 Field = TypeVar("Field", np.ndarray, "xr.DataArray", Tensor)
@@ -62,6 +64,13 @@ class FrozenSimulator(nn.Module):
     def pitch_um(self) -> float:
         """Return the pixel pitch for which the model was made, µm."""
         return self.card["pitch_um"]
+
+    @property
+    def guard_um(self) -> float:
+        """Return the width, µm, of the border of level 0 that an element that stands alone on the substrate
+        needs, because a model assumes that a layout continues beyond its edge.
+        """
+        return _WIDEST_GUARD_UM if self.reach_um is None else self.reach_um
 
     @property
     def tile(self) -> Tile | None:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import torch
 from PIL import Image
 
 from litho_data.foundation.errors import InputError
@@ -27,6 +28,7 @@ from litho_design.exports.sidecar import sidecar_path
 from litho_design.exports.stl import write_stl
 from litho_design.images.targets import load_target
 from litho_design.printers.layout import LayoutSettings
+from litho_design.printers.source import load_printer
 from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram
@@ -69,27 +71,33 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
 
 
 def test_every_export_can_be_read_as_a_layout_for_a_model(tmp_path):
-    """Check that a model predicts an exported design by means of its sidecar file, and that it refuses a
-    design with another pitch or level height.
+    """Check that a model predicts an exported element as a design does, i.e. alone on the substrate, and that
+    it refuses an element with another pitch or level height.
     """
     from litho_models.frozen.files import load_frozen
     from litho_models.frozen.on_store import predict_file
 
     model = load_frozen("zoo:physics")
     levels = np.kron(LETTER * 12, np.ones((4, 4), np.uint8))
-    wanted = predict_file(model, _saved(tmp_path / "levels.npy", levels), tmp_path / "print.npy")
+    printer = load_printer("zoo:physics", LayoutSettings())
+    wanted = printer(torch.from_numpy(levels)[None, None].float())[0, 0].numpy()
     for kind in FORMATS:
         file = export_design(levels, kind, tmp_path / kind)
-        assert np.array_equal(predict_file(model, file, tmp_path / f"{kind}.gsf"), wanted)
+        height, surround = predict_file(model, file, tmp_path / f"{kind}.gsf")
+        np.testing.assert_allclose(height, wanted, rtol=0, atol=1e-6)
+        assert surround == "surrounded by level 0"
+    # Without a sidecar, the layout continues, so a uniform layout has no edge. An exported one has.
+    flat = np.full((40, 40), 12, np.uint8)
+    np.save(tmp_path / "flat.npy", flat)
+    height, surround = predict_file(model, tmp_path / "flat.npy", tmp_path / "print.npy")
+    assert np.ptp(height) < 1e-5
+    assert surround == "continued by its outermost levels"
+    alone = predict_file(model, export_design(flat, "gds", tmp_path / "flat"), tmp_path / "print.npy")[0]
+    assert np.ptp(alone) > 0.1
     for name in ("pitch_um", "level_height_um"):
         file = export_design(levels, "gds", tmp_path / name, **{name: 0.05})
         with pytest.raises(InputError, match=name):
             predict_file(model, file, tmp_path / "x.npy")
-
-
-def _saved(path, array):
-    np.save(path, array)
-    return path
 
 
 @pytest.mark.parametrize(("suffix", "step"), [(".png", 65535 // 12), (".bmp", 255 // 12)])
