@@ -73,7 +73,8 @@ def main() -> None:
     scope, judge = Microscope(words.size_px, words.depth_um), litho_design.Element(words.model, layout)
     for name, iterations in (("none", 0), ("none", words.iterations), (words.model, words.iterations)):
         element = litho_design.Element(name, layout)
-        ramp = np.linspace(0, 1, words.size_px)[:, None].repeat(words.size_px, axis=1)
+        ramp = np.linspace(0, 1, words.size_px).reshape(-1, element.layout.cell_px).mean(1)
+        ramp = ramp.repeat(element.layout.cell_px)[:, None].repeat(words.size_px, axis=1)
         element.start_from_levels(4 + 4 * ramp if iterations else 0 * ramp)
         optimiser = torch.optim.Adam(element.free.parameters(), lr=0.2)
         for _ in range(iterations):

@@ -150,10 +150,26 @@ class Element(nn.Module):
     def start_from_levels(self, levels: np.ndarray) -> None:
         """Set the free levels to the values in ``levels``, an array of shape (size, size). The values need
         not be integers.
+
+        Raises:
+            InputError: a level is beyond the range of the layout, or levels differ within a cell or ring.
         """
         pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
         self._check_map("levels", pixels)
-        self.free.start_from(self.free.cells.average(pixels))
+        highest, what = self.layout.levels - 1, "levels of an element"
+        if not ((pixels >= 0) & (pixels <= highest)).all():
+            raise InputError(what, got=f"{pixels.min():g} to {pixels.max():g}", wanted=f"0 to {highest}")
+        values = self.free.cells.average(pixels)
+        # Means of real levels are rounded to float32.
+        if (self.free.cells(values) - pixels).abs().max() > 1e-3:
+            cell = "ring" if self.free.cells.radial else "cell"
+            raise InputError(
+                what,
+                got=f"levels that differ within a {cell}",
+                wanted=f"one level per {cell} of {self.layout.cell_um:g} µm",
+                hint=f"average them over each {cell}, or give the element another cell_um",
+            )
+        self.free.start_from(values)
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
         """Set the free levels to those whose print comes closest to a target phase, apart from a constant

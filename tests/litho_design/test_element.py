@@ -109,6 +109,25 @@ def test_an_element_starts_from_a_layout_or_a_phase(element):
     assert len(np.unique(element.levels())) == 1
 
 
+def test_levels_that_the_layout_does_not_have_are_refused(element):
+    """Check that a start never changes the levels that it is given, also for rings."""
+    before = element.levels()
+    for level, said in ((13, "got 13 to 13"), (-1, "got -1 to -1"), (math.nan, "wanted 0 to 12")):
+        with pytest.raises(InputError, match=said):
+            element.start_from_levels(np.full((40, 40), level))
+    with pytest.raises(InputError, match=r"differ within a cell, wanted one level per cell of 0\.2 µm"):
+        element.start_from_levels(np.arange(1600).reshape(40, 40) % 13)
+    assert np.array_equal(element.levels(), before)
+    element.start_from_levels(np.full((40, 40), 3.6))
+    assert (element.levels() == 4).all()
+    rings = Element("none", {"size_px": 40, "cell_um": 0.3, "symmetry": "radial"}, seed=2)
+    levels = rings.levels()
+    rings.start_from_levels(levels)
+    assert np.array_equal(rings.levels(), levels)
+    with pytest.raises(InputError, match="within a ring"):
+        rings.start_from_levels(before)
+
+
 def test_two_sources_of_a_resin_agree():
     """Check that Cauchy (2017) and Sellmeier (2019) differ by a constant 0.004 in the visible range."""
     um = np.linspace(0.45, 1.0, 24)
