@@ -17,7 +17,13 @@ from litho_data.foundation.errors import InputError
 from litho_design.elements.transforms import printed_anyhow
 from litho_design.optics import Optics
 from litho_design.optics.materials import Resin, refractive_index
-from litho_design.optics.thin_element import LONGEST_UM, SHORTEST_UM, ElementKind, through_relief
+from litho_design.optics.thin_element import (
+    LONGEST_UM,
+    SHORTEST_UM,
+    ElementKind,
+    known_height,
+    through_relief,
+)
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
 from litho_design.printers.layout import LayoutSettings
@@ -87,7 +93,9 @@ class Element(nn.Module):
         self.free.start_random(seed)
         self.whole = True
 
-    def forward(self, field: Tensor, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
+    def forward(
+        self, field: Tensor, wavelength_um: float, height_um: Tensor | np.ndarray | None = None
+    ) -> Tensor:
         """Return the wave behind the element when ``field`` illuminates it, a complex tensor of shape
         (..., size, size).
 
@@ -96,29 +104,38 @@ class Element(nn.Module):
             wavelength_um: wavelength in vacuum.
             height_um: heights of a known print, for example measured heights, in µm, shape (size, size). They
                 replace the heights that the model predicts for the levels.
+
+        Raises:
+            InputError: field or heights do not have the shape of the element, a height is missing, or the
+                wavelength is not one that the element can have.
         """
-        height = self.height_um() if height_um is None else height_um
         self._check_map("field", field)
         if self.kind == "thin":
-            return field * self.transmission(wavelength_um, height)
-        self._check_map("height", height)
+            return field * self.transmission(wavelength_um, height_um)
+        height = self._height_um(height_um)
         kept = (-0.5 * self.absorption_per_um * height).exp()
         return through_relief(field * kept, height, self.layout.pitch_um, self.optics(wavelength_um))
 
-    def transmission(self, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
+    def transmission(self, wavelength_um: float, height_um: Tensor | np.ndarray | None = None) -> Tensor:
         """Return the complex transmission of the thin element, shape (size, size).
 
         The transmission is exp(2 pi j (n - n0) h / wavelength - a h / 2), where n and n0 are the refractive
         indices of the resin and its surroundings, h is the height, and a is the absorption coefficient.
         """
-        height = self.height_um() if height_um is None else height_um
-        self._check_map("height", height)
+        height = self._height_um(height_um)
         phase = height * (2 * math.pi / self.optics(wavelength_um).wave_height_um)
         return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
 
     def height_um(self) -> Tensor:
         """Return the printed height, µm, shape (size, size). Gradients flow to the free levels."""
         return printed_anyhow(self._print, self.free.sample(hard=self.whole))[0, 0]
+
+    def _height_um(self, known_um: Tensor | np.ndarray | None) -> Tensor:
+        if known_um is None:
+            return self.height_um()
+        height = known_height(known_um, self.free.height)
+        self._check_map("height", height)
+        return height
 
     def _print(self, level: Tensor) -> Tensor:
         if self.tile_px is None or self.layout.size_px <= self.tile_px:

@@ -17,7 +17,7 @@ from litho_design.large.bands import BAND_PX, Bands
 from litho_design.large.hologram import BandedHologram
 from litho_design.large.lens import RingLens
 from litho_design.lenses.task import LensTask
-from litho_design.optics.thin_element import ElementKind
+from litho_design.optics.thin_element import ElementKind, known_height
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import check_device
 from litho_design.reliefs.task import UNPRINTABLE_FILE
@@ -118,13 +118,13 @@ class LoadedDesign:
         return self.task.printed_um(self.level, judge)
 
     @torch.no_grad()
-    def image(self, height_um: Tensor) -> np.ndarray:
+    def image(self, height_um: Tensor | np.ndarray) -> np.ndarray:
         """Return the image or PSF behind a print. Each pixel gives its share of the incident power."""
-        return self.bench(height_um).cpu().numpy()
+        return self.bench(known_height(height_um, self.expected_um)).cpu().numpy()
 
-    def score(self, height_um: Tensor) -> Record:
+    def score(self, height_um: Tensor | np.ndarray) -> Record:
         """Return the score of a print, given as heights in µm of shape (size, size)."""
-        return self.task.score(height_um, self.expected_um)
+        return self.task.score(known_height(height_um, self.expected_um), self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
         """Return an image scaled to match its target, for reports. A PSF is divided by its peak, and the

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Literal
 
 from litho_data.commands.settings import setting
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_design.optics.materials import Resin, refractive_index
 
@@ -18,6 +19,7 @@ SHORTEST_UM, LONGEST_UM = 0.05, 100.0
 _BORDER_UM = 2.0
 
 if TYPE_CHECKING:
+    import numpy as np
     from torch import Tensor
 
     from litho_data.foundation.grid import PixelGrid
@@ -103,6 +105,36 @@ class Optics(Record):
     def wave_height_um(self) -> float:
         """Return the height that delays the wave by one period, µm."""
         return self.wavelength_um / self.index_step
+
+
+def known_height(height_um: Tensor | np.ndarray, like: Tensor) -> Tensor:
+    """Return the heights of a known print, µm, as a tensor on the device of ``like``. An array also gets the
+    dtype of ``like``.
+
+    Raises:
+        InputError: the heights are not numbers, or some are missing, as in a scan.
+    """
+    import numpy as np
+    import torch  # imported late, as in `element_field`
+
+    if isinstance(height_um, torch.Tensor):
+        height = height_um.to(like.device)
+    else:
+        try:
+            height = torch.from_numpy(np.array(height_um, np.float64)).to(like)
+        except (TypeError, ValueError) as error:
+            raise InputError("heights of a print", got=error, wanted="an array of heights in µm") from None
+    # A transform of torch.func does not allow a program to read the values.
+    if torch._C._functorch.is_functorch_wrapped_tensor(height):
+        return height
+    if missing := int((~height.isfinite()).sum()):
+        raise InputError(
+            "heights of a print",
+            got=f"no finite number at {missing} of {height.numel()} pixels",
+            wanted="a height in µm at every pixel",
+            hint="fill pixels without a measurement, for example with the predicted heights",
+        )
+    return height
 
 
 def element_field(

@@ -48,6 +48,23 @@ def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
     assert dark.transmission(0.5, known).angle().abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("kind", ["thin", "thick"])
+def test_a_known_print_may_be_an_array_without_gaps(make_printer, kind):
+    """Check that measured heights give the wave of the same tensor, and that none may be missing."""
+    element = Element(make_printer(LAYOUT), LAYOUT, kind=kind)
+    wave = torch.ones(40, 40, dtype=torch.complex64)
+    height = element.height_um().detach()
+    wanted = element(wave, 0.6328)
+    for given in (height, height.numpy(), height.numpy().astype(">f8")):
+        assert torch.equal(element(wave, 0.6328, given), wanted)
+    height[3, 4] = math.nan
+    for given in (height, height.numpy()):
+        with pytest.raises(InputError, match=r"got no finite number at 1 of 1600 pixels, .*; fill"):
+            element(wave, 0.6328, given)
+    with pytest.raises(InputError, match="heights of a print"):
+        element(wave, 0.6328, "print.gsf")
+
+
 def test_a_thick_element_is_that_of_the_designs(make_printer):
     thick = Element(make_printer(LAYOUT), LAYOUT, kind="thick", resin=lambda um: 1.548)
     wave = torch.full((40, 40), 1 / math.sqrt(16), dtype=torch.complex64)

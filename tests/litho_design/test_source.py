@@ -96,7 +96,12 @@ def test_a_hologram_is_designed_for_its_source(tmp_path):
     loaded = load_design(tmp_path)
     again = loaded.score(loaded.expected_um)
     assert again.eff_signal == pytest.approx(made.predicted["eff_signal"], rel=1e-6)
+    # A measured print is an array.
     seen = np.load(tmp_path / "image_share.npy")
+    measured = loaded.expected_um.double().numpy()
+    np.testing.assert_allclose(loaded.image(measured), seen, rtol=1e-5, atol=1e-9)
+    with pytest.raises(InputError, match="heights of a print, got no finite number at 4096"):
+        loaded.score(measured * np.nan)
     point = HologramBench(made.layout, made.optics.model_copy(update={"source_sine": 0.0}))
     assert np.abs(point(loaded.expected_um).numpy() - seen).mean() > 0.1 * seen.mean()
 
