@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from litho_data.commands.settings import changed
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known, unknown_name
+from litho_data.foundation.quantities import Range
 from litho_design.elements.transforms import printed_anyhow
 from litho_design.optics import Optics
 from litho_design.optics.materials import Resin, refractive_index
@@ -31,6 +32,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer
 
 Index = Callable[[float], float]
+_SURROUNDINGS, _ABSORPTION = Range(1, 10), Range(0, 1e3, "1/µm")
 
 
 class Element(nn.Module):
@@ -48,9 +50,9 @@ class Element(nn.Module):
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
         layout: geometry and number of levels of the layout, or a mapping of changes to the default layout
             settings, such as ``{"size_px": 256}``.
-        resin: name of a resin, or a function from the wavelength in µm to its refractive index.
-        surroundings: refractive index above the relief.
-        absorption_per_um: absorption coefficient of the resin for intensity, 1/µm.
+        resin: name of a resin, its refractive index, or a function from the wavelength in µm to this index.
+        surroundings: refractive index above the relief, 1 or more.
+        absorption_per_um: absorption coefficient of the resin for intensity, 1/µm, 0 or more.
         kind: ``thin`` or ``thick``. For ``thick``, the wave is propagated through the relief by the wave
             propagation method; the relief must be in air.
         tile_px: side, in pixels, of the overlapping tiles into which an element larger than one tile is
@@ -61,8 +63,8 @@ class Element(nn.Module):
         device, extrapolate: as for ``load_printer``.
 
     Raises:
-        InputError: ``load_printer`` rejects the model, the printer model provides no gradients, or the
-            refractive index of the resin does not exceed that of the surroundings. The error is also raised
+        InputError: ``load_printer`` rejects the model, the printer model provides no gradients, the resin or
+            the kind of element is not known, or an optical constant is out of range. The error is also raised
             if tiles are requested for a model whose print depends on the position, or if a thick element is
             not in air.
     """
@@ -72,7 +74,7 @@ class Element(nn.Module):
         model: str | Path | Printer,
         layout: LayoutSettings | Mapping[str, Any] | None = None,
         *,
-        resin: Resin | Index = "ip-dip",
+        resin: Resin | float | Index = "ip-dip",
         surroundings: float = 1.0,
         absorption_per_um: float = 0.0,
         kind: ElementKind = "thin",
@@ -82,6 +84,11 @@ class Element(nn.Module):
         extrapolate: bool = False,
     ):
         super().__init__()
+        if not (callable(resin) or isinstance(resin, int | float) or resin in get_args(Resin)):
+            raise unknown_name("resin", resin, get_args(Resin), also="its refractive index")
+        require_known("kind of an element", kind, get_args(ElementKind))
+        _SURROUNDINGS.require("surroundings", surroundings)
+        _ABSORPTION.require("absorption_per_um", absorption_per_um)
         if not isinstance(layout, LayoutSettings):
             layout = changed(LayoutSettings(), dict(layout or {}))
         self.layout, self.kind, self.tile_px = layout, kind, tile_px
@@ -150,7 +157,14 @@ class Element(nn.Module):
     def optics(self, wavelength_um: float) -> Optics:
         """Return the optical settings of the element at this wavelength: the wavelength, the refractive index
         step and the kind of element (thin or thick).
+
+        Raises:
+            InputError: the wavelength is not one number in the range of light, or the refractive index of the
+                resin does not exceed that of the surroundings.
         """
+        if isinstance(wavelength_um, Sequence) or getattr(wavelength_um, "ndim", False):
+            got, hint = f"a {type(wavelength_um).__name__}", "call the element once for each wavelength"
+            raise InputError("wavelength", got=got, wanted="one number in µm", hint=hint)
         if not SHORTEST_UM < wavelength_um < LONGEST_UM:
             wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
             hint = "convert nm or metres to µm, or use as_torchoptics(unit_um=1e6) for metres"

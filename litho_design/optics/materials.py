@@ -15,11 +15,13 @@ _CAUCHY = {"ip-dip": (1.5273, 6.5456e-3, 2.5345e-4), "su-8": (1.5525, 6.29e-3, 4
 _SELLMEIER = {"ip-dip-2019": ((1.2899, 1.1283e-2), (6.0569e-2, 7.7762e-2), (1.1844e5, 2.5802e7))}
 
 
-def refractive_index(resin: Resin, wavelength_um: float) -> float:
-    """Return the refractive index of a resin.
+def refractive_index(resin: Resin | float, wavelength_um: float) -> float:
+    """Return the refractive index of a resin. A number in place of its name is the index at all wavelengths.
 
     For ``constant``, the index is 1 at all wavelengths, because only differences of the index matter.
     """
+    if not isinstance(resin, str):
+        return float(resin)
     if resin == "constant":
         return 1.0
     square = wavelength_um**2

@@ -232,6 +232,19 @@ def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch
         Element(printer, LAYOUT, kind="thick", surroundings=1.33)
     with pytest.raises(InputError, match="resin"):
         Element(printer, LAYOUT, resin="constant").optics(0.5)
+    for said, bad in (
+        ("resin, got 'su8', wanted .* its refractive index; did you mean su-8", {"resin": "su8"}),
+        ("resin, got 'None'", {"resin": None}),
+        ("kind of an element, got 'Thick', wanted thin, thick", {"kind": "Thick"}),
+        ("absorption_per_um, got -1, wanted a number from 0", {"absorption_per_um": -1}),
+        ("surroundings, got 0, wanted a number from 1", {"surroundings": 0}),
+    ):
+        with pytest.raises(InputError, match=said):
+            Element(printer, LAYOUT, **bad)
+    assert Element(printer, LAYOUT, resin=1.5).optics(0.5).index_step == 0.5
+    for several in (torch.tensor([0.5, 0.6]), np.array([0.5, 0.6]), [0.5, 0.6]):
+        with pytest.raises(InputError, match="wanted one number in µm; call the element once"):
+            element.transmission(several)
     with pytest.raises(InputError, match="a thin element"):
         Element(printer, LAYOUT, kind="thick").as_torchoptics()
     printer.simulator.card = {"process_effects": {"edge-bead": {}}}
