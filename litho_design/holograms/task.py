@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -18,6 +17,7 @@ from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
 from litho_design.images.targets import TargetRecord, stroke_width_px
 from litho_design.optics import Optics
 from litho_design.optimisation.phases import gerchberg_saxton, nearest_levels
+from litho_design.optimisation.process_window import allowed_defocus_um, rounded_down
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
@@ -69,7 +69,7 @@ class HologramTask(Task):
         if settings.loss.signal_window_um:
             self.headline = ("si_psnr_window_db", *self.headline[1:])  # type: ignore[misc]
         self.notes += [f"target {record.adaptation}"] if record and record.adaptation else []
-        self.notes += _too_fine(target, settings)
+        self.notes += self._too_fine(target)
         self.target = torch.from_numpy(target).to(printer.device)
         self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
 
@@ -112,6 +112,28 @@ class HologramTask(Task):
         with torch.no_grad():
             return WindowedHologramScore(**score.model_dump(), **self._inside_window(self.bench(height_um)))
 
+    def _too_fine(self, target: np.ndarray) -> list[str]:
+        """Return a list with one note if diffraction will blur the strokes of the target in any layout.
+        Otherwise, return an empty list.
+        """
+        layout, optics, window = self.settings.layout, self.settings.optics, self.settings.window
+        stroke_um = stroke_width_px(target) * layout.pitch_um
+        finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
+        if stroke_um >= finest_um:
+            return []
+        # The advised distance is rounded down, so that no stroke is too fine at this distance.
+        near_um = rounded_down(stroke_um / finest_um * optics.distance_um)
+        near = optics.model_copy(update={"distance_um": near_um})
+        # At a small distance, some draws of the process window would lie in front of the element.
+        calm_um = allowed_defocus_um(window, near, self.bench.grid, self.bench.window)
+        defocus = "or less" if calm_um == window.defocus_sd_um else f"with --defocus-sd-um {calm_um:.2g}"
+        closer = f"--distance-um {near_um:.2g} {defocus}, " if calm_um else ""
+        return [
+            f"the image will be blurred: the strokes of the target are about {stroke_um:.2g} µm wide, but an "
+            f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm resolves no detail finer than "
+            f"λz/D = {finest_um:.2g} µm; use {closer}a larger --size-px, or bolder strokes"
+        ]
+
     def _inside_window(self, seen: Tensor) -> dict[str, float]:
         if self.counted is None:
             return {}
@@ -132,27 +154,6 @@ class HologramTask(Task):
         """Return the image, scaled to match its target."""
         target = self.inputs["target"]
         return (seen * target).sum() / max(float((seen**2).sum()), 1e-30) * seen
-
-
-def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
-    """Return a list with one note if diffraction will blur the strokes of the target in any layout.
-    Otherwise, return an empty list.
-    """
-    layout, optics = settings.layout, settings.optics
-    stroke_um = stroke_width_px(target) * layout.pitch_um
-    finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
-    if stroke_um >= finest_um:
-        return []
-    near_um = stroke_um / finest_um * optics.distance_um
-    # The advised distance is rounded down to two digits, so that no stroke is too fine at this distance.
-    digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
-    near_um = math.floor(near_um / digit_um) * digit_um
-    return [
-        f"the image will be blurred: the strokes of the target are about {stroke_um:.2g} µm wide, but an "
-        f"element of {layout.size_um:.4g} µm at {optics.distance_um:g} µm resolves no detail finer than "
-        f"λz/D = {finest_um:.2g} µm; use --distance-um {near_um:.2g} or less, a larger --size-px, or "
-        "bolder strokes"
-    ]
 
 
 def check_target(target: np.ndarray, layout: LayoutSettings) -> None:

@@ -137,7 +137,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
         InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
             and ``target``, or the wavelength in a draw is not positive.
     """
-    drawn = draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
+    drawn = _all_draws(window, optics)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
     if min(lengths_um) <= 0:
         raise InputError(
@@ -146,22 +146,61 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
-    # The angular spectrum has no sampling limit, but the distance must stay positive, so that the image plane
-    # lies behind the element.
-    limit_um = min(lengths_um)
-    if optics.propagation == "rayleigh-sommerfeld":
-        limit_um = max(sampling_limit_um(source, target, length) for length in lengths_um)
+    limit_um = _limit_um(drawn, optics, source, target)
     nearest_um, wanted = min(draw.optics.distance_um for draw in drawn), f"at least {limit_um:.4g} µm"
     if optics.distance_um < limit_um:
         hint = f"the wavelength is {optics.wavelength_um:g} µm; convert nm to µm" if limit_um > 20 else ""
         raise InputError("propagation distance", got=f"{optics.distance_um:g} µm", wanted=wanted, hint=hint)
     if nearest_um < limit_um:
+        calm_um = allowed_defocus_um(window, optics, source, target)
         raise InputError(
             f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",
             got=f"{nearest_um:.4g} µm in a draw of the process window",
             wanted=wanted,
-            hint="lower --defocus-sd-um",
+            hint=f"use --defocus-sd-um {calm_um:.2g} or less, or a larger --distance-um",
         )
+
+
+def allowed_defocus_um(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
+    """Return the largest spread of the defocus, µm, with which the light of every draw can be propagated:
+    that of ``window``, or a smaller one, rounded down to two digits. It is 0 if the distance itself is too
+    small.
+    """
+    drawn = _all_draws(window, optics)
+    limit_um = _limit_um(drawn, optics, source, target)
+    nearest_um = min(draw.optics.distance_um for draw in drawn)
+    if nearest_um >= limit_um:
+        return window.defocus_sd_um
+    # The displacement of the image plane in every draw is proportional to the spread.
+    share = (optics.distance_um - limit_um) / (optics.distance_um - nearest_um)
+    return rounded_down(share * window.defocus_sd_um)
+
+
+def rounded_down(value: float) -> float:
+    """Return a value rounded down to two digits, so that advice to stay below it can be followed. A value
+    that is not positive gives 0.
+    """
+    if value <= 0:
+        return 0.0
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.floor(value / digit) * digit
+
+
+def _all_draws(window: ProcessWindow, optics: Optics) -> list[Draw]:
+    """Return the draws of the search and of the yield."""
+    return draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
+
+
+def _limit_um(drawn: Sequence[Draw], optics: Optics, source: PixelGrid, target: PixelGrid) -> float:
+    """Return the smallest distance at which the light of every draw can be propagated, µm.
+
+    The angular spectrum has no sampling limit, but the distance must stay positive, so that the image plane
+    lies behind the element.
+    """
+    lengths_um = [draw.optics.wavelength_um for draw in drawn]
+    if optics.propagation != "rayleigh-sommerfeld":
+        return min(lengths_um)
+    return max(sampling_limit_um(source, target, length) for length in lengths_um)
 
 
 class Yield(Record):

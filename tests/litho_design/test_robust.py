@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,8 @@ from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.optics import Optics
 from litho_design.optimisation.process_window import Draw, ProcessWindow, draws, risk
+from litho_design.printers.layout import LayoutSettings
+from litho_design.printers.printer import Printer
 from litho_design.tasks.design import HEIGHT_FILE
 from litho_design.workflows.design import design_hologram
 
@@ -76,6 +80,34 @@ def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     assert not (tmp_path / "near").exists()
     calm = settings.model_copy(update={"window": ProcessWindow(defocus_sd_um=0.1)})
     HologramTask(calm, make_printer(settings.layout), inputs=RING)
+
+
+@pytest.mark.parametrize("distance_um", [8.0, 10.0])
+def test_an_advised_distance_can_be_used(small_settings, distance_um):
+    """Check that a design accepts the distance and the spread that a note or a refusal advises, and that a
+    slightly larger spread would be refused.
+    """
+
+    def task(distance_um: float, **window: float) -> HologramTask:
+        settings = small_settings.model_copy(
+            update={
+                "layout": LayoutSettings(size_px=64),
+                "optics": Optics(distance_um=distance_um),
+                "window": ProcessWindow(**window),
+            }
+        )
+        return HologramTask(settings, Printer(None, settings.layout, source="none"), inputs=inputs)
+
+    inputs = {"target": load_target("text", 64).pixels}
+    try:
+        said = task(distance_um).notes[-1]
+    except InputError as refused:
+        spread_um = float(re.search(r"--defocus-sd-um ([\d.]+) or less", str(refused))[1])
+        said = task(distance_um, defocus_sd_um=spread_um).notes[-1]
+    near_um, spread_um = map(float, re.search(r"-um ([\d.]+) with --defocus-sd-um ([\d.]+)", said).groups())
+    assert not any("blurred" in note for note in task(near_um, defocus_sd_um=spread_um).notes)
+    with pytest.raises(InputError, match=f"--defocus-sd-um {spread_um:g} or less"):
+        task(near_um, defocus_sd_um=1.1 * spread_um)
 
 
 @pytest.mark.long
