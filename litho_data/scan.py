@@ -100,7 +100,8 @@ class Scan:
             raise InputError(
                 f"scan {self.source or self.name} has no pixel pitch",
                 wanted="a pitch in µm",
-                hint="give the field size, for example size_um = [54.0, 54.0]",
+                hint="give the field size, for example size_um = [54.0, 54.0], --size-um 54 54 or "
+                "--scan-size-um 54",
             )
         return self.pitch_um
 

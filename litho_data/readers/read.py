@@ -203,7 +203,7 @@ def _settle_unit(
         first = ", ".join(f"{value:g}" for value in np.asarray(values)[0, :3])
         raise InputError(
             "the file does not state the unit of its heights",
-            wanted="the option unit, for example 'm'",
+            wanted="their unit, for example unit = 'm', --unit m or --scan-unit m",
             hint=f"the first row begins {first}: with unit 'm' these are metres, with 'nm' nanometres",
         )
     if unit is not None and channel.unit is not None and um_per(unit) != um_per(channel.unit):

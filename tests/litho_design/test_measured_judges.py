@@ -13,6 +13,7 @@ from scipy.special import erf, j1
 from benchmarks.coverage import Camera
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_data.readers import read_scan
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.measurements import MeasuredSource, PhotoSource
 from litho_design.images.noise import estimated
@@ -158,6 +159,18 @@ def test_a_scan_of_something_else_is_refused(tmp_path, printed_design):
             judges=[],
             scan=MeasuredSource(tmp_path / "scan.txt", "m", (12.8, 12.8)),
         )
+
+
+def test_a_scan_without_unit_or_size_names_options_that_a_score_has(tmp_path):
+    np.save(tmp_path / "scan.npy", np.eye(64))
+    unit, size = (
+        MeasuredSource.__pydantic_fields__[name].json_schema_extra["options"][0]
+        for name in ("unit", "size_um")
+    )
+    with pytest.raises(InputError, match=f"unit = 'm', --unit m or {unit} m;"):
+        read_scan(tmp_path / "scan.npy")
+    with pytest.raises(InputError, match=f"--size-um 54 54 or {size} 54$"):
+        read_scan(tmp_path / "scan.npy", unit="um").require_pitch()
 
 
 @pytest.mark.pictures
