@@ -6,13 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.results import Record
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
@@ -59,23 +62,25 @@ class Target:
     record: TargetRecord
 
 
-def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Target:
+def load_target(source: str | Path | np.ndarray | Tensor | Target, size_px: int) -> Target:
     """Load a target image of ``size_px``. The source is the name of a drawing, the path of an image, or an
     array.
 
     Args:
-        source: text, ring, chart, spots or letters; an image file, which is converted to grey values and
-            fitted to the square; or an array of shape (size_px, size_px) with values in [0, 1], which is used
-            unchanged.
+        source: text, ring, chart, spots or letters; an image file, which is converted to grey values; or an
+            array or tensor of shape (ny, nx) with values in [0, 1], which are not changed. Images and arrays
+            are fitted to the square.
 
     Raises:
-        InputError: the source is neither a drawing nor a readable image, or the image has no light.
+        InputError: the source is neither a drawing nor a readable image nor an array of numbers, or the image
+            has no light.
     """
     if isinstance(source, Target):
         return source
-    if isinstance(source, np.ndarray):
-        pixels = np.ascontiguousarray(source, np.float32)
-        return Target(pixels, TargetRecord.of_array("array", pixels, "1"))
+    if not isinstance(source, str | Path):
+        pixels, notes = _fitted(_numbers(source), size_px)
+        record = TargetRecord.of_array("array", pixels, "1")
+        return Target(pixels, record.model_copy(update={"adaptation": "; ".join(notes)}))
     name = str(source)
     if name in get_args(DrawnTarget):
         pixels = draw_target(name, size_px)
@@ -84,6 +89,19 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
         raise unknown_name("target", name, get_args(DrawnTarget), also="an image file")
     pixels, notes = read_image(Path(name), size_px, "target")
     return Target(pixels, TargetRecord.of_file(Path(name), notes))
+
+
+def _numbers(source: Any) -> np.ndarray:
+    """Return an array or tensor as a float32 array of shape (ny, nx)."""
+    try:
+        pixels = np.ascontiguousarray(
+            source.detach().cpu() if hasattr(source, "detach") else source, np.float32
+        )
+    except (TypeError, ValueError) as error:
+        raise InputError("target", got=error, wanted="a drawing, an image file, or an array") from None
+    if pixels.ndim != 2 or not pixels.size:
+        raise InputError("target", got=f"an array of shape {np.shape(source)}", wanted="an image, (ny, nx)")
+    return pixels
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:
@@ -217,12 +235,21 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
     Raises:
         InputError: the image is not readable, has values that are not numbers, or has no light.
     """
-    import cv2
-
     found, notes = read_grey(path, what)
     grey: np.ndarray = found.astype(np.float32)
     if grey.max() <= 0:
         raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
+    grey, changes = _fitted(grey, size_px)
+    return np.clip(grey / grey.max(), 0, 1).astype(np.float32), notes + changes
+
+
+def _fitted(grey: np.ndarray, size_px: int) -> tuple[np.ndarray, list[str]]:
+    """Place a float32 image of shape (ny, nx) on a black square, and resample it to the side ``size_px``.
+    Return it with a list of these conversions, one phrase each.
+    """
+    import cv2
+
+    notes = []
     height, width = grey.shape
     if height != width:
         side = max(height, width)
@@ -236,4 +263,4 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
         method = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
         notes.append(f"resampled from {grey.shape[0]} to {size_px} px")
         grey = cv2.resize(grey, (size_px, size_px), interpolation=method)
-    return np.clip(grey / grey.max(), 0, 1).astype(np.float32), notes
+    return grey, notes

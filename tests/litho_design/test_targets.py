@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design.images.targets import draw_target, load_target, read_grey
@@ -39,6 +40,23 @@ def test_another_size_and_shape_are_adapted_and_reported(tmp_path):
     assert (image * rows).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
     assert (image * columns).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
     assert image.max() == 1
+
+
+def test_an_array_is_fitted_like_the_picture_with_the_same_pixels(tmp_path):
+    grey = np.random.default_rng(0).integers(0, 256, (30, 50)).astype(np.uint8)
+    grey[0, 0] = 255
+    for size_px, image in ((64, grey), (20, grey), (30, grey[:, :30])):
+        cv2.imwrite(str(tmp_path / "picture.png"), image)
+        picture = load_target(tmp_path / "picture.png", size_px)
+        for array in (image / 255, torch.from_numpy(image / 255).requires_grad_(), (image / 255).tolist()):
+            target = load_target(array, size_px)
+            assert target.record.adaptation == picture.record.adaptation
+            # A picture is divided by its brightest value after it is resampled.
+            expected = picture.pixels * target.pixels.max()
+            np.testing.assert_allclose(target.pixels, expected, rtol=0, atol=1e-6)
+    for bad in (np.zeros((2, 3, 4)), np.zeros((0, 4)), torch.zeros(5), [["a"]], object()):
+        with pytest.raises(InputError, match="target, got"):
+            load_target(bad, 64)
 
 
 @pytest.mark.parametrize("depth", [np.uint8, np.uint16])
