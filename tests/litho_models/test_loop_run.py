@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +16,6 @@ import tifffile
 
 import litho_data
 from litho_data.foundation.errors import InputError
-from litho_data.reports import page
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import locked_ids
 from litho_models.effects import get_effect
@@ -36,7 +35,7 @@ from litho_models.loop.results import _strengths, _verdict, clustered_covariance
 from litho_models.loop.run import close_loop, save_model
 from litho_models.scan_terms.grouped import ALL
 from litho_models.scoring.statistics import over_units
-from tests.conftest import BLANK
+from tests.figures import undrawn
 from tests.litho_models.loop_scans import (
     bare_state,
     base_model,
@@ -383,9 +382,10 @@ def test_one_scan_is_too_few(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     search_little(monkeypatch)
-    monkeypatch.setattr(page, "svg_address", lambda figure: BLANK)
+    with undrawn():
+        yield
 
 
 def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(quick: None, tmp_path: Path) -> None:
