@@ -231,7 +231,7 @@ def export(
 
 @app.command("import-pairs")
 def import_pairs(
-    folder: Annotated[Path, argument("folder with mask/, afm/ and src_max_dict.txt")],
+    folder: Annotated[Path, argument("folder with mask/, afm/, src_max_dict.txt and possibly valid/")],
     out: Annotated[Path | None, option("store to write; by default FOLDER.zarr")] = None,
     pitch_um: Annotated[float, option("pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, option("nominal height of one level, µm")] = 0.1,

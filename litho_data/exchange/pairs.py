@@ -4,6 +4,9 @@ their data in this format. ``litho_data.readers.pairs`` describes the limits of 
 ``mask/<id><q>.tif`` contains level numbers, ``afm/<id><q>.tif`` contains heights, and ``src_max_dict.txt``
 contains the full scale of each height file (the height of grey value 255) in metres. The digit q names a
 quadrant of the field: 1 (top left), 2 (top right), 3 (bottom left) or 4 (bottom right).
+
+This project adds ``valid/<id><q>.tif``, which is black where no height was measured. The authors' files have
+no such masks.
 """
 
 import json
@@ -32,8 +35,10 @@ from litho_data.store.partial import Piece
 from litho_data.store.read import open_store
 
 _QUADRANTS = (1, 2, 3, 4)
+_MASKS = "valid"
 SCALES_FILE = "src_max_dict.txt"
 _AUTHORS_IDS = r"FOV(?P<print>\d)(?P<field>\d)\d?"
+_FRAME = f"all heights along a side are exactly 0: were they measured? {_MASKS}/ marks pixels that were not"
 
 
 def import_pairs(
@@ -54,8 +59,12 @@ def import_pairs(
     The height of a pixel is grey value / 255 · full scale. In the authors' own files, heights were rounded
     down to a grey value, so they are too low by half a grey value (about 2 nm) on average.
 
+    If the folder contains ``valid/``, the heights of its black pixels are not valid. Otherwise, all pixels
+    are valid, and a field is reported if the height is 0 along a whole side, as in a frame that was not
+    measured.
+
     Args:
-        folder: folder that contains ``mask/``, ``afm/`` and ``src_max_dict.txt``.
+        folder: folder that contains ``mask/``, ``afm/``, ``src_max_dict.txt`` and possibly ``valid/``.
         out: path of the store.
         pitch_um, level_height_um, levels: pixel pitch and nominal height of a level, in µm, and number of
             levels. The files do not state these values; the defaults are those of the paper.
@@ -69,19 +78,20 @@ def import_pairs(
     """
     root = Path(folder).resolve()
     scales = read_full_scales(root / SCALES_FILE)
-    fields, unpaired = _fields(root, scales)
+    kinds = ("mask", "afm", *[_MASKS] * (root / _MASKS).is_dir())
+    fields, unpaired = _fields(root, kinds, scales)
     if not fields:
         raise InputError(
             f"complete pairs in {folder}",
             got=next((f"none; {name}: {reason}" for name, reason in unpaired.items()), "none"),
-            wanted=f"files with the same name in mask/ and afm/, and this name in {SCALES_FILE}",
+            wanted=f"files with the same name in {'/, '.join(kinds)}/, and this name in {SCALES_FILE}",
         )
     card = _card(
         name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
     )
     ids = sorted(fields)
     jobs = [
-        PairsJob(field_id, print_id or field_id, order, root, fields[field_id], scales, card)
+        PairsJob(field_id, print_id or field_id, order, root, kinds, fields[field_id], scales, card)
         for order, (field_id, print_id) in enumerate(zip(ids, prints_of(ids, card.ids.print), strict=True))
     ]
     source = Source(
@@ -100,8 +110,9 @@ def import_pairs(
 
 @dataclass(frozen=True)
 class PairsJob:
-    """A job that joins the quadrants of one field. ``quadrants`` maps the number of each quadrant to the file
-    name that its layout file and its height file share.
+    """A job that joins the quadrants of one field. ``quadrants`` maps the number of each quadrant to the name
+    that its files share. ``kinds`` are the folders of these files: ``mask``, ``afm`` and, if there are masks,
+    ``valid``.
 
     A field that is not divided has only the quadrant 0.
     """
@@ -110,16 +121,17 @@ class PairsJob:
     print_id: str
     order: int
     root: Path
+    kinds: Sequence[str]
     quadrants: Mapping[int, str]
     scales_um: Mapping[str, float]
     card: Card
 
     @property
     def files(self) -> dict[str, Path]:
-        """Return the files of the field: first the layout files, then the height files, each in the order of
-        the quadrants.
+        """Return the files of the field: first the layout files, then the height files, then the masks, each
+        in the order of the quadrants.
         """
-        names = [f"{kind}/{name}" for kind in ("mask", "afm") for name in self.quadrants.values()]
+        names = [f"{kind}/{name}" for kind in self.kinds for name in self.quadrants.values()]
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
@@ -137,6 +149,8 @@ class PairsJob:
         """
         chain = Chain()
         chain.run("stitch-pairs", self._params, self.files)
+        height = chain.arrays["height_um"]
+        sides = () if _MASKS in self.kinds else (height[0], height[-1], height[:, 0], height[:, -1])
         return chain.piece(
             id=self.id,
             key=self.key(),
@@ -144,7 +158,8 @@ class PairsJob:
             print=self.print_id,
             order=self.order,
             columns={},
-            quality={"valid_fraction": 1.0},
+            quality={"valid_fraction": float(chain.arrays["valid"].mean())},
+            notes=[_FRAME] * any(not side.any() for side in sides),
             read={"pitch_um": [self.card.layout.pitch_um] * 2},
         )
 
@@ -157,12 +172,14 @@ class PairsJob:
         }
 
 
-def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
+def _fields(
+    root: Path, kinds: Sequence[str], scales: Mapping[str, float]
+) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
     """Return the file names keyed by field and quadrant, and a dict that maps each unusable file to the
     reason.
     """
-    masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
-    if unprintable := [name for name in sorted(masks | heights) if not name.isprintable()]:
+    masks, heights, *seen = ({path.name for path in (root / kind).glob("*.tif")} for kind in kinds)
+    if unprintable := [name for name in sorted(masks.union(heights, *seen)) if not name.isprintable()]:
         raise InputError(
             f"file name in {root}", got=ascii(unprintable[0]), wanted="a name of printable characters"
         )
@@ -170,6 +187,9 @@ def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int
     unpaired |= {f"afm/{name}": "no layout file of this name" for name in sorted(heights - masks)}
     unpaired |= {f"afm/{name}": f"not in {SCALES_FILE}" for name in sorted((masks & heights) - set(scales))}
     paired = masks & heights & set(scales)
+    for own in seen:
+        unpaired |= {f"afm/{name}": f"not in {_MASKS}/" for name in sorted(paired - own)}
+        paired &= own
     complete = sorted(name for name in paired if SAFE_ID.fullmatch(name))
     unpaired |= {f"afm/{name}": f"a name {SAFE_ID_RULE}" for name in sorted(paired.difference(complete))}
     cut: dict[str, dict[int, str]] = {}
@@ -203,7 +223,8 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     """Write a store in the pair format. Return one note for each scan that has negative heights or unmeasured
     pixels, which the format cannot represent.
 
-    Heights are rounded to the nearest grey value; pixels that were not measured become 0.
+    Heights are rounded to the nearest grey value; pixels that were not measured become 0, and are black in
+    the masks ``valid/<id><q>.tif``.
 
     Raises:
         InputError: a field cannot be cut into four quadrants, or the output folder contains files of another
@@ -212,8 +233,8 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     store = open_store(store_path)
     notes: list[str] = []
     scales: dict[str, float] = {}
-    with whole_folder(out, "mask/*.tif", "afm/*.tif", SCALES_FILE) as folder:
-        for name in ("mask", "afm"):
+    with whole_folder(out, "mask/*.tif", "afm/*.tif", f"{_MASKS}/*.tif", SCALES_FILE) as folder:
+        for name in ("mask", "afm", _MASKS):
             (folder / name).mkdir()
         for scan_id in progress(store.ids, "exporting pairs"):
             scan = store.scan(scan_id)
@@ -221,25 +242,29 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
                 raise InputError(
                     f"size of field {scan_id}", got=scan.shape, wanted="even numbers of rows and columns"
                 )
-            lift_um = -float(np.nanmin(scan.height_um, initial=0))
-            height_um = scan.height_um + lift_um
+            valid = scan.valid & np.isfinite(scan.height_um)
+            measured_um = np.where(valid, scan.height_um, np.nan)
+            lift_um = -float(np.nanmin(measured_um, initial=0))
+            height_um = measured_um + lift_um
             if lift_um:
                 notes.append(
                     f"{scan_id}: heights were raised by {lift_um * 1e3:.1f} nm, because the format has no "
                     "negative heights"
                 )
-            if unmeasured := int(np.isnan(height_um).sum()):
+            if unmeasured := int((~valid).sum()):
                 notes.append(
-                    f"{scan_id}: {unmeasured} unmeasured pixels became 0, because the format cannot mark them"
+                    f"{scan_id}: {unmeasured} unmeasured pixels became 0, and are marked only in {_MASKS}/"
                 )
             full_scale_um = max(float(np.nanmax(height_um, initial=0)), 1e-6)
             grey = np.rint(np.nan_to_num(height_um) / full_scale_um * GREY_MAX).astype(np.uint8)
+            seen = np.where(valid, GREY_MAX, 0).astype(np.uint8)
             for quadrant in _QUADRANTS:
                 name = f"{scan_id}{quadrant}.tif"
                 _write_tiff(
                     folder / "mask" / name, np.repeat(_cut(scan.mask_level, quadrant)[..., None], 3, axis=2)
                 )
                 _write_tiff(folder / "afm" / name, _cut(grey, quadrant))
+                _write_tiff(folder / _MASKS / name, _cut(seen, quadrant))
                 scales[name] = full_scale_um * 1e-6
         (folder / SCALES_FILE).write_text(json.dumps(scales), encoding="utf-8")
     return notes

@@ -3,8 +3,9 @@ images, one of the layout and one of the heights. A field may also be cut into f
 of images for each.
 
 In an image of heights, the height of a pixel is its grey value, divided by 255 and multiplied by the full
-scale. The format has no mask of valid pixels, no negative heights and only 256 grey values, so it loses
-accuracy.
+scale. The format has no negative heights and only 256 grey values, so it loses accuracy. The authors' files
+have no mask of valid pixels. This project adds one as a third image, in which pixels that were not measured
+are black.
 """
 
 from collections.abc import Sequence
@@ -24,8 +25,8 @@ def stitch_field(
     """Join the quadrants of one field, and return the arrays of the field, keyed by name.
 
     Args:
-        files: the images of the layout, followed by the images of the heights. Both groups are in the order
-            of ``quadrants``.
+        files: the images of the layout, followed by the images of the heights and, if there are any, by the
+            masks of valid pixels. All groups are in the order of ``quadrants``.
         quadrants: the numbers of the quadrants, 1 to 4, or only 0 for an undivided field.
         full_scale_um: for each image of heights, the height that grey value 255 stands for.
         levels: number of levels that the layout may have.
@@ -34,23 +35,25 @@ def stitch_field(
         InputError: a file is unreadable, the images have different sizes, or a layout contains a level that
             exceeds ``levels - 1``.
     """
-    images = [read_layout(path) for path in files]
+    images, count = [read_layout(path) for path in files], len(quadrants)
     if len({image.shape for image in images}) != 1:
         raise InputError(
             f"sizes of {', '.join(path.name for path in files)}", got={image.shape for image in images}
         )
-    mask = _join(images[: len(quadrants)], quadrants)
+    mask = _join(images[:count], quadrants)
     if mask.max() >= levels:
         raise InputError(
             f"layout {files[0]}: highest level", got=int(mask.max()), wanted=f"at most {levels - 1}"
         )
     scaled = [
         (image.astype(float) / GREY_MAX * scale).astype(np.float32)
-        for image, scale in zip(images[len(quadrants) :], full_scale_um, strict=True)
+        for image, scale in zip(images[count : 2 * count], full_scale_um, strict=True)
     ]
-    height = _join(scaled, quadrants)
+    seen = images[2 * count :] or [np.ones_like(image) for image in scaled]
+    valid = _join(seen, quadrants) > 0
+    height = np.where(valid, _join(scaled, quadrants), np.float32(np.nan))
     arrays = {"mask_level": mask, "raw_height_um": height, "height_um": height}
-    return {**arrays, "valid": np.ones(height.shape, dtype=bool), "scan_to_layout": np.eye(3)}
+    return {**arrays, "valid": valid, "scan_to_layout": np.eye(3)}
 
 
 def quadrant_slices(quadrant: int, shape: Shape) -> tuple[slice, slice]:

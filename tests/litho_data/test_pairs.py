@@ -35,6 +35,7 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
         difference = other.height_um - scan.height_um - raised.get(scan.id, 0)
         assert np.abs(difference).max() <= half_step_um + 0.5e-4 + 1e-6
         assert np.abs(difference.mean()) < 0.1 * half_step_um + 0.5e-4  # rounded, not truncated
+    assert result.findings == []
     assert verify(tmp_path / "back.zarr").findings == ()
 
 
@@ -95,6 +96,44 @@ def test_gaps_are_filled_with_a_note(tmp_path: Path, without_report: None) -> No
     ]
 
 
+def test_pixels_that_were_not_measured_stay_so(
+    own_campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Check a frame and a hole that no scan measured, with the masks, without one of them, and without all of
+    them, as in the authors' files.
+    """
+    card = own_campaign / "card.toml"
+    card.write_text(card.read_text() + '\n[write]\nsurround = "unknown"\n')
+    scan = own_campaign / "scans" / "P12.txt"
+    rows = [line.split() for line in scan.read_text().splitlines()]
+    rows[60][60] = "nan"
+    scan.write_text("\n".join("\t".join(row) for row in rows))
+    build_dataset(card, own_campaign / "prints.zarr")
+    pairs = tmp_path / "pairs"
+    export_pairs(own_campaign / "prints.zarr", pairs)
+    result = import_pairs(pairs, tmp_path / "back.zarr")
+    back = open_store(tmp_path / "back.zarr")
+    for one in open_store(own_campaign / "prints.zarr").scans():
+        assert 0 < one.valid.mean() < 0.9
+        np.testing.assert_array_equal(back.scan(one.id).valid, one.valid)
+        np.testing.assert_array_equal(np.isfinite(back.scan(one.id).height_um), one.valid)
+    assert back.quality["valid_fraction"].max() < 0.9
+    assert result.findings == []
+
+    (pairs / "valid" / "P123.tif").unlink()
+    assert import_pairs(pairs, tmp_path / "partly.zarr").unpaired == {"afm/P123.tif": "not in valid/"}
+
+    shutil.rmtree(pairs / "valid")
+    capsys.readouterr()
+    result = import_pairs(pairs, tmp_path / "bare.zarr")
+    assert open_store(tmp_path / "bare.zarr").scan("P12").valid.all()
+    assert [(one.scan, one.text[:32]) for one in result.findings] == [
+        (scan_id, "all heights along a side are exa") for scan_id in ("P11", "P12", "P21")
+    ]
+    assert capsys.readouterr().err.count("check P") == 3
+    assert "were they measured?" in (tmp_path / "bare-report" / "report.html").read_text()
+
+
 def test_files_are_those_of_the_authors(campaign: Path, tmp_path: Path) -> None:
     export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
     names = {f"{scan}{quadrant}.tif" for scan in ("P11", "P12", "P21") for quadrant in "1234"}
@@ -126,7 +165,7 @@ def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
 def test_pairs_whose_name_cannot_be_an_id_are_listed(campaign: Path, tmp_path: Path, name: str) -> None:
     pairs = tmp_path / "pairs"
     export_pairs(campaign / "prints.zarr", pairs)
-    for folder in ("mask", "afm"):
+    for folder in ("mask", "afm", "valid"):
         (pairs / folder / "P111.tif").rename(pairs / folder / name)
     scales = (pairs / SCALES_FILE).read_text()
     (pairs / SCALES_FILE).write_text(scales.replace("P111.tif", name))
@@ -159,7 +198,7 @@ def test_a_folder_that_is_not_in_the_pair_format_is_refused(tmp_path: Path) -> N
 def test_the_authors_pairs_become_whole_fields(measured_prints: Path, tmp_path: Path) -> None:
     result = import_pairs(measured_prints, tmp_path / "authors.zarr", workers=1)
     store = open_store(tmp_path / "authors.zarr")
-    assert (result.n_scans, result.skipped) == (24, {})
+    assert (result.n_scans, result.skipped, result.findings) == (24, {}, [])
     assert set(store.scan(store.ids[0]).print_id) == {"1"}
     for scan_id in ("FOV11", "FOV72"):
         # The quadrants in mask/ are exact parts of the whole layouts in mask_ug/.
