@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -150,6 +151,22 @@ def test_a_copy_or_a_part_by_xarray_is_a_store_again(campaign: Path, tmp_path: P
         np.testing.assert_array_equal(back["height_um"], part["height_um"])
         # The coordinates of the pixel centres allow a selection by length.
         assert float(back.sel(x=5.04, y=1.01, method="nearest")["x_um"]) == pytest.approx(5.05)
+
+
+def test_the_selection_that_the_page_shows_is_a_store_again(
+    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "dataset_store.md").read_text("utf-8")
+    code = re.search(r"^import xarray\n.*?(?=```)", page, re.MULTILINE | re.DOTALL)
+    shown: dict[str, Any] = {}
+    monkeypatch.chdir(campaign)
+    exec(code[0], shown)
+    monkeypatch.undo()
+    shown["prints"].isel(y=slice(96)).to_zarr(tmp_path / "part.zarr")
+    whole, part = open_store(campaign / "prints.zarr"), open_store(tmp_path / "part.zarr")
+    assert part.ids == [whole.ids[0], whole.ids[2]]
+    for one in part.scans():
+        np.testing.assert_array_equal(one.height_um, whole.scan(one.id).height_um[:96])
 
 
 @pytest.mark.parametrize(
