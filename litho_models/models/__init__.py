@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from pydantic import ValidationError
 
 from litho_data.commands.settings import refused
-from litho_data.foundation.errors import InputError, require_known, unknown_name
-from litho_data.foundation.plugins import foreign_sha256
+from litho_data.foundation.errors import InputError, require_known, said, unknown_name
+from litho_data.foundation.plugins import OPTION, foreign_sha256
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
@@ -36,6 +37,8 @@ MODELS: dict[str, type[Simulator]] = {
         *(Features, RandomFeatures, Physics, ElectronBeam, Projection, LaserWriter, DmdGrayscale, Pbl, Fno),
     )
 }
+# Side, in pixels, of the layout on which a registered model is tried. It is that of the crops of a training.
+_TRIAL_PX = 128
 # Maps the name of each registered model to the hashes of the sources of its class and of the base classes.
 _REGISTERED: dict[str, list[str]] = {}
 
@@ -46,11 +49,14 @@ def register_simulator(model: type[Simulator]) -> type[Simulator]:
     To register the class in every process that a command starts, call this function in a plug-in.
 
     Raises:
-        InputError: the class has no name, or its name is already taken.
+        InputError: the class has no name, its name is already taken, or it lacks ``reach_px`` or
+            ``interior``.
     """
     name = getattr(model, "name", "")
     if not name or name in MODELS:
         raise InputError("simulator to register", got=f"name {name!r}", wanted="a name that is not taken")
+    if missing := ", ".join(sorted(model.__abstractmethods__)):
+        raise InputError(f"simulator {name}", got=f"no {missing}", wanted="a class that defines it")
     MODELS[name] = model
     _REGISTERED[name] = [foreign_sha256(one) for one in model.__mro__ if one not in Simulator.__mro__]
     return model
@@ -73,7 +79,9 @@ def model_class(name: str) -> type[Simulator]:
     Raises:
         InputError: the name is unknown.
     """
-    require_known("model", name, MODELS)
+    if name not in MODELS:
+        hint = f"a model of your own has to be registered first, in a command with {OPTION} FILE"
+        raise unknown_name("model", name, MODELS, hint)
     return MODELS[name]
 
 
@@ -114,7 +122,7 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
 
     Raises:
         InputError: the model, a field or a parameter to fix is unknown or belongs to a network inside the
-            model, or a value is not allowed.
+            model; a value is not allowed; or a registered model does not predict a map of finite heights.
     """
     kind = model_class(name)
     for field in fields:
@@ -130,4 +138,29 @@ def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simul
         if fixed not in numbers:
             what, hint = f"parameter of {name} to fix", "the weights inside networks are always fitted"
             raise unknown_name(what, fixed, numbers, hint)
+    if name in _REGISTERED:
+        _require_heights(model)
     return model
+
+
+def _require_heights(model: Simulator) -> None:
+    """Predict a ramp over all levels, and raise an InputError that names the model if this fails or if the
+    result is not a finite height for each pixel.
+    """
+    side = model.tile.size_px if model.tile else _TRIAL_PX
+    ramp = torch.linspace(0, model.config.full_height_um, side * side).reshape(1, 1, side, side)
+    what = f"prediction of model {model.name}"
+    # In training mode, the trial could change running means or use up random numbers.
+    model.eval()
+    try:
+        with torch.no_grad():
+            heights = model(ramp)
+            shapes, finite = (tuple(heights.shape), tuple(ramp.shape)), bool(heights.isfinite().all())
+    except Exception as error:
+        raise InputError(what, got=f"{type(error).__name__}: {said(error)}", wanted="heights") from error
+    if shapes[0] != shapes[1]:
+        cut = f"interior must cut reach_px = {model.reach_px} pixels off each side" if model.reach_px else ""
+        raise InputError(what, got=f"shape {shapes[0]}", wanted=f"{shapes[1]}, that of the layout", hint=cut)
+    if not finite:
+        raise InputError(what, got="NaN or infinity", wanted="finite heights")
+    model.train()

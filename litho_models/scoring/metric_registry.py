@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError, require_known, said
 from litho_data.foundation.kinds import Array
 from litho_data.store import PrintedScan
 from litho_models.scoring.films import FILMS_TEXT, films_of_scan
@@ -85,7 +85,7 @@ def register_metric(
     ``function(scan, prediction_um, residual_um)`` receives the ``PrintedScan`` and two maps in µm, of shape
     (ny, nx). The first map is the predicted height. The second map is the measured minus the predicted
     height, after the per-scan terms are removed; it is NaN at pixels that are not scored. The function
-    returns a number, or None if there is nothing to measure. Example::
+    returns a number, or None or NaN if there is nothing to measure. Example::
 
         register_metric(
             "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
@@ -113,7 +113,15 @@ def register_metric(
     taken = {known.key for known in registered_metrics()} | ScanRow.model_fields.keys()
     if metric.key in taken | ModelScores.model_fields.keys():
         raise InputError("metric", got=metric.key, wanted="a name that is not taken")
-    _MEASUREMENTS.append(Measurement((metric,), lambda *scan: (function(*scan),), explanation))
+
+    def measured(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> tuple[float | None]:
+        try:
+            return (function(scan, prediction_um, residual_um),)
+        except Exception as error:
+            got = f"{type(error).__name__}: {said(error)}"
+            raise InputError(f"metric {name} of {scan.id}", got=got, wanted="a number or None") from error
+
+    _MEASUREMENTS.append(Measurement((metric,), measured, explanation))
     return metric
 
 
@@ -134,7 +142,7 @@ def metrics_of(scan: PrintedScan, prediction_um: Array, residual_um: Array) -> d
     Return them as the fields of ``MetricValues``.
 
     Raises:
-        InputError: the function of a metric returns neither a number nor None.
+        InputError: the function of a metric raises an error, or returns neither a number nor None.
     """
     values: dict[str, float | None] = {}
     for measurement in _MEASUREMENTS:

@@ -17,6 +17,7 @@ from litho_models.fitting.fit import run_key
 from litho_models.models import MODELS, build_model, kernels_part, register_part
 from litho_models.models.baselines import Affine
 from litho_models.models.parts import PARTS, REGISTERED
+from litho_models.simulator import Simulator
 from litho_models.splits.folds import Fold
 from tests.litho_models.prints import make_scans, write_store
 
@@ -65,6 +66,55 @@ def test_a_fit_is_made_again_after_the_code_of_its_model_changed(tmp_path, monke
     assert spreads[0] > 0.1
     assert spreads[1] == 0
     assert plugins.foreign_sha256(Affine) == ""
+
+
+def test_a_model_without_a_reach_is_refused_when_it_is_registered(monkeypatch):
+    monkeypatch.setattr("litho_models.models.MODELS", known := dict(MODELS))
+
+    class NoReach(Simulator):
+        name = "no-reach"
+
+        def interior(self, layout_um):
+            return layout_um
+
+    with pytest.raises(InputError, match="simulator no-reach, got no reach_px"):
+        register_simulator(NoReach)
+    assert "no-reach" not in known
+
+
+@pytest.mark.parametrize(
+    ("reach", "interior", "words"),
+    [
+        (2, lambda layout: layout, r"got shape \(1, 1, 132, 132\).*reach_px = 2 pixels off each side"),
+        (None, lambda layout: layout[..., 1:], r"got shape \(1, 1, 128, 127\), wanted \(1, 1, 128, 128\)"),
+        (0, lambda layout: layout.log(), "got NaN or infinity"),
+        (0, lambda layout: layout.no_such, "got AttributeError: 'Tensor' object has no attribute 'no_such'"),
+        (0, lambda layout: None, "got AttributeError"),
+    ],
+)
+def test_a_model_that_predicts_no_map_of_heights_is_refused_before_it_is_fitted(
+    reach, interior, words, monkeypatch
+):
+    monkeypatch.setattr("litho_models.models.MODELS", dict(MODELS))
+    monkeypatch.setattr("litho_models.models._REGISTERED", {})
+
+    class Wrong(Simulator):
+        name = "wrong"
+        reach_px = reach
+
+        def interior(self, layout_um):
+            return interior(layout_um)
+
+    register_simulator(Wrong)
+    with pytest.raises(InputError, match=f"prediction of model wrong, {words}"):
+        build_model("wrong")
+
+
+def test_an_own_model_that_is_not_loaded_is_told_from_a_misspelt_one():
+    with pytest.raises(InputError, match=r"'my-gain'.*registered first, in a command with --plugin FILE"):
+        build_model("my-gain")
+    with pytest.raises(InputError, match=r"'physic'.*did you mean physics\?"):
+        build_model("physic")
 
 
 def test_the_key_of_a_fit_covers_the_parts_and_kernels_that_its_model_names(tmp_path, monkeypatch):

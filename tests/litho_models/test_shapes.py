@@ -175,3 +175,10 @@ def test_a_metric_has_to_be_a_number(own_metrics):
     scan = make_scan(0, 64)
     with pytest.raises(InputError, match="metric map, got a ndarray"):
         score_model("flat", [scan], [Prediction(scan.layout_um)], NuisanceProtocol.of_policy("none"))
+
+
+def test_an_error_in_a_metric_is_one_line_that_names_it(own_metrics):
+    register_metric("broken", "nm", lambda scan, z, r: 1 / 0, "never computed.")
+    scan = make_scan(0, 64)
+    with pytest.raises(InputError, match=rf"metric broken of {scan.id}, got ZeroDivisionError: division by"):
+        score_model("flat", [scan], [Prediction(scan.layout_um)], NuisanceProtocol.of_policy("none"))
