@@ -19,7 +19,10 @@ STEPS: "dict[str, type[Step]]" = {}
 """The classes of the steps that a recipe can contain, keyed by the name of the operation."""
 # Arguments whose values come with the scan, so they are not settings of a step. The values are the phrases
 # with which messages name these arguments.
-_OF_SCAN = {"pitch_um": "the pixel pitch", "layout_level": "the layout in the scan's frame"}
+_OF_SCAN = {
+    "pitch_um": "the pixel pitch",
+    "layout_level": "the layout in the scan's frame, which only a build finds,",
+}
 
 
 @dataclass(frozen=True, eq=False)
