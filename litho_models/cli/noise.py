@@ -17,7 +17,10 @@ def noise(
     out: Annotated[Path, option("folder for noise.json, the report and the tables")],
     store: Annotated[
         Path | None,
-        argument("dataset store; only its scans that are marked substrate, flat or steps are used"),
+        argument(
+            "dataset store; scans marked substrate, flat or steps, repeated prints, and scans with a dose "
+            "are used"
+        ),
     ] = None,
     substrate: Annotated[Path | None, option("scan of the bare substrate, instead of a store")] = None,
     flat: Annotated[Path | None, option("scan of a flat print, instead of a store")] = None,
