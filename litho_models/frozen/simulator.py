@@ -110,8 +110,8 @@ class FrozenSimulator(nn.Module):
 
         Raises:
             InputError: the pitch or the level height differs from that of the model; the layout is not a
-                tensor, or has the wrong shape or dtype; or heights of the layout lie beyond the calibrated
-                range and the model was loaded without ``extrapolate``.
+                tensor, contains NaN, or has the wrong shape or dtype; or heights of the layout lie beyond the
+                calibrated range and the model was loaded without ``extrapolate``.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -230,8 +230,7 @@ class FrozenSimulator(nn.Module):
                 wanted=f"{wanted}, like the weights",
                 hint=f"use layout.to({wanted})",
             )
-        if not self.extrapolate:
-            self._check_range(layout_um)
+        self._check_range(layout_um)
 
     def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
         """Check that a pitch and a level height, µm, are those of the model. A value of None is not checked.
@@ -248,8 +247,11 @@ class FrozenSimulator(nn.Module):
 
     def _check_range(self, layout_um: Tensor) -> None:
         lowest, highest = (float(v) for v in torch.aminmax(layout_um.detach()))
+        if np.isnan(lowest):
+            got = f"NaN in {int(layout_um.isnan().sum())} of {layout_um.numel()} pixels"
+            raise InputError(f"layout for model {self.name}", got=got, wanted="a height for every pixel")
         inside = lowest >= self._lowest_um - _ROUNDING_UM and highest <= self._highest_um + _ROUNDING_UM
-        if not inside:
+        if not (inside or self.extrapolate):
             raise InputError(
                 f"layout for model {self.name}",
                 got=f"heights from {lowest:g} to {highest:g} µm",

@@ -82,7 +82,7 @@ def test_it_stays_frozen(folder):
         (lambda m: m(torch.zeros(1, 1, 64, 64), level_height_um=0.2), "level_height_um"),
         (lambda m: m(torch.full((1, 1, 64, 64), 1.3)), "calibrated range"),
         (lambda m: m(torch.full((1, 1, 64, 64), -0.1)), "calibrated range"),
-        (lambda m: m(torch.full((1, 1, 64, 64), float("nan"))), "calibrated range"),
+        (lambda m: m(torch.full((1, 1, 64, 64), float("nan"))), "NaN in 4096 of 4096 pixels"),
         (lambda m: m(torch.zeros(64, 64)), "shape"),
         (lambda m: m(torch.zeros(0, 1, 64, 64)), "shape"),
         (lambda m: m(torch.zeros(1, 1, 0, 64)), "shape"),
@@ -98,7 +98,11 @@ def test_it_refuses_in_one_line_what_it_was_not_made_for(folder, call, said):
 
 def test_extrapolation_has_to_be_asked_for(folder):
     high = torch.full((1, 1, 64, 64), 1.3)
-    assert torch.isfinite(load_frozen(folder, extrapolate=True)(high)).all()
+    model = load_frozen(folder, extrapolate=True)
+    assert torch.isfinite(model(high)).all()
+    high[..., 3, 5] = float("nan")
+    with pytest.raises(InputError, match="NaN in 1 of 4096 pixels"):
+        model(high)
 
 
 def truncate(folder):
