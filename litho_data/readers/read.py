@@ -90,6 +90,11 @@ def read_scan(
         finite = height[np.isfinite(height)]
         ends_um = [float(finite.min(initial=0)), float(finite.max(initial=0))]
         stated_size = chosen.size_um or _size_of_extent(chosen, stated_unit)
+        if stated_size and not chosen.size_um and size_um is None:
+            side_y, side_x = stated_size
+            assumed = "µm" if stated_size == chosen.extent else stated_unit
+            likely = f"a size of {side_y:g} × {side_x:g} µm is likely: confirm it with size_um"
+            notes.append(f"its coordinates have no unit; {assumed} was assumed, because {likely}")
         HEIGHT_UM.require(f"heights in µm, converted from unit {stated_unit!r}", ends_um)
         return Scan(
             height_um=height,

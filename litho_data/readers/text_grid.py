@@ -158,8 +158,7 @@ def map_of_points(points: Array, words: Sequence[str]) -> Map | None:
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
     size_um = _size_um(words, extent)
-    note = f"points of a grid; rows keep the order of the file, so y {'grows' if down else 'falls'} downwards"
+    # Rows keep the order of the file.
+    x_is = f"column {columns[0] + 1} of points; y {'grows' if down else 'falls'} downwards"
     counted = _counts(x) and _counts(y)
-    return Map(
-        values, None if counted else extent, size_um, x_is=f"column {columns[0] + 1} of points", notes=(note,)
-    )
+    return Map(values, None if counted else extent, size_um, x_is=x_is)

@@ -301,5 +301,21 @@ def test_coordinates_without_a_unit_are_taken_as_micrometres_or_need_a_size(
     values = 0.05 * np.random.default_rng(0).random((9, 12))
     values[0, 1:], values[1:, 0] = np.arange(11) * step, np.arange(8) * step
     np.savetxt(path, values)
-    found = read_scan(path, unit=unit).pitch_um
+    scan = read_scan(path, unit=unit)
+    found = scan.pitch_um
     assert found is None if pitch_um is None else found == pytest.approx((pitch_um, pitch_um))
+    assumed = "µm" if step == 0.2 else unit
+    said = f"its coordinates have no unit; {assumed} was assumed, because a size of 1.6 × 2.2 µm is likely"
+    assert [note.partition(":")[0] for note in scan.notes] == [said] * (pitch_um is not None)
+    if pitch_um is not None:
+        assert read_scan(path, unit=unit, size_um=(1.6, 2.2)).notes == ()
+
+
+def test_points_of_a_grid_say_how_y_runs_without_a_warning(tmp_path: Path) -> None:
+    rng, points = np.random.default_rng(0), [(x, y) for y in range(8) for x in range(9)]
+    for order, way in ((points, "grows"), (points[::-1], "falls")):
+        rows = (f"{0.2 * x:.1f} {0.2 * y:.1f} {rng.random():.4f}" for x, y in order)
+        (tmp_path / "scan.xyz").write_text("\n".join(["X (um) Y (um) Z (nm)", *rows]) + "\n")
+        (channel,) = list_channels(tmp_path / "scan.xyz")
+        assert channel.x_is == f"column 1 of points; y {way} downwards"
+        assert read_scan(tmp_path / "scan.xyz").notes == ()
