@@ -22,7 +22,6 @@ from litho_models.frozen.simulator import FrozenSimulator
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
-    from torch.fx import GraphModule, Node
 
 SUFFIXES = (".pt2", ".onnx")
 # Largest allowed difference, µm, between the height that an exported program computes and the height that its
@@ -119,30 +118,8 @@ def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
         with _Numbers(noted[0]):
             return simulator(layout_um)
 
-    traced = _folded(make_fx(run, tracing_mode="real")(layouts[0]))
+    traced = make_fx(run, tracing_mode="real")(layouts[0])
     return torch.export.export(_Program(traced), (layouts[0],), strict=False)
-
-
-def _folded(traced: GraphModule) -> GraphModule:
-    """Replace the operations that do not depend on the layout by their results. They are, for example, the
-    kernels of the blurs.
-    """
-    from torch.fx import map_arg
-
-    known: dict[Node, Any] = {}
-    for node in traced.graph.nodes:
-        if node.op == "get_attr":
-            known[node] = getattr(traced, node.target)
-        elif node.op == "call_function" and all(one in known for one in node.all_input_nodes):
-            known[node] = node.target(*map_arg(node.args, known.get), **map_arg(node.kwargs, known.get))
-    for node, value in known.items():
-        if node.op != "get_attr" and isinstance(value, Tensor) and not known.keys() >= node.users.keys():
-            traced.register_buffer(f"known_{node.name}", value)
-            with traced.graph.inserting_before(node):
-                node.replace_all_uses_with(traced.graph.get_attr(f"known_{node.name}"))
-    traced.graph.eliminate_dead_code()
-    traced.recompile()
-    return traced
 
 
 class _Program(nn.Module):
@@ -164,7 +141,7 @@ def _write_pt2(program: ExportedProgram, file: Path, layout_um: Tensor, facts: d
 def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any]) -> Tensor:
     try:
         import onnxruntime
-        from onnxscript.optimizer import fold_constants, remove_unused_nodes
+        import onnxscript  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(
             "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
@@ -172,8 +149,7 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
     # The exporter warns about packages that none of these models needs. Such warnings are hidden.
     with quiet("torch.onnx", "onnxscript", "onnx_ir", above=logging.WARNING):
         try:
-            # The search for patterns to simplify would take most of the time, and the runtime does it anyway.
-            written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False, optimize=False)
+            written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)
         except torch.onnx.errors.OnnxExporterError as error:
             complex_numbers = "complex" in str(error)
             raise InputError(
@@ -184,8 +160,6 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
                 hint="export to .pt2, which supports every model",
             ) from None
     assert written is not None
-    fold_constants(written.model)
-    remove_unused_nodes(written.model)
     written.model.metadata_props.update({key: json.dumps(value) for key, value in facts.items()})
     written.save(str(file))
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
