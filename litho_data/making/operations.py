@@ -188,12 +188,17 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
 
 @_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
-    """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs these levels."""
+    """Find the layout's levels at the pixels of the raw scan. Layout-aware levelling needs these levels.
+
+    The levels are NaN at defects too, so that no background is fitted to dust.
+    """
     from litho_data.level import layout_in_scan_frame
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
     found = _registration(raw, layout, params)
     _require_found(found, params, " before levelling")
+    if found.defects is not None:
+        layout = np.where(found.defects, np.nan, layout)
     shape, pitch_um = raw.shape, tuple(params["scan_pitch_um"])
     level = layout_in_scan_frame(
         layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"], found.bend_um
