@@ -14,7 +14,7 @@ import numpy as np
 from litho_data.foundation import Array, InputError
 
 REACH_PX = 8.0
-"""Distances from an edge that are larger than this many pixels of the micrograph are set to this value."""
+"""Distances from an edge are measured at least up to this many pixels of the micrograph."""
 _NOISE_PX = 1.0
 # Pixels on the film whose distance from the first edge lies in the first range, in px, count as rim. Pixels
 # off the film whose distance lies in the second range count as ground. The last value is the sigma, in px, of
@@ -45,11 +45,12 @@ class Edges(NamedTuple):
     sigma_px: float
 
 
-def find_edges(grey: Array) -> Edges:
+def find_edges(grey: Array, reach_px: float = REACH_PX) -> Edges:
     """Find the edges of the film in a micrograph, to a fraction of a pixel.
 
     Args:
         grey: grey values of the micrograph, shape (ny, nx).
+        reach_px: larger distances from an edge are set to this value.
 
     Raises:
         InputError: the micrograph shows no edges.
@@ -82,10 +83,10 @@ def find_edges(grey: Array) -> Edges:
     if not lines:
         raise InputError("micrograph", got="no edge", wanted="bright film on dark ground, or the reverse")
     points = np.concatenate([_dense(line) for line in lines])
-    near = np.where(film, inside, outside) <= REACH_PX + _NEAR_PX
-    reached, _ = cKDTree(points).query(np.argwhere(near), distance_upper_bound=REACH_PX)
-    distance = np.full(smooth.shape, REACH_PX)
-    distance[near] = np.minimum(reached, REACH_PX)
+    near = np.where(film, inside, outside) <= reach_px + _NEAR_PX
+    reached, _ = cKDTree(points).query(np.argwhere(near), distance_upper_bound=reach_px)
+    distance = np.full(smooth.shape, reach_px)
+    distance[near] = np.minimum(reached, reach_px)
     slope = np.hypot(*np.gradient(smooth))[np.abs(above) < height / 4]
     noise = np.std((smooth - gaussian_filter(smooth, 2 * _NOISE_PX))[outside > _GROUND_PX[0]])
     return Edges(np.where(above > 0, distance, -distance), film != first, float(noise / np.median(slope)))

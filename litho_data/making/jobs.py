@@ -15,6 +15,7 @@ from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.making.chain import Chain
+from litho_data.making.contour import REACH_PX
 from litho_data.making.operations import OPERATIONS, READER_SHA256
 from litho_data.readers.exported import sidecar_of
 from litho_data.readers.read import own_reader_sha256
@@ -167,7 +168,10 @@ class FieldJob:
         """
         full_level = self.card.layout.levels - 1
         film = {"film_um": full_level * self.card.layout.level_height_um}
-        edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film})
+        # Distances must be known up to the size of a layout pixel, even in a much finer micrograph.
+        ratio = self.card.layout.pitch_um / min(chain.pitch_um)
+        reach = {"reach_px": ratio} if ratio > REACH_PX else {}
+        edges = chain.run("find-edges", {"scan_pitch_um": chain.pitch_um, **film, **reach})
         chain.run("register", self.register_params(chain))
         sigma = {"edge_sigma_um": edges["edge_sigma_nm"] / 1e3, "full_level": full_level}
         chain.run("cover", {"edge_px": 0, **self._place(chain), **film, **sigma, "dirt_px": _DIRT_PX})

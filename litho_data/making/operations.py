@@ -122,9 +122,10 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
 @_operation("find-edges", "micrograph", "making/contour.py")
 def _find_edges(params: Params, _: Files, arrays: Inputs) -> Made:
     """Find the edges of the film, and convert them to a height map. Another operation registers this map."""
-    from litho_data.making.contour import coverage, find_edges
+    from litho_data.making.contour import REACH_PX, coverage, find_edges
 
-    edges, pitch_um = find_edges(arrays["micrograph"]), float(np.mean(params["scan_pitch_um"]))
+    edges = find_edges(arrays["micrograph"], params.get("reach_px", REACH_PX))
+    pitch_um = float(np.mean(params["scan_pitch_um"]))
     height = params["film_um"] * coverage(edges.distance_px, 1.0)
     found = {"edge_distance_um": edges.distance_px * pitch_um, "levelled_height_um": height}
     facts = {"edge_sigma_nm": 1e3 * edges.sigma_px * pitch_um, "speck_px": int(edges.specks.sum())}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,8 @@ from litho_data.cards.card import check_card
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.making.contour import coverage, edge_shift_px, find_edges, foreign, with_moved_edges
-from litho_data.making.operations import OPERATIONS
+from litho_data.making.jobs import field_jobs
+from litho_data.making.operations import OPERATIONS, no_recipe
 from litho_data.provenance.verify import verify
 
 RADIUS_PX = 60.0
@@ -192,6 +194,29 @@ def test_a_film_store_is_verified_and_its_instrument_is_part_of_it(films: Path, 
     shutil.copytree(films / "films.zarr", copy)
     zarr.open_group(copy, mode="r+", use_consolidated=False).attrs["instrument"] = "afm"
     assert open_store(copy).sha256 != open_store(films / "films.zarr").sha256
+
+
+def test_film_is_whole_and_ground_bare_however_fine_the_micrograph(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Check the heights of a stripe if a layout pixel is 20 pixels of the micrograph."""
+    card = CARD.replace("average_px = 4\nlevels = 17", "levels = 2").replace(".png", ".tif", 1)
+    card = card.replace("[0.48, 0.56]", "[0.048, 0.08]").replace("unknown", "substrate")
+    (tmp_path / "card.toml").write_text(card, encoding="utf-8")
+    for name in ("layout", "sem"):
+        (tmp_path / name).mkdir()
+    layout = np.zeros((12, 20), np.uint8)
+    layout[:, 6:12] = 1
+    across_px = np.broadcast_to(60 - np.abs(np.arange(400) - 179.5), (240, 400))
+    cv2.imwrite(str(tmp_path / "layout/F1.tif"), layout)
+    cv2.imwrite(str(tmp_path / "sem/F1.png"), _micrograph(across_px))
+    # So small a pattern cannot be registered. Its place is known: a rim of two layout pixels is added to it.
+    in_place = np.array([[1, 0, 0.008], [0, 1, 0.008], [0, 0, 1]])
+    placed = replace(OPERATIONS["register"], function=lambda *_: ({"scan_to_layout": in_place}, {}))
+    monkeypatch.setitem(OPERATIONS, "register", placed)
+    (job,) = field_jobs(list_fields(tmp_path / "card.toml"), no_recipe())
+    height_um = job.run().arrays["height_um"][2:-2, 2:-2]
+    np.testing.assert_allclose(height_um, 0.01 * layout, atol=0.0002)
 
 
 @pytest.mark.measured
