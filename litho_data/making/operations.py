@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 UNREGISTERED = "registration failed"
 _PLANE = {"step": [{"op": "layout-aware"}]}
-# If the registration fails and the aspect ratio of the scan's pixels differs from 1 by more than this, the
-# message asks whether rows are missing.
+# Pixels whose aspect ratio differs from 1 by more than this count as oblong. Micrographs with such pixels are
+# refused. If the registration of a scan with such pixels fails, the message asks whether rows are missing.
 _OBLONG = 0.01
 
 
@@ -115,6 +115,13 @@ def _read_micrograph(params: Params, files: Files, _: Inputs) -> Made:
     if grey.dtype.kind != "u" or grey.dtype.itemsize > 2:
         raise InputError(f"micrograph {files[0]}", got=str(grey.dtype), wanted="grey values of 8 or 16 bits")
     pitch_um = [size / length for size, length in zip(params["size_um"], grey.shape, strict=True)]
+    if abs(pitch_um[0] / pitch_um[1] - 1) > _OBLONG:
+        # Distances from edges are measured in pixels.
+        raise InputError(
+            f"micrograph {files[0]}",
+            got=f"pixels of {pitch_um[0]:.4g} × {pitch_um[1]:.4g} µm (y × x)",
+            wanted=f"square pixels, so a size_um in the ratio of {grey.shape[0]} to {grey.shape[1]} pixels",
+        )
     facts = {"pitch_um": pitch_um, "sized_by_file": False, "reader": "picture", "unit": "", "channel": ""}
     return {"micrograph": grey.astype(np.uint16)}, {**facts, "fast_axis": None, "header": {}}
 

@@ -140,6 +140,18 @@ def test_a_picture_without_edges_is_refused() -> None:
         find_edges(np.full((64, 64), 90, np.uint8))
 
 
+@pytest.mark.parametrize("size_um", [[0.48, 0.28], [0.56, 0.48]])
+def test_a_micrograph_with_oblong_pixels_is_refused(size_um: list[float], tmp_path: Path) -> None:
+    """Check that distances from edges have the same unit along both axes."""
+    cv2.imwrite(str(tmp_path / "F1.png"), np.zeros((48, 56), np.uint8))
+    read, files = OPERATIONS["read-micrograph"], {"F1.png": tmp_path / "F1.png"}
+    assert read.run({"size_um": [0.48, 0.5595]}, files, {})[2]["pitch_um"] == pytest.approx(
+        [0.01] * 2, rel=0.01
+    )
+    with pytest.raises(InputError, match=r"pixels of .* × .* µm \(y × x\), wanted square pixels"):
+        read.run({"size_um": size_um}, files, {})
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
