@@ -4,13 +4,14 @@ or gives a reason for skipping it.
 Jobs are sent to other processes and computers, so they contain only paths and plain parameters.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from litho_data.cards.card import Card
+from litho_data.cards.card import Card, Use
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
 from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
@@ -183,9 +184,8 @@ class FieldJob:
         of_dataset = self.field.use == "dataset"
         pitch = {"scan_pitch_um": chain.pitch_um}
         recipe = dict(self.recipe)
-        if "mask_level" not in chain.arrays or not (of_dataset or np.ptp(chain.arrays["mask_level"])):
-            # A reference scan has no layout, or a flat layout that cannot be located in the scan.
-            recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
+        if not of_dataset:
+            recipe["step"] = _without_layout(recipe["step"], self.field.use)
         elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             chain.run("locate", self.register_params(chain))
         chain.run("level", {**pitch, "recipe": recipe})
@@ -259,6 +259,23 @@ class FieldJob:
             {**one, **_own_reader(files[one["file"]], one["read"]["format"])}
             for one in self.standards.described
         ]
+
+
+def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
+    """Return the steps of a recipe with which a reference scan is levelled. Its layout, if it has one, cannot
+    be located in the scan, so no step can be layout-aware.
+
+    On a surface of one level, polynomials of the same degrees take their place. On steps and gratings, these
+    would remove part of the structure, so nothing takes their place.
+    """
+    kept = []
+    for step in steps:
+        if step["op"] != _LAYOUT_AWARE:
+            kept.append(step)
+        elif use in ("flat", "substrate"):
+            degrees = {name: value for name, value in step.items() if name != "blur_px"}
+            kept.append({**degrees, "op": "polynomial"})
+    return kept
 
 
 def _own_reader(scan: Path, format: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.making.build import _relative, build_dataset
 from litho_data.making.jobs import field_jobs, finish
-from litho_data.making.operations import no_recipe
+from litho_data.making.operations import load_recipe, no_recipe
 from litho_data.making.result import BuildResult, report_folder
 from litho_data.provenance.history import raw_folder, read_steps, replay
 from litho_data.provenance.verify import verify
@@ -262,6 +262,25 @@ def test_references_are_kept_apart_from_the_dataset(tmp_path: Path) -> None:
     # From 128² pixels, the standard deviation of white noise is known to 1 / sqrt(2 · 128²) = 0.6 %.
     assert store.scan_frame("bare", "levelled_height_um").std() == pytest.approx(0.001, rel=0.03)
     assert verify(tmp_path / "prints.zarr").findings == ()
+
+
+def test_references_are_levelled_without_their_layouts(tmp_path: Path) -> None:
+    """Check that a plane is removed from surfaces of one level, and nothing from steps, by default."""
+    card = write_campaign(tmp_path, count=1, more='table = "scans.csv"\n[write]\nsurround = "substrate"')
+    card.write_text(card.read_text().replace("levelled = true\n", ""))
+    (tmp_path / "scans.csv").write_text("id,use\nP11,\nbare,substrate\neven,flat\nstairs,steps\n")
+    ladder, tilt_um = np.tile(np.arange(112) // 14, (112, 1)).astype(np.uint8), np.arange(128) / 400
+    tifffile.imwrite(tmp_path / "layouts" / "stairs.tif", ladder)
+    tifffile.imwrite(tmp_path / "layouts" / "even.tif", np.full_like(ladder, 6))
+    for name, shape in {"bare": 0, "even": 0.6, "stairs": np.pad(0.1 * ladder, MARGIN_PX)}.items():
+        write_scan(tmp_path / "scans" / f"{name}.txt", shape + tilt_um + np.zeros((128, 128)))
+    jobs = field_jobs(list_fields(card), load_recipe(None))
+    made = {job.id: job.run().arrays for job in jobs if job.field.use != "dataset"}
+    for name in ("bare", "even"):
+        # The file keeps six digits.
+        np.testing.assert_allclose(made[name]["levelled_height_um"], 0, atol=1e-5)
+    stairs = made["stairs"]
+    np.testing.assert_array_equal(stairs["levelled_height_um"], stairs["raw_height_um"])
 
 
 def test_a_levelling_recipe_is_applied_and_recorded(tmp_path: Path) -> None:
