@@ -228,6 +228,8 @@ def _refusal(scan_id: str, print_id: str | None, use: str, table: Mapping[str, F
             return f"the first or last character of the {what} {name[:80]!r}, or its length, is not allowed"
     if print_id is None and use == "dataset":
         return f"id does not match [ids] print = {card.ids.print!r}"
+    if use != "dataset" and card.scan.instrument == "sem":
+        return f"use = {use}, but a reference is a scan of heights, and a micrograph has none"
     if scan_id not in table and any("order" in row for row in table.values()):
         return f"not in {card.ids.table}, which sets the order"
     return ""

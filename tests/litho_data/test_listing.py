@@ -89,6 +89,17 @@ def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
     assert by_id["bare"].layout is None
 
 
+def test_a_micrograph_is_no_reference(tmp_path: Path) -> None:
+    card = folder_with(tmp_path, [*PAIRS, "scans/bare.txt"], more='table = "scans.csv"')
+    heights = 'format = "text-matrix"\nunit = "m"\n'
+    card.write_text(card.read_text().replace(heights, 'instrument = "sem"\n'), encoding="utf-8")
+    (tmp_path / "scans.csv").write_text("id,use\nP11,\nP12,flat\nbare,substrate\n", encoding="utf-8")
+    listing = list_fields(card)
+    assert [one.id for one in listing.fields] == ["P11"]
+    assert "use = flat" in listing.refused["P12"]
+    assert "use = substrate, but a reference is a scan of heights" in listing.refused["bare"]
+
+
 def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_path: Path) -> None:
     """Check that a scan without an order is not given an arbitrary place in the order of writing."""
     card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
