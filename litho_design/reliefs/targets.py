@@ -48,8 +48,8 @@ def load_relief(
     return _checked(heights, size), TargetRecord.of_file(path, notes)
 
 
-def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
-    """Return the deviation of a print from the expected print, after blurring it and subtracting its mean.
+def print_off_um(printed_um: np.ndarray, predicted_um: np.ndarray, blur_px: float) -> np.ndarray:
+    """Return the deviation of a print from its predicted print, after blurring it and subtracting its mean.
 
     The deviation is a float32 array of shape (size, size), in µm.
 
@@ -57,7 +57,7 @@ def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float
     """
     from scipy.ndimage import gaussian_filter
 
-    off = gaussian_filter(printed_um.astype(np.float64) - expected_um, blur_px)
+    off = gaussian_filter(printed_um.astype(np.float64) - predicted_um, blur_px)
     return (off - off.mean()).astype(np.float32)
 
 

@@ -21,6 +21,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import own_error_um
 from litho_design.reliefs.settings import ReliefSettings
+from litho_design.reliefs.targets import print_off_um
 from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
@@ -59,9 +60,10 @@ class ReliefTask(Task):
     """The task of printing a target height map in µm, shape (size, size). ``load_relief`` returns such a map
     and its record.
 
-    The input ``off_um`` is the deviation of a first print from the expected print, without its mean. The
-    search expects the same deviation in the next print. The scores compare the predicted print with the
-    target itself, as a measurement would.
+    The inputs ``first_level`` and ``first_print_um``, both of shape (size, size), are the layout of a first
+    print and its measured heights. Every printer predicts the first print with another deviation, and the
+    next print is expected to deviate by the same amount. ``printed`` therefore adds this deviation, so search
+    and scores compare the expected real print with the target itself, as a measurement would.
 
     Raises:
         InputError: the start in the settings works only for holograms or lenses, or the spreads of the
@@ -87,10 +89,15 @@ class ReliefTask(Task):
     ):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble, record=record)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
-        off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
-        # The height map that the model's print should match. The real print is then expected to match the
-        # target, because it deviates from the model's print by ``off_um``.
-        self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
+        self._off: dict[Printer, Tensor] = {}
+        for one in self.printers:
+            # The search may run its models at a lower precision; the deviation is computed before.
+            self._off_um(one)
+        if "first_level" in self.inputs:
+            self.notes.append(
+                "the print according to each model includes the deviation of the measured first print from "
+                "the prediction of this model"
+            )
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
         span_um, reach_um = float(np.ptp(self.inputs["relief_um"])), max(heights) - min(heights)
@@ -105,16 +112,37 @@ class ReliefTask(Task):
         """Return a bench that returns the print itself and ignores the light."""
         return _Bare(self.settings.layout).to(self.printer.device)
 
+    def printed(self, level: Tensor, printer: Printer) -> Tensor:
+        """Return the expected height of a real print, µm, shape (size, size). It is the print that the
+        printer predicts, plus the deviation of the first print, if any, from the prediction of this printer.
+        """
+        return super().printed(level, printer) + self._off_um(printer)
+
+    def _off_um(self, printer: Printer) -> Tensor:
+        """Return the deviation of the first print from the prediction of a printer, µm, shape (size, size).
+        It is 0 if there is no first print.
+        """
+        if "first_level" not in self.inputs:
+            return torch.zeros_like(self.target)
+        if printer not in self._off:
+            level = torch.from_numpy(self.inputs["first_level"]).to(self.target)[None, None]
+            with torch.no_grad():
+                predicted_um = super().printed(level, printer).cpu().numpy()
+            blur_px = self.settings.off_blur_um / self.settings.layout.pitch_um
+            off_um = print_off_um(self.inputs["first_print_um"], predicted_um, blur_px)
+            self._off[printer] = torch.from_numpy(off_um).to(self.target)
+        return self._off[printer]
+
     def loss(self, seen: Tensor) -> Tensor:
         """Return the rms error of a print after the mean error is removed, µm."""
-        return (seen - self.asked).std(correction=0)
+        return (seen - self.target).std(correction=0)
 
     def loss_by(self, printer: Printer, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return the expected rms error of a real print, µm. It combines the error of the print that the
         model predicts with the expected error of the model's prediction.
         """
         rms_um = self.loss(seen)
-        own_um = own_error_um(printer.card, float(self.asked.std()))
+        own_um = own_error_um(printer.card, float(self.target.std()))
         return (rms_um.square() + own_um**2).sqrt(), {"rms": float(rms_um.detach())}
 
     def over_models(self, losses: Tensor) -> Tensor:
@@ -148,7 +176,7 @@ class ReliefTask(Task):
         height; and the best affine layout.
         """
         heights = self.printer.level_heights_um()
-        starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
+        starts = [self._levels_printing(heights, self._asked, zero) for zero in _AFFINE_ZEROS]
         return min((*starts, self.cells.average(self._best_affine)), key=self._expected)
 
     def untouched(self) -> dict[str, Tensor]:
@@ -164,6 +192,13 @@ class ReliefTask(Task):
         with torch.no_grad():
             found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
         return found | {"free levels": self.figures(self._free_print)}
+
+    @property
+    def _asked(self) -> Tensor:
+        """Return the height map, µm, that the prediction of the model has if the expected print is the
+        target.
+        """
+        return self.target - self._off_um(self.printer)
 
     @property
     def _nominal(self) -> Tensor:
@@ -206,7 +241,7 @@ class ReliefTask(Task):
         level per cell.
         """
         whole = self.cells(levels.round())[None, None].float()
-        losses = torch.stack([self.loss_by(one, one(whole)[0, 0])[0] for one in self.printers])
+        losses = torch.stack([self.loss_by(one, self.printed(whole, one))[0] for one in self.printers])
         return float(self.over_models(losses))
 
     def thick_score(self, height_um: Tensor) -> None:
@@ -217,14 +252,14 @@ class ReliefTask(Task):
         """Return the arrays that every task saves, and a map of the height error that remains even with the
         best unrounded levels. No layout can remove this error.
         """
-        left = self.asked - self._free_print
+        left = self.target - self._free_print
         return super().arrays(level, height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
     def _free_print(self) -> Tensor:
         """Return the print, µm, of the unrounded levels with the lowest loss."""
         free = DirectLevels(self.settings.layout).to(self.printer.device)
-        free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
+        free.start_from(self._levels_printing(self.printer.level_heights_um(), self._asked))
 
         def loss() -> tuple[Tensor, Tensor]:
             print_um = self.printed(free.sample(), self.printer)

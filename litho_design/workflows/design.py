@@ -27,7 +27,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers, models_at_hand
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
-from litho_design.reliefs.targets import load_relief, print_off_um
+from litho_design.reliefs.targets import load_relief
 from litho_design.reliefs.task import ReliefTask
 from litho_design.reports.design import write_design_report
 from litho_design.tasks.design import Design
@@ -171,8 +171,8 @@ def correct(
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction that was printed and measured.
-        scan: measurement of this first print. The next print is expected to deviate from its prediction in
-            the same way as the first print did.
+        scan: measurement of this first print. The next print is expected to deviate from the prediction of
+            each model in the same way as the first print did.
         how: see ``How``; ``robust`` is True by default.
 
     Returns:
@@ -188,18 +188,18 @@ def correct(
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         heights, record = load_relief(relief, made.layout, made.height_um)
-        inputs = {"relief_um": heights} | _print_off(made, after, scan)
+        inputs = {"relief_um": heights} | _first_print(made, after, scan)
         return ReliefTask(made, printer, inputs=inputs, ensemble=others, record=record)
 
     robustly: How = {"robust": True, **how}
     return _designed(task, made.layout, model, out, **robustly)
 
 
-def _print_off(
+def _first_print(
     settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
 ) -> dict[str, np.ndarray]:
-    """Return the deviation of the measured print of a first element from its predicted print, as an input for
-    the design of the second element.
+    """Return the layout and the measured print of a first element, as inputs for the design of the second
+    element.
 
     The result is empty if there is no first element.
     """
@@ -214,8 +214,7 @@ def _print_off(
             f"design {after}", got="another layout", wanted="a design with the same size, pitch and levels"
         )
     printed_um, _ = measured_print(first, scan)
-    blur_px = settings.off_blur_um / settings.layout.pitch_um
-    return {"off_um": print_off_um(printed_um.numpy(), first.expected_um.numpy(), blur_px)}
+    return {"first_level": first.level.numpy(), "first_print_um": printed_um.numpy()}
 
 
 def design(

@@ -21,6 +21,7 @@ from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
 from litho_design.reliefs.task import ReliefTask
 from litho_design.reports.advice import width_sentence
+from litho_design.tasks.run import best_layout
 
 TINY = {
     "layout.size_px": 48,
@@ -157,11 +158,12 @@ def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_pr
     # The error due to levels remains, 62 nm for a tenth of the cells. The tilt of 50 nm rms is removed.
     assert rms_nm(first) > 20
     assert rms_nm(again) < rms_nm(first) / 3
-    # The scores compare the modelled print with the target relief.
+    # The scores compare the expected real print with the target relief, and a measured print likewise.
     expected = np.load(again / "predicted_height_um.npy")
     assert made.predicted["rms_nm"] == pytest.approx(1e3 * (expected - wanted).std(), rel=1e-4)
-    assert made.predicted["rms_nm"] > 20
-    assert made.baselines["uncorrected"] == load_design(first).record.baselines["uncorrected"]
+    assert made.predicted["rms_nm"] == pytest.approx(rms_nm(again), abs=2)
+    printed = torch.from_numpy(np.asarray(printed_um(again)))
+    assert load_design(again).score(printed).rms_nm == pytest.approx(rms_nm(again), rel=1e-4)
     # Such a small element cannot be registered, and a scan of another size does not match its pixels.
     with pytest.raises(InputError, match="--scan-aligned"):
         measured_print(load_design(first), replace(scan, aligned=False))
@@ -174,6 +176,33 @@ def test_a_second_round_subtracts_the_error_of_the_first_print(tmp_path, make_pr
         correct(wanted[:44, :44], model, tmp_path / "no", settings=other, after=first, scan=scan)
     words = ["correct", "lens", "--model", "none", "--size-px", "48", "--out", tmp_path / "no"]
     assert "a scan without its element" in refused(*words, "--scan", tmp_path / "scan.txt")
+
+
+def test_every_model_learns_from_the_first_print(make_printer):
+    """Check that every model predicts the first layout as it was printed, apart from its mean height, and
+    that scores, width and gain follow from these predictions.
+    """
+    settings = relief_settings(TINY | {"off_blur_um": 0.0})
+    generator = np.random.default_rng(0)
+    level = np.repeat(np.repeat(generator.integers(0, 13, (24, 24)), 2, 0), 2, 1).astype(np.uint8)
+    printed, wanted = generator.random((2, 48, 48)).astype(np.float32)
+    models = [make_printer(settings.layout, gain=gain, name=str(gain)) for gain in (0.5, 0.6, 0.7)]
+    inputs = {"relief_um": wanted, "first_level": level, "first_print_um": printed}
+    task = ReliefTask(settings, models[0], inputs=inputs, ensemble=models[1:2])
+    task.judges = models[2:]
+    for one in models:
+        off = task.printed_um(torch.from_numpy(level), one).numpy() - printed
+        assert off == pytest.approx(off.mean(), abs=1e-6)
+    # The models agree on the error of the first layout, which is that of the measured print.
+    rms_nm = 1e3 * (printed - wanted).std()
+    width = best_layout(task, torch.from_numpy(level).long())[1]
+    assert width.values("searched") == pytest.approx([rms_nm] * 3, rel=1e-4)
+    assert float(task.objective(torch.from_numpy(level)[None, None].float())[0]) == pytest.approx(
+        1e-3 * rms_nm, rel=1e-4
+    )
+    # Another model in the first place does not change the expectation of any model.
+    other = ReliefTask(settings, models[1], inputs=inputs)
+    assert torch.equal(*(one.printed_um(torch.from_numpy(level), models[1]) for one in (task, other)))
 
 
 def test_the_part_of_a_relief_that_no_layout_prints_is_shown(tmp_path, monkeypatch, capsys):
