@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from typing import Self
 
 import numpy as np
 import torch
@@ -64,6 +66,19 @@ class LensOptics(nn.Module):
     def oblique_path_um(self) -> Tensor | float:
         """Return the extra path of oblique light to each of these points, float64, µm."""
         return 0.0
+
+    def thin(self) -> Self:
+        """Return this bench for a thin element, with the same propagator. The slopes of a thick element cast
+        shadows, so only a thin element is a perfect lens.
+        """
+        bench = copy.copy(self)
+        bench.optics = self.optics.model_copy(update={"element": "thin"})
+        return bench
+
+    def ideal_psf(self) -> Tensor:
+        """Return the PSF of a perfect lens, shape (window, window)."""
+        psf: Tensor = self.thin()(self.ideal_height_um())
+        return psf
 
     def ideal_height_um(self) -> Tensor:
         """Return the heights of a perfect lens, µm, wrapped at the height that gives a phase delay of 2π."""

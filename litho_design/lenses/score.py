@@ -65,7 +65,7 @@ class ImagingScore(Record):
 @torch.no_grad()
 def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensScore:
     """Score the PSF of printed heights, µm, on a plane, shape (size, size), or on rings, shape (rings,)."""
-    psf, ideal = (bench(height).double() for height in (height_um, bench.ideal_height_um()))
+    psf, ideal = bench(height_um).double(), bench.ideal_psf().double()
     pitch = bench.layout.pitch_um
     fwhm_ideal = half_maximum_width_um(ideal, pitch)
     radius_um = 3 * fwhm_ideal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
@@ -153,7 +154,9 @@ class LensTask(Task):
         """Return the scores of a perfect lens and of a flat plate on the same grid."""
         ideal = self.bench.ideal_height_um()
         flat = lens_score(self.bench, torch.zeros_like(ideal)).model_dump(include=_OF_POWER)
-        return {"perfect lens": self.score(ideal).model_dump(), "no lens": flat}
+        perfect = copy.copy(self)
+        perfect.bench = self.bench.thin()
+        return {"perfect lens": perfect.score(ideal).model_dump(), "no lens": flat}
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Return the Strehl ratio and the centre-to-background ratio of a PSF."""
@@ -175,7 +178,7 @@ class LensTask(Task):
 
     @cached_property
     def _ideal_peak(self) -> float:
-        return float(self.bench(self.bench.ideal_height_um()).max())
+        return float(self.bench.ideal_psf().max())
 
 
 @register_task

@@ -86,7 +86,7 @@ def lens_curves(height_um: np.ndarray, psf: np.ndarray, bench: LensBench) -> Fig
 
     with torch.no_grad():
         ideal_um = bench.ideal_height_um()
-        ideal = bench(ideal_um).cpu().numpy()
+        ideal = bench.ideal_psf().cpu().numpy()
     figure = new_figure(13, 3.6)
     profile, spread, transfer = figure.subplots(1, 3)
     middle, row = len(height_um) // 2, len(psf) // 2

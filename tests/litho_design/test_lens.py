@@ -68,6 +68,28 @@ def test_a_perfect_lens_is_as_sharp_in_oblique_light(direction):
     assert (oblique(oblique.ideal_height_um()) - psf).abs().max() < 1e-4 * psf.max()
 
 
+def test_a_perfect_lens_is_thin_even_if_the_element_is_thick(settings):
+    """Check at an NA of 0.6, where the slopes of a thick relief cast shadows: a print is compared with the
+    same perfect lens, whichever kind of element it is.
+    """
+    thick_optics, layout = Optics(distance_um=20.0, element="thick"), settings.layout
+    thin, thick = (
+        lens_task(settings.model_copy(update={"optics": one}), Printer(None, layout, source="none"))
+        for one in (Optics(distance_um=20.0), thick_optics)
+    )
+    height = thin.bench.ideal_height_um()
+    figures, shadowed = thin.score(height), thick.score(height)
+    for name in ("cbr_ceiling", "fwhm_ideal_um", "focusing_radius_um"):
+        assert getattr(shadowed, name) == getattr(figures, name)
+    peaks = [float(one.bench(height).max()) for one in (thick, thin)]
+    assert shadowed.strehl == pytest.approx(peaks[0] / peaks[1], rel=1e-6)
+    assert shadowed.strehl < 0.8
+    assert thick.window_figures(thick.bench(height))["strehl"] == pytest.approx(shadowed.strehl, rel=1e-6)
+    assert thick.baselines()["perfect lens"]["strehl"] == pytest.approx(1, abs=1e-12)
+    # The bench itself stays that of the thick element.
+    assert thick.bench.optics == thick_optics
+
+
 def test_airy_power_inside_the_focusing_radius():
     bench = LensBench(LAYOUT, OPTICS, LensView(window_px=254))
     score = lens_score(bench, bench.ideal_height_um())
