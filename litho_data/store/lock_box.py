@@ -9,34 +9,66 @@ import hashlib
 from collections.abc import Sequence
 from typing import Protocol
 
-from litho_data.foundation import InputError
+from litho_data.foundation import Array, InputError, record_sha256
+from litho_data.store.schema import VARIABLES
+
+FIELD_COLUMNS = ("field_x_um", "field_y_um", "dose")
+"""Columns that tell apart fields of one print that have the same layout."""
 
 
-class HasPrint(Protocol):
-    """Protocol for objects that state the id and the print of a scan, which determine whether the scan is put
-    into the lock box.
+class HasField(Protocol):
+    """Protocol for objects that state the id of a scan and the printed field that it shows, which determine
+    whether the scan is put into the lock box.
     """
 
     @property
     def id(self) -> str: ...
     @property
     def print_id(self) -> str: ...
+    @property
+    def mask_level(self) -> Array: ...
+    @property
+    def field_x_um(self) -> float | None: ...
+    @property
+    def field_y_um(self) -> float | None: ...
+    @property
+    def dose(self) -> float | None: ...
 
 
-def locked_ids(scans: Sequence[HasPrint]) -> list[str]:
+def locked_ids(scans: Sequence[HasField]) -> list[str]:
     """Return the ids of the scans in the lock box of a dataset. ``scans`` are all scans of the dataset."""
-    return lock_box([scan.id for scan in scans], [scan.print_id for scan in scans])
+    ids, print_ids = [scan.id for scan in scans], [scan.print_id for scan in scans]
+    return lock_box(ids, print_ids, [field_of(scan) for scan in scans])
 
 
-def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
-    """Return the ids of the scans in the lock box: a sixth of all scans, but at least one, from different
-    prints if possible.
+def field_of(scan: HasField) -> str:
+    """Return the hash that identifies the printed field of a scan (see ``field_sha256``)."""
+    stated = [getattr(scan, name) for name in FIELD_COLUMNS]
+    return field_sha256(scan.print_id, scan.mask_level, stated)
 
-    If the dataset has only one or two scans, none is chosen.
+
+def field_sha256(print_id: str, mask_level: Array, stated: Sequence[float | None]) -> str:
+    """Return the hash that identifies a printed field. Scans of one field, such as trace and retrace, have
+    the same print, layout, position and dose.
+
+    Args:
+        print_id: the print of the field.
+        mask_level: levels of the layout, shape (ny, nx).
+        stated: values of the columns ``FIELD_COLUMNS``.
+    """
+    return record_sha256([print_id, VARIABLES["mask_level"].sample_sha256(mask_level), *stated])
+
+
+def lock_box(ids: Sequence[str], print_ids: Sequence[str], fields: Sequence[str]) -> list[str]:
+    """Return the ids of the scans in the lock box: all scans of a sixth of the printed fields, but of at
+    least one field, and from different prints if possible.
+
+    If the dataset has only one or two fields, none is chosen.
 
     Args:
         ids: ids of the scans.
         print_ids: the print of each scan, in the same order.
+        fields: the printed field of each scan, as ``field_of`` returns it.
 
     Raises:
         InputError: an id occurs twice, or the lists have different lengths.
@@ -44,15 +76,27 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str]) -> list[str]:
     require_unique(ids)
     if len(print_ids) != len(ids):
         raise InputError("print_ids", got=f"{len(print_ids)} entries", wanted=f"{len(ids)}, one per scan id")
-    by_print: dict[str, list[str]] = {}
-    for scan_id, print_id in sorted(
-        zip(ids, print_ids, strict=True), key=lambda pair: drawing_key(pair[0], 0)
-    ):
-        by_print.setdefault(print_id, []).append(scan_id)
+    print_of = dict(zip(ids, print_ids, strict=True))
+    by_print: dict[str, list[list[str]]] = {}
+    every = scans_by_field(ids, fields, 0)
+    for members in every:
+        by_print.setdefault(print_of[members[0]], []).append(members)
     prints = sorted(by_print, key=lambda print_id: drawing_key(f"print {print_id}", 0))
-    turns = range(len(ids))
+    turns = range(len(every))
     drawn = [by_print[name][turn] for turn in turns for name in prints if turn < len(by_print[name])]
-    return sorted(drawn[: max(1, round(len(ids) / 6)) if len(ids) > 2 else 0])
+    count = max(1, round(len(every) / 6)) if len(every) > 2 else 0
+    return sorted(scan_id for members in drawn[:count] for scan_id in members)
+
+
+def scans_by_field(ids: Sequence[str], fields: Sequence[str], seed: int) -> list[list[str]]:
+    """Return the ids of the scans of each printed field, with the fields in a random order.
+
+    Scans of one field share the errors of its print, so they are never divided between training and test.
+    """
+    found: dict[str, list[str]] = {}
+    for scan_id, of in sorted(zip(ids, fields, strict=True), key=lambda one: drawing_key(one[0], seed)):
+        found.setdefault(of, []).append(scan_id)
+    return list(found.values())
 
 
 def drawing_key(name: str, seed: int) -> str:

@@ -32,7 +32,7 @@ from litho_data.store.contract import (
     require_possible,
     true_shapes,
 )
-from litho_data.store.lock_box import lock_box
+from litho_data.store.lock_box import FIELD_COLUMNS, field_sha256, lock_box
 from litho_data.store.printed_scan import PrintedScan as PrintedScan
 from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
@@ -178,12 +178,18 @@ class Store:
         """
         return values_of(group_of(self.root, f"scans/{scan_id}"), name)
 
-    @property
+    @cached_property
     def locked_ids(self) -> list[str]:
-        """Return the ids of the scans in the lock box, which are set aside for the final test. It is always
-        the same sixth of the scans.
+        """Return the ids of the scans in the lock box, which are set aside for the final test. They are
+        always the scans of the same sixth of the printed fields.
         """
-        return lock_box(self.ids, self._print_ids)
+        fields = [
+            field_sha256(
+                name, self.sample("mask_level", row), [self._columns[one][row] for one in FIELD_COLUMNS]
+            )
+            for row, name in enumerate(self._print_ids)
+        ]
+        return lock_box(self.ids, self._print_ids, fields)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
         """Return the hashes of the scans' raw files, keyed by scan id. They do not depend on levelling or

@@ -66,7 +66,7 @@ def benchmark(
             parts of the same scans, so errors are underestimated. Use it only for comparison with the paper.
         models: names of the models to compare.
         settings: values for fields of ``TrainingConfig``, which replace those of the recipe.
-        folds: number of folds of the split ``grouped``, at most the number of development scans.
+        folds: number of folds of the split ``grouped``, at most the number of unlocked printed fields.
         first_folds: number of folds to fit and score, for a quick comparison of seeds or settings; None fits
             and scores all folds.
         policy: policy, i.e. set of nuisance terms that are fitted to each scan before its
@@ -102,7 +102,7 @@ def benchmark(
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     made = sum(not fold.locked for fold in plan)
     if split == "grouped" and made < folds:
-        say(f"{made} folds instead of {folds}: one for each of the scans that are not locked")
+        say(f"{made} folds instead of {folds}: one for each printed field that is not locked")
     if first_folds is not None:
         if not 1 <= first_folds <= made:
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")

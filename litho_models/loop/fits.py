@@ -17,6 +17,7 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.sharing.workers import HERE, Workers
 from litho_data.store import PrintedScan
+from litho_data.store.lock_box import field_of
 from litho_models.effects.chain import Fields
 from litho_models.fitting.least_squares import (
     Linearised,
@@ -74,7 +75,7 @@ class Study:
     ) -> Study:
         """Prepare scans and divide them into at most ``folds`` folds."""
         ids = [scan.id for scan in scans]
-        lists = grouped_folds(ids, min(folds, len(ids)), seed)
+        lists = grouped_folds(ids, [field_of(scan) for scan in scans], folds, seed)
         fold = {one: number for number, members in enumerate(lists) for one in members}
         return cls(prepare_scans(scans), np.array([fold[one] for one in ids]), seed, workers, report)
 

@@ -15,7 +15,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_data.store.lock_box import drawing_key, require_unique
+from litho_data.store.lock_box import drawing_key, field_of, require_unique, scans_by_field
 from litho_models.scan_terms.background import ScanPart
 
 SplitKind = Literal["grouped", "paper", "leave-one-print-out"]
@@ -102,14 +102,14 @@ def plan_folds(
     if open_lock_box and not locked:
         raise InputError(
             "lock box to open",
-            got=f"no locked scans, because {len(scans)} scans are too few",
-            wanted="at least 3 scans",
+            got=f"no locked scans, because {len(scans)} scans show too few printed fields",
+            wanted="scans of at least 3 fields",
             hint="run without --open-lock-box",
         )
     development = [scan for scan in scans if scan.id not in locked]
     ids = [scan.id for scan in development]
     if split == "grouped":
-        lists = grouped_folds(ids, min(folds, len(ids)), seed)
+        lists = grouped_folds(ids, [field_of(scan) for scan in development], folds, seed)
     elif split == "leave-one-print-out":
         lists = leave_one_print_out(ids, [scan.print_id for scan in development])
     else:
@@ -127,22 +127,31 @@ def plan_folds(
     return plan
 
 
-def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
-    """Divide scans into ``k`` folds. Return, for each fold, the ids of the scans that it holds out.
+def grouped_folds(ids: Sequence[str], fields: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
+    """Divide scans into ``k`` folds, or into one per printed field if there are fewer fields. All scans of a
+    field are in the same fold. Return, for each fold, the ids of the scans that it holds out.
+
+    Args:
+        ids: ids of the scans.
+        fields: the printed field of each scan, in the same order, as ``field_of`` returns it.
+        k: number of folds.
+        seed: seed of the random order.
 
     Raises:
-        InputError: an id is repeated, there are fewer than two ids, or ``k`` is below 2 or above the number
-            of scans.
+        InputError: an id is repeated, there are fewer than two fields, or ``k`` is below 2.
     """
     require_unique(ids)
-    if len(ids) < 2:
+    shuffled = scans_by_field(ids, fields, seed)
+    if len(shuffled) < 2:
         raise InputError(
-            "scans to divide into folds", got=len(ids), wanted="at least 2, so that one scan can be held out"
+            "printed fields to divide into folds",
+            got=len(shuffled),
+            wanted="at least 2, so that one field can be held out",
         )
-    if not 2 <= k <= len(ids):
-        raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
-    shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
-    return [sorted(shuffled[fold::k]) for fold in range(k)]
+    if k < 2:
+        raise InputError("number of folds", got=k, wanted="at least 2")
+    k = min(k, len(shuffled))
+    return [sorted(scan_id for scans in shuffled[fold::k] for scan_id in scans) for fold in range(k)]
 
 
 def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:

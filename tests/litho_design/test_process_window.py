@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_data.store.lock_box import locked_ids
+from litho_data.store.lock_box import lock_box
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.settings import LensView
 from litho_design.optics import Optics
@@ -65,7 +65,8 @@ class _Store:
 
     @property
     def locked_ids(self) -> list[str]:
-        return locked_ids(self._scans)
+        ids = [scan.id for scan in self._scans]
+        return lock_box(ids, ids, ids)
 
 
 def _store(gains: np.ndarray, offsets: np.ndarray) -> _Store:

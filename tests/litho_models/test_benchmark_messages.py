@@ -21,7 +21,7 @@ def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tm
     result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
     assert "no intervals: " in result.stdout
     assert "but at least 6 are needed" in result.stdout
-    assert " folds instead of 50: one for each of the scans" in result.stderr
+    assert " folds instead of 50: one for each printed field" in result.stderr
     assert "…" not in result.stdout
     assert result.stdout.splitlines()[-2].startswith("affine is")
 

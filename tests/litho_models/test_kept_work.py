@@ -190,7 +190,7 @@ def test_a_list_of_models_has_names_and_each_once(names, got, store, tmp_path):
 def test_two_scans_have_no_lock_box_to_open_and_one_scan_no_folds():
     two = make_scans(2, size_px=32)
     assert len(plan_folds(two, locked_ids(two), "grouped")) == 2
-    with pytest.raises(InputError, match=r"lock box to open, got no locked scans.*at least 3 scans"):
+    with pytest.raises(InputError, match=r"lock box to open, got no locked scans.*at least 3 fields"):
         plan_folds(two, locked_ids(two), "grouped", open_lock_box=True)
     with pytest.raises(InputError, match="got 1, wanted at least 2"):
-        grouped_folds(["a"], 2)
+        grouped_folds(["a"], ["a"], 2)

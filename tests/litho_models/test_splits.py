@@ -22,21 +22,35 @@ PRINTS = [scan_id[3] for scan_id in MEASURED_IDS]
 
 
 def test_folds_hold_each_scan_out_exactly_once():
-    folds = grouped_folds(MEASURED_IDS, 5)
+    folds = grouped_folds(MEASURED_IDS, MEASURED_IDS, 5)
     assert sorted(scan_id for fold in folds for scan_id in fold) == sorted(MEASURED_IDS)
     assert max(map(len, folds)) - min(map(len, folds)) <= 1
 
 
 def test_folds_depend_on_the_seed_and_not_on_the_order_of_the_ids():
-    assert grouped_folds(MEASURED_IDS, 5, seed=3) == grouped_folds(MEASURED_IDS[::-1], 5, seed=3)
-    assert grouped_folds(MEASURED_IDS, 5, seed=3) != grouped_folds(MEASURED_IDS, 5, seed=4)
+    assert grouped_folds(MEASURED_IDS, MEASURED_IDS, 5, seed=3) == grouped_folds(
+        MEASURED_IDS[::-1], MEASURED_IDS[::-1], 5, seed=3
+    )
+    assert grouped_folds(MEASURED_IDS, MEASURED_IDS, 5, seed=3) != grouped_folds(
+        MEASURED_IDS, MEASURED_IDS, 5, seed=4
+    )
 
 
 def test_the_recorded_folds_of_the_measured_prints_are_those_that_are_computed():
     record = Path(__file__).parents[2] / "datasets" / "neural-lithography.split.toml"
     stated = tomllib.loads(record.read_text(encoding="utf-8"))
-    locked = lock_box(MEASURED_IDS, PRINTS)
-    assert stated["grouped"]["folds"] == grouped_folds([i for i in MEASURED_IDS if i not in locked], 5)
+    locked = lock_box(MEASURED_IDS, PRINTS, MEASURED_IDS)
+    rest = [scan_id for scan_id in MEASURED_IDS if scan_id not in locked]
+    assert stated["grouped"]["folds"] == grouped_folds(rest, rest, 5)
+
+
+def test_no_fold_separates_scans_of_one_field():
+    field_of = {f"{scan_id}{way}": scan_id for scan_id in MEASURED_IDS for way in ("trace", "retrace")}
+    folds = grouped_folds([*field_of], [*field_of.values()], 5)
+    assert sorted(one for fold in folds for one in fold) == sorted(field_of)
+    held_out = [{field_of[one] for one in fold} for fold in folds]
+    assert sum(map(len, held_out)) == len(MEASURED_IDS)
+    assert len(grouped_folds([*field_of][:6], [*field_of.values()][:6], 5)) == 3
 
 
 def test_leave_one_print_out_holds_out_whole_prints():
@@ -73,8 +87,8 @@ def test_inner_validation_is_a_small_part_of_the_training_scans():
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: grouped_folds(["a", "a", "b"], 2),
-        lambda: grouped_folds(["a", "b"], 3),
+        lambda: grouped_folds(["a", "a", "b"], ["a", "a", "b"], 2),
+        lambda: grouped_folds(["a", "b"], ["1", "1"], 2),
         lambda: leave_one_print_out(["a", "b"], ["1", "1"]),
     ],
 )
