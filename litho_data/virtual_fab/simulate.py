@@ -12,7 +12,7 @@ import numpy as np
 
 from litho_data.cards.card import load_card
 from litho_data.commands.progress import progress
-from litho_data.foundation import InputError, Shape, array_sha256, record_sha256, require_known
+from litho_data.foundation import YX, InputError, Shape, array_sha256, record_sha256, require_known
 from litho_data.foundation.begun import whole_folder
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, write_card, write_layout, write_table
 from litho_data.level.scan import write_heights
@@ -120,6 +120,7 @@ def simulate(
         for part in (raw / "scans", hidden / "prints", hidden / "surfaces"):
             part.mkdir(parents=True)
         rows: list[tuple[object, ...]] = []
+        sizes_um: list[YX] = []
         scans: list[ScanTruth] = []
         for job in progress(source, "printing and scanning", total):
             scan = scan_job(fab, job)
@@ -128,8 +129,9 @@ def simulate(
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             rows.append(_row(job, len(rows)))
+            sizes_um.append(scan.frame.size_um)
             scans.append(_scan_truth(scan))
-        _write_table(raw, rows)
+        _write_table(raw, rows, sizes_um)
         in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
         tables: dict[str, Any] = {
             "ids": {"print": print_pattern if in_prints else None, "table": TABLE_NAME},
@@ -207,13 +209,17 @@ def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
         raise InputError("level in a layout", got=highest, wanted=f"0 to {printer.levels - 1}")
 
 
-def _write_table(raw: Path, rows: list[tuple[object, ...]]) -> None:
+def _write_table(raw: Path, rows: list[tuple[object, ...]], sizes_um: list[YX]) -> None:
     """Write the card's table. The columns in SCANNING are written only if at least one scan differs from a
-    usual scan in them.
+    usual scan in them, and the sizes (y, x) of the scans only if they are not all the same.
     """
     ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
     columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
-    write_table(raw, columns, [row[: len(columns)] for row in rows])
+    rows = [row[: len(columns)] for row in rows]
+    sizes = [" x ".join(f"{round(side, 9)}" for side in size_um) for size_um in sizes_um]
+    if len(set(sizes)) > 1:
+        columns, rows = (*columns, "size_um"), [(*row, size) for row, size in zip(rows, sizes, strict=True)]
+    write_table(raw, columns, rows)
 
 
 def _scan_truth(scan: FabScan) -> ScanTruth:

@@ -268,6 +268,16 @@ class TestFiles:
             assert other.read_bytes() == field.scan.read_bytes()
         assert load_card(again) == load_card(first)
 
+    @pytest.mark.parametrize("shape", [(32, 48), (32, 32)])
+    def test_the_pixels_of_a_scan_of_a_turned_print_are_square(self, tmp_path, shape):
+        level = np.arange(shape[0] * shape[1]).reshape(shape).astype(np.uint8) % 13
+        jobs = [Job("P1F1", level), Job("P1F2", level, index=1, print_index=0, turned_deg=90.0)]
+        card = simulate(tmp_path / "run", jobs=jobs)
+        for field in list_fields(card).fields:
+            size_um = field.read.get("size_um", load_card(card).scan.size_um)
+            assert read_scan(field.scan, unit="m", size_um=size_um).pitch_um == pytest.approx((0.1, 0.1))
+        assert ("size_um" in (card.parent / "scans.csv").read_text()) == (shape[0] != shape[1])
+
     @pytest.mark.parametrize("files", ["text-matrix", "gsf"])
     def test_each_id_with_dots_has_a_scan_of_its_own(self, tmp_path, files):
         doses = {f"dose{dose:.2f}": dose for dose in (1.05, 1.10)}
