@@ -3,7 +3,7 @@ and a step, and the dataset card names their scans.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -91,7 +91,7 @@ def standards_of(listing: Listing) -> Standards:
         files.setdefault(listing.relative(path), path)
         size = one.size_um or card.scan.size_um
         missing = card.scan.missing if one.missing is None else one.missing
-        defaults = {"defaults": True} if one.unit is None and one.size_um is None else {}
+        own = [name for name in ("unit", "size_um") if getattr(one, name) is not None]
         standards.append(
             {
                 "scale": scale,
@@ -105,11 +105,21 @@ def standards_of(listing: Listing) -> Standards:
                     "size_um": list(size) if size else None,
                     "channel": one.channel or card.scan.channel,
                     **({} if missing is None else {"missing": list(missing)}),
-                    **defaults,
+                    "defaults": defaults_beside(own),
                 },
             }
         )
     return Standards(tuple(standards), files)
+
+
+def defaults_beside(own: Collection[str]) -> list[str]:
+    """Return the arguments of ``read_scan`` that are only defaults for files that do not state their unit or
+    size, because the card states them for all scans.
+
+    ``own`` contains the names of the values that the card or its table states for one scan. The file of this
+    scan must agree with these values.
+    """
+    return [name for name in ("unit", "size_um") if name not in own]
 
 
 def measure_scales(standards: Sequence[Facts], files: Sequence[Path]) -> Array:

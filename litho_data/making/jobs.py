@@ -14,7 +14,7 @@ import numpy as np
 from litho_data.cards.card import Card, Use
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation import Array, Facts, InputError, file_sha256, record_sha256
-from litho_data.making.calibration import NO_STANDARDS, Standards, standards_of
+from litho_data.making.calibration import NO_STANDARDS, Standards, defaults_beside, standards_of
 from litho_data.making.chain import Chain
 from litho_data.making.contour import REACH_PX
 from litho_data.making.operations import OPERATIONS, READER_SHA256
@@ -246,9 +246,7 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        # If the card's table states unit or size for a scan, the scan's file must agree with it. If only the
-        # card itself states them, they are used only for files that do not state their own unit or size.
-        defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
+        defaults = {"defaults": defaults_beside(self.field.read)}
         own = {} if self._is_micrograph else _own_reader(self.field.scan, stated["format"])
         return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um, **own}
 

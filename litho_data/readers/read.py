@@ -42,7 +42,7 @@ def read_scan(
     fast_axis: Axis | None = None,
     full_scale_um: float | None = None,
     missing: Sequence[float | str] | None = None,
-    defaults: bool = False,
+    defaults: Sequence[str] = (),
 ) -> Scan:
     """Read one height map.
 
@@ -60,8 +60,8 @@ def read_scan(
         missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
             to the marks that the file itself states. An empty list states that there are no such additional
             marks.
-        defaults: if true, ``unit`` and ``size_um`` are only used if the file does not state the unit or the
-            size. If false, they must agree with what the file states.
+        defaults: those of the names ``unit`` and ``size_um`` whose argument is only used if the file does not
+            state the unit or the size. Otherwise, the argument must agree with what the file states.
 
     Raises:
         InputError: the file is unreadable; it has no height channel, or it has several and ``channel`` is not
@@ -76,11 +76,11 @@ def read_scan(
         values, mask = chosen.load()
         values = without_missing(chosen, values, missing)
         notes = list(chosen.notes)
-        if defaults and unit is not None and chosen.unit is not None:
+        if "unit" in defaults and unit is not None and chosen.unit is not None:
             if um_per(unit) != um_per(chosen.unit):
                 notes.append(f"heights in {chosen.unit}, as the file states, not in {unit}")
             unit = None
-        if defaults and size_um is not None and chosen.size_um is not None:
+        if "size_um" in defaults and size_um is not None and chosen.size_um is not None:
             if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
                 side_y, side_x = chosen.size_um
                 notes.append(f"size {side_y:g} × {side_x:g} µm, as the file states, not {size_um}")

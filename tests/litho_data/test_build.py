@@ -154,6 +154,20 @@ def test_scans_that_state_their_own_size_may_have_pixels_of_another_shape(tmp_pa
     assert "rows or columns are missing" in result.skipped["P31"]
 
 
+def test_a_unit_in_the_table_leaves_the_size_in_the_card_a_default(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1)
+    text = card.read_text().replace("{id}.txt", "{id}.gsf").replace('format = "text-matrix"', "")
+    card.write_text(text + 'table = "table.csv"\n')
+    (tmp_path / "scans" / "P11.gsf").write_bytes(gsf_bytes(np.eye(64), (0.2, 0.1)))
+    for row in ("id,unit\nP11,m\n", "id,size_um\nP11,12.8 x 6.4\n", "id\nP11\n"):
+        (tmp_path / "table.csv").write_text(row)
+        (job,) = field_jobs(list_fields(card), no_recipe())
+        assert job.begin().pitch_um == [0.2, 0.1]
+    (tmp_path / "table.csv").write_text("id,size_um\nP11,12.8\n")
+    with pytest.raises(InputError, match="size_um, got"):
+        field_jobs(list_fields(card), no_recipe())[0].begin()
+
+
 def test_the_manifest_does_not_depend_on_where_the_raw_files_lie(
     campaign: Path, tmp_path: Path, without_report: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -207,7 +207,8 @@ def test_a_standard_is_read_as_the_scans_are(tmp_path: Path) -> None:
     true = scale("x.txt", own=own)
     assert true == pytest.approx(SCALE["x"], rel=0.01)
     # The file states another unit and size than the card does for the scans.
-    assert scale("x.gsf", own='format = "gsf"\n') == pytest.approx(true, rel=1e-4)
+    for stated in ("", 'unit = "m"\n'):
+        assert scale("x.gsf", own=f'format = "gsf"\n{stated}') == pytest.approx(true, rel=1e-4)
     # It must agree with what the card states for this standard.
     with pytest.raises(InputError, match="size_um"):
         scale("x.gsf", own='format = "gsf"\nunit = "m"\nsize_um = [12.8, 12.8]\n')

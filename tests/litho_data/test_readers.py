@@ -192,9 +192,12 @@ def test_arguments_that_contradict_the_file_are_refused(tmp_path: Path) -> None:
         read_scan(path, channel="Phase")
     assert read_scan(path, unit="m", size_um=SIZE_UM).pitch_um == pytest.approx(PITCH_UM)
     # If the arguments are only defaults for many files, what the file states takes precedence.
-    scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=True)
+    scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=["unit", "size_um"])
     assert (scan.unit, scan.pitch_um) == ("m", pytest.approx(PITCH_UM))
     assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "size 2.5 × 1.6 µm"]
+    assert read_scan(path, unit="m", size_um=(9.0, 9.0), defaults=["size_um"]).pitch_um == scan.pitch_um
+    with pytest.raises(InputError, match=r"unit.*'nm'.*'m' as in the file"):
+        read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=["size_um"])
 
 
 def test_missing_files(tmp_path: Path) -> None:
