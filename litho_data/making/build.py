@@ -150,7 +150,8 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
                 _leave_out(scan_id, reason, records, skipped, partial)
             prints = [one for one in prints if one.id in records]
             named = _name_layouts(source.jobs, skipped)
-            _require_enough(records, {**skipped, **source.unpaired}, strict, out)
+            left_out = {**skipped, **source.unpaired}
+            _require_enough(records, left_out, strict, out)
             require_heights(prints, source.card)
         except InputError:
             partial.discard()
@@ -168,7 +169,7 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             "software": software_record(),
         }
         of_use = records_of_use(kept)
-        found = findings(of_use, prints, {**doubted, **named}, skipped, source.card)
+        found = findings(of_use, prints, {**doubted, **named}, left_out, source.card)
         for one in found:
             if one.weight != Weight.SKIPPED:
                 print(f"check {one}", file=sys.stderr)

@@ -30,6 +30,8 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
+# Names of the tables that not every report has.
+_SOMETIMES = ("findings", "left_out", "warnings", "gratings", "summary", "uncertainty")
 # The columns of each table of the report, in order, each with its title and its meaning.
 _COLUMNS = table_beside(__file__, "columns.toml")
 
@@ -39,6 +41,9 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
     ``report.html``.
     """
     store = open_store(store_path)
+    # Otherwise, a table that this report lacks would remain from an earlier build.
+    for stale in (path for name in _SOMETIMES for path in folder.glob(f"{name}.*")):
+        stale.unlink()
     page = Page(
         f"Dataset {store.name}",
         "The raw scans were read, levelled, registered onto their layouts and stored.",

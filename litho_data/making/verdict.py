@@ -92,7 +92,7 @@ def findings(
     records: Sequence[Facts],
     prints: Sequence[Print],
     doubts: Mapping[str, str],
-    skipped: Mapping[str, str],
+    left_out: Mapping[str, str],
     card: Card,
 ) -> list[Finding]:
     """Return the list of things to fix, worst first. The list is empty for a good dataset.
@@ -101,11 +101,11 @@ def findings(
         records: the records of the dataset's scans.
         prints: the registered scans, sampled at a few points (see ``prints_of``).
         doubts: reasons to suspect that a scan does not show its own layout, keyed by the id of the scan.
-        skipped: reasons why scans are not in the store, keyed by the id of the scan.
+        left_out: reasons why ids are not in the store, keyed by the id.
         card: the dataset card whose numbers are compared with the heights.
     """
     named = [(name, text, Weight.LAYOUT) for name, text in doubts.items()]
-    named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in skipped.items()]
+    named += [(name, f"skipped: {reason}", Weight.SKIPPED) for name, reason in left_out.items()]
     spread_nm = {one.id: 1e3 * float(np.nanstd(one.height)) for one in prints}
     for record in records:
         named += [(record["id"], text, weight) for text, weight in _of_a_scan(record, spread_nm)]

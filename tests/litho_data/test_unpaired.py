@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 import pytest
 from typer.testing import CliRunner
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 import litho_data
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
+from tests.litho_data.campaigns import write_campaign
 
 
 def test_a_scan_without_layout_is_counted_and_refused_under_strict(tmp_path):
@@ -21,6 +23,18 @@ def test_a_scan_without_layout_is_counted_and_refused_under_strict(tmp_path):
     assert "no file " in said.stderr
     with pytest.raises(InputError, match="1 ids cannot be used"):
         litho_data.build_dataset(card, tmp_path / "strict.zarr", strict=True)
+
+
+def test_the_report_names_an_unpaired_id_until_it_is_gone(tmp_path):
+    card = write_campaign(tmp_path, count=1)
+    extra, report = tmp_path / "layouts" / "P19.tif", tmp_path / "prints-report"
+    shutil.copy(tmp_path / "layouts" / "P11.tif", extra)
+    for names, tables in ((["P19"], True), ([], False)):
+        result = litho_data.build_dataset(card, tmp_path / "prints.zarr")
+        assert [one.scan for one in result.findings] == names
+        assert ("Good: all 1 scans" in (report / "report.html").read_text()) != tables
+        assert (report / "left_out.csv").exists() == (report / "findings.csv").exists() == tables
+        extra.unlink(missing_ok=True)
 
 
 def test_a_missing_card_and_a_single_size_are_reported_in_words(tmp_path):
