@@ -159,12 +159,13 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
     """Yield the scans that are mirrored relative to their layout, and the scans that are rotated in another
-    way than most scans. Each is yielded as its id and the reason. If the card states that a print was
-    rotated, scans of this print are left out.
+    way than most scans. Each is yielded as its id and the reason. Scans for which the card states that
+    the print was rotated are left out, and do not count among the others.
     """
-    usual, count = Counter(one.dihedral for one in prints).most_common(1)[0] if prints else ("", 0)
-    for one in (one for one in prints if not one.turned):
-        if one.dihedral != usual and 2 * count > len(prints):
+    upright = [one for one in prints if not one.turned]
+    usual, count = Counter(one.dihedral for one in upright).most_common(1)[0] if upright else ("", 0)
+    for one in upright:
+        if one.dihedral != usual and 2 * count > len(upright):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
             what = "a mirror image of its layout" if mirrored else f"rotated ({one.dihedral})"
             yield one.id, f"{what}, unlike the other scans: is its layout file the right one?"

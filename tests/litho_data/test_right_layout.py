@@ -156,6 +156,19 @@ def test_a_mirrored_layout_is_named(tmp_path: Path) -> None:
     assert "mirror image" in warnings["P12"]
 
 
+def test_turned_prints_do_not_say_how_upright_scans_lie() -> None:
+    one = {**doses(1, 0)["P11"], "dose": None}
+    ways = {"A0": ("identity", 0.0), "A90": ("rotate-90", 90.0), "B90": ("rotate-90", 90.0)}
+    records = [
+        {**record_of(name, one), "columns": {"turned_deg": deg}, "quality": {"dihedral": dihedral}}
+        for name, (dihedral, deg) in ways.items()
+    ]
+    assert doubts(prints_of(records, lambda _: one)) == {}
+    records += [{**records[0], "id": name} for name in ("B0", "C0")]
+    records[1]["columns"]["turned_deg"] = 0.0
+    assert [*doubts(prints_of(records, lambda _: one))] == ["A90"]
+
+
 def test_scans_under_wrong_ids_are_named_with_the_right_one(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
