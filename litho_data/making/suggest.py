@@ -115,14 +115,15 @@ def suggest_recipe(
         if len(pictures) == _SCANS:
             break
         try:
-            raw_um, layout = _located(job)
+            raw_um, layout, mask = _located(job)
         except InputError as error:
             refusal = f"{job.id}: {error}"
             continue
         pictures[job.id] = [raw_um]
         for name, text in RECIPES.items():
-            height_um, note = _levelled(text, raw_um, layout)
-            left[name][job.id] = 1e3 * left_by_layout(height_um, layout)
+            height_um, note = _levelled(text, raw_um, layout, mask)
+            seen_um = height_um if mask is None else np.where(mask, np.nan, height_um)
+            left[name][job.id] = 1e3 * left_by_layout(seen_um, layout)
             pictures[job.id].append(height_um)
             warned |= {name: note} if note else {}
     if not pictures:
@@ -147,22 +148,24 @@ def _best(left_nm: Mapping[str, float]) -> str:
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
-def _located(job: FieldJob) -> tuple[Array, Array]:
-    """Return the raw heights in µm, and the levels of the layout in the frame of the scan, NaN outside the
-    layout. Both have the shape (ny, nx) of the scan.
+def _located(job: FieldJob) -> tuple[Array, Array, Array | None]:
+    """Return the raw heights in µm, the levels of the layout in the frame of the scan, NaN outside the
+    layout, and the file's mask of pixels that levelling ignores, None if there is none. All have the shape
+    (ny, nx) of the scan.
     """
     chain = job.begin()
     chain.run("locate", job.register_params(chain))
-    return chain.arrays["raw_height_um"].astype(float), chain.arrays["layout_in_scan"]
+    arrays = chain.arrays
+    return arrays["raw_height_um"].astype(float), arrays["layout_in_scan"], arrays.get("vendor_mask")
 
 
-def _levelled(recipe: str, raw_um: Array, layout: Array) -> tuple[Array, str]:
+def _levelled(recipe: str, raw_um: Array, layout: Array, mask: Array | None) -> tuple[Array, str]:
     """Return the levelled heights, and a text with the warnings of the recipe's steps. If the recipe cannot
     be applied, return the raw heights and the reason.
     """
     try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
-        levelled, notes = steps.apply_noting(raw_um, layout_level=layout)
+        levelled, notes = steps.apply_noting(raw_um, mask=mask, layout_level=layout)
     except InputError as error:
         return raw_um, str(error)
     return levelled.height, "; ".join(notes)

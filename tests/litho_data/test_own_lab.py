@@ -18,7 +18,8 @@ from litho_data.making.build import build_dataset
 from litho_data.making.suggest import RECIPES, left_by_layout, suggest_recipe
 from litho_data.register.refine import interior_of
 from litho_data.store import open_store
-from tests.litho_data.campaigns import write_campaign
+from tests.litho_data import afm_files
+from tests.litho_data.campaigns import height_of, layout_of, write_campaign
 from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, RIM_PX, errors_nm, write_lab
 
 BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
@@ -176,6 +177,24 @@ def test_a_suggested_card_that_would_say_something_else_is_not_written(tmp_path:
     with pytest.raises(InputError, match=r"table process, got no line.* the best recipe is 'plane'"):
         _write_card(card, "plane")
     assert [*tmp_path.iterdir()] == [card]
+
+
+def test_recipes_are_compared_without_the_pixels_that_the_file_masks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = write_campaign(tmp_path, count=1)
+    text = card.read_text().replace("{id}.txt", "{id}.gwy").replace('format = "text-matrix"', "")
+    card.write_text(text)
+    monkeypatch.setattr(afm_files, "SIZE_UM", (12.8, 12.8))
+    height_um = height_of(layout_of(0), 0)
+    dust = np.zeros(height_um.shape, bool)
+    dust[90:110, 90:110] = True
+    left = []
+    for dust_um in (0.0, 1.0):
+        channels = {"Height": (1e-6 * (height_um + dust_um * dust), "m")}
+        afm_files.write_gwy(tmp_path / "scans" / "P11.gwy", channels, dust)
+        left.append(suggest_recipe(card, tmp_path / "levelling").left_nm["plane"]["P11"])
+    assert left[1] == pytest.approx(left[0], rel=0.1)
 
 
 def test_the_residual_of_the_layout_is_noise_tilt_and_lost_print() -> None:
