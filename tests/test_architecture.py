@@ -198,6 +198,19 @@ def _between(page: str, name: str) -> str:
     return page.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
 
 
+def test_the_code_of_an_operation_contains_what_it_imports_from_the_rooms_of_processing() -> None:
+    from litho_data.making.operations import OPERATIONS
+
+    rooms = tuple(f"litho_data.{room}." for room in ("register", "level", "roughness", "tip"))
+    for operation in OPERATIONS.values():
+        paths = [ROOT / "litho_data" / name for name in operation.code if name != "making/operations.py"]
+        code = {file for path in paths for file in (path.rglob("*.py") if path.is_dir() else [path])}
+        for name in (one for file in code for one in _imports(file) if one.startswith(rooms)):
+            package, room, module = name.split(".")[:3]
+            file = ROOT / package / room / f"{module}.py"
+            assert {file, file.with_name("__init__.py")} & code, f"{operation.name} also depends on {name}"
+
+
 def test_virtual_fab_knows_no_model() -> None:
     for file in _sources("litho_data/virtual_fab"):
         assert not {n for n in _imports(file) if n.startswith("litho_models")}, file.name

@@ -214,7 +214,7 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"layout_in_scan": level.astype(np.float32)}, {}
 
 
-@_operation("level", "raw_height_um vendor_mask calibration layout_in_scan", "level")
+@_operation("level", "raw_height_um vendor_mask calibration layout_in_scan", "register", "level")
 def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.level import Recipe
 
@@ -290,7 +290,7 @@ def _registration(height_um: Array, layout_level: Array, params: Facts) -> Regis
     )
 
 
-@_operation("tip", "levelled_height_um", "tip", "register/topography.py")
+@_operation("tip", "levelled_height_um", "tip", "register/topography.py", "roughness")
 def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.tip import lateral_resolution_um, tip_certain
 
