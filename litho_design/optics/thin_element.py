@@ -107,6 +107,33 @@ class Optics(Record):
         return self.wavelength_um / self.index_step
 
 
+def check_incidence(grid: PixelGrid, optics: Optics) -> None:
+    """Check that the light of one wave reaches every pixel at a real angle, and that pixels sample its phase.
+
+    The sine of the angle at a pixel is that of the incidence plus that of the ray from a near point source.
+
+    Raises:
+        InputError: along one axis, the sine reaches wavelength / (2 pitch), above which the sampled wave
+            goes in another direction; or the sine as a whole reaches 1.
+    """
+    farthest_um = [float(abs(axis).max()) for axis in (grid.y_um, grid.x_um)]
+    distance_um = optics.source_distance_um
+    oblique = abs(optics.incidence_y), abs(optics.incidence_x)
+    near = [far / math.hypot(far, distance_um) if distance_um else 0.0 for far in farthest_um]
+    corner_um = math.hypot(*farthest_um)
+    whole = math.hypot(*oblique) + (corner_um / math.hypot(corner_um, distance_um) if distance_um else 0.0)
+    along = [tilt + ray for tilt, ray in zip(oblique, near, strict=True)]
+    limits = [optics.wavelength_um / (2 * pitch_um) for pitch_um in grid.pitch_um]
+    for sine, limit in ((whole, 1.0), *zip(along, limits, strict=True)):
+        if sine >= limit:
+            raise InputError(
+                "light on the element",
+                got=f"an angle of incidence with a sine of up to {sine:.3g}",
+                wanted=f"below {limit:.3g}" + (", which is λ / (2 pitch)" if limit != 1 else ""),
+                hint="lower incidence_x, incidence_y or source_sine, or raise source_distance_um",
+            )
+
+
 def known_height(height_um: Tensor | np.ndarray, like: Tensor) -> Tensor:
     """Return the heights of a known print, µm, as a tensor on the device of ``like``. An array also gets the
     dtype of ``like``.
@@ -162,11 +189,15 @@ def element_field(
 
     Returns:
         The complex wave, 1/µm, shape (..., ny, nx).
+
+    Raises:
+        InputError: ``check_incidence`` rejects the direction of the light.
     """
     import torch  # imported late, because the command line reads `Optics` without it
 
     phase = height_um * (2 * math.pi / optics.wave_height_um)
     if optics.incidence_x or optics.incidence_y or optics.source_distance_um or optics.beam_um:
+        check_incidence(grid, optics)
         x, y = (torch.from_numpy(axis).double().to(phase.device) for axis in (grid.x_um, grid.y_um))
         squared = x[None, :] ** 2 + y[:, None] ** 2
         path_um = optics.oblique_path_um(y[:, None], x[None, :])

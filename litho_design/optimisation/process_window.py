@@ -16,6 +16,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.optics import Optics, sampling_limit_um
+from litho_design.optics.source import coherent_parts
+from litho_design.optics.thin_element import check_incidence
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -135,7 +137,8 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
     Raises:
         InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
-            and ``target``, or the wavelength in a draw is not positive.
+            and ``target``, the wavelength in a draw is not positive, or ``check_incidence`` rejects a
+            direction of the light.
     """
     drawn = _all_draws(window, optics)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
@@ -146,6 +149,10 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted="a positive wavelength",
             hint="lower --wavelength-sd-um",
         )
+    # The shortest wavelength allows the least oblique light.
+    shortest = min((draw.optics for draw in drawn), key=lambda one: one.wavelength_um)
+    for _, part in coherent_parts(shortest, source.size_um[0]):
+        check_incidence(source, part)
     limit_um = _limit_um(drawn, optics, source, target)
     nearest_um, wanted = min(draw.optics.distance_um for draw in drawn), f"at least {limit_um:.4g} µm"
     if optics.distance_um < limit_um:

@@ -9,6 +9,8 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import draw_target
 from litho_design.optics import (
     Optics,
     blaze_efficiency,
@@ -18,6 +20,7 @@ from litho_design.optics import (
     make_propagator,
 )
 from litho_design.optics.far_field import FarFieldPropagator
+from litho_design.printers.printer import Printer
 
 FAR = Optics(distance_um=100.0, propagation="far-field")
 
@@ -73,6 +76,36 @@ def test_a_gaussian_beam_and_a_near_point():
     turned = near[64] * torch.polar(torch.ones_like(phase), -phase)
     # The paraxial error is r^4 / (8 d^3) = 0.03 µm at 12.8 µm, or 0.27 rad.
     assert turned.angle().sub(turned[64].angle()).abs().max() < 0.4
+
+
+def test_oblique_light_keeps_its_direction_or_is_refused():
+    """Check that light goes to f times its sine, and that a steeper wave than pixels can sample is refused,
+    whatever makes it steep.
+    """
+    grid = centred_grid((48, 48), 0.4)
+    line = centred_grid((1, 301), FAR.wavelength_um * FAR.distance_um / (0.4 * 301))
+    for sine in (0.3, -0.75):
+        optics = FAR.model_copy(update={"incidence_x": sine})
+        wave = make_propagator(grid, line, optics)(element_field(torch.zeros(48, 48), grid, optics))
+        where = line.x_um[int(intensity_share(wave, line).argmax())]
+        assert where == pytest.approx(sine * FAR.distance_um, abs=3)
+    # The limit is 0.6328 / 0.8 = 0.791. The outermost pixel is 9.4 µm from the axis.
+    for steep in (
+        {"incidence_x": 0.9},
+        {"incidence_x": 0.75, "incidence_y": 0.75},
+        {"source_distance_um": 7.0},
+        {"source_distance_um": 50.0, "incidence_y": -0.7},
+    ):
+        with pytest.raises(InputError, match="light on the element"):
+            element_field(torch.zeros(48, 48), grid, FAR.model_copy(update=steep))
+    element_field(torch.zeros(48, 48), grid, FAR.model_copy(update={"source_distance_um": 8.0}))
+    # A source around a tilt, and a shorter wavelength in a draw, are refused before the search.
+    changes = {"layout.size_px": 32, "layout.pitch_um": 0.4, "layout.cell_um": 0.4, "optics.incidence_x": 0.7}
+    for change in ({"optics.source_sine": 0.15}, {"window.wavelength_sd_um": 0.05}):
+        settings = hologram_settings(changes=changes | change)
+        printer = Printer(None, settings.layout, source="none")
+        with pytest.raises(InputError, match="light on the element"):
+            HologramTask(settings, printer, inputs={"target": draw_target("ring", 32)})
 
 
 def test_a_fan_out_in_the_far_field_stands_beside_its_baselines(tmp_path):
