@@ -115,12 +115,12 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     """Blur a target image of shape (m, m) to the resolution of an element of the same size.
 
     The target is convolved with the intensity in the focus of a square aperture, sinc^2(2 NA x / wavelength)
-    along both axes, where NA is the sine of the angle, seen from the image, between the axis and the edge of
-    the element. Outside its window, the target is taken to be dark.
+    along both axes, where NA is the ``edge_sine`` of half the side. Outside its window, the target is taken
+    to be dark.
     """
     blurs = []
     for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
-        aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
+        aperture = optics.edge_sine(size_um / 2)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
         # Each blur is a matrix whose row i contains the weights of all pixels in the blurred pixel i. Two

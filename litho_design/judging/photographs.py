@@ -135,7 +135,7 @@ def _registered(
 ) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
     # The finest fringes in the image are formed by rays from two opposite sides of the element.
-    finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
+    finest_per_um = 2 * optics.edge_sine(half_um) / optics.wavelength_um
     return photographed_image(wanted, pitch_um, source, finest_per_um, averaged_um)
 
 

@@ -44,8 +44,7 @@ class LensOptics(nn.Module):
         """Return the numerical aperture, which is the sine of the angle, seen from the focus, between the
         axis and the edge of the aperture along x or y.
         """
-        half = self.layout.size_um / 2
-        return half / math.hypot(half, self.optics.distance_um)
+        return self.optics.edge_sine(self.layout.size_um / 2)
 
     def ratio(self, psf: Tensor) -> Tensor:
         """Return the centre-to-background ratio of a PSF of shape (window, window)."""

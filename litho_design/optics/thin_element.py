@@ -101,6 +101,14 @@ class Optics(Record):
         """
         return self.incidence_x * x_um + self.incidence_y * y_um
 
+    def edge_sine(self, radius_um: float) -> float:
+        """Return the sine of the angle, seen from the image, between the axis and a point of the element at
+        a distance ``radius_um`` from the axis. An ideal lens, which forms the far field, has radius / focal
+        length instead.
+        """
+        far_field = self.propagation == "far-field"
+        return radius_um / (self.distance_um if far_field else math.hypot(radius_um, self.distance_um))
+
     @property
     def wave_height_um(self) -> float:
         """Return the height that delays the wave by one period, µm."""

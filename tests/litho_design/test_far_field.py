@@ -9,6 +9,7 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design import design_hologram, hologram_settings
+from litho_design.holograms.bench import HologramBench
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import draw_target
 from litho_design.optics import (
@@ -20,6 +21,7 @@ from litho_design.optics import (
     make_propagator,
 )
 from litho_design.optics.far_field import FarFieldPropagator
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 
 FAR = Optics(distance_um=100.0, propagation="far-field")
@@ -106,6 +108,19 @@ def test_oblique_light_keeps_its_direction_or_is_refused():
         printer = Printer(None, settings.layout, source="none")
         with pytest.raises(InputError, match="light on the element"):
             HologramTask(settings, printer, inputs={"target": draw_target("ring", 32)})
+
+
+def test_the_resolution_of_the_far_field_is_that_of_its_focus():
+    """Check that a point, blurred to the resolution of the element, is the focus of a flat element. The focal
+    length is half of its side.
+    """
+    size = 65
+    optics = FAR.model_copy(update={"distance_um": size * 0.1 / 2})
+    bench = HologramBench(LayoutSettings(size_px=size), optics)
+    point = torch.zeros(size, size, dtype=torch.float64)
+    point[size // 2, size // 2] = 1
+    focus, blurred = bench(torch.zeros(size, size)).double(), bench.resolved(point)
+    assert (blurred / blurred.max() - focus / focus.max()).abs().max() < 1e-5
 
 
 def test_a_fan_out_in_the_far_field_stands_beside_its_baselines(tmp_path):
