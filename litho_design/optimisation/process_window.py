@@ -137,9 +137,17 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
     Raises:
         InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
-            and ``target``, the wavelength in a draw is not positive, or ``check_incidence`` rejects a
-            direction of the light.
+            and ``target``, the wavelength in a draw is not positive, ``check_incidence`` rejects a
+            direction of the light, or the defocus of a far field varies.
     """
+    if optics.propagation == "far-field" and window.defocus_sd_um:
+        # In a draw, the distance would be another focal length, which only rescales the image.
+        raise InputError(
+            "defocus spread of the far field",
+            got=f"{window.defocus_sd_um:g} µm",
+            wanted="0, because the image always lies in the focal plane",
+            hint="use --defocus-sd-um 0",
+        )
     drawn = _all_draws(window, optics)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
     if min(lengths_um) <= 0:
