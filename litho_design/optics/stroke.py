@@ -1,9 +1,10 @@
 """The stroke of a print (the height range of its levels), and the share of the light that a staircase grating
-with this stroke sends into a diffraction order.
+of these levels sends into a diffraction order.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 
@@ -30,17 +31,24 @@ class Stroke(Record):
 
 def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
     """Return the efficiency, according to scalar theory, of a blazed grating whose periods consist of
-    ``steps`` equal steps and whose stroke is ``gain`` waves.
-
-    eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2, where m is the order, N is the number
-    of steps and g is the stroke in waves.
+    ``steps`` equal steps and whose stroke is ``gain`` waves. This counts the step that follows the highest
+    one, where the next period begins.
     """
-    detuning = math.pi * (gain - order)
-    narrow = steps * math.sin(detuning / steps)
-    array = 1.0 if abs(narrow) < 1e-15 else math.sin(detuning) / narrow
-    fraction = order / steps
-    element = 1.0 if order == 0 else math.sin(math.pi * fraction) / (math.pi * fraction)
-    return (element * array) ** 2
+    return staircase_efficiency([gain * step / steps for step in range(steps)], order)
+
+
+def staircase_efficiency(waves: Sequence[float], order: int) -> float:
+    """Return the efficiency, according to scalar theory, of a grating whose periods consist of N steps of
+    equal width and of the given heights in waves.
+
+    eta_m = sinc^2(m/N) |mean over k of exp(2 pi j (w_k - m k/N))|^2, where m is the order and w_k is the
+    height of step k.
+    """
+    steps = len(waves)
+    turns = [2j * math.pi * (wave - order * step / steps) for step, wave in enumerate(waves)]
+    fraction = math.pi * order / steps
+    element = math.sin(fraction) / fraction if order else 1.0
+    return float(abs(element * sum(map(cmath.exp, turns)) / steps) ** 2)
 
 
 def measure_stroke(
@@ -54,22 +62,21 @@ def measure_stroke(
         level_height_um: nominal height of one level, µm.
 
     Returns:
-        The stroke, and the efficiency of a blazed grating with this stroke in the first and the zero order.
+        The stroke, and the efficiency of this grating in the first and the zero order.
         The record also states two ways to make the stroke one wave: the number of levels if their height is
         kept, and the height of a level if the number of levels is kept.
     """
     count = len(printed_height_um)
     stroke_um = printed_height_um[-1] - printed_height_um[0]
     gain = stroke_um / ((count - 1) * level_height_um) if count > 1 else 0.0
-    # A staircase of N equal steps approximates a ramp that is N/(N-1) times as high as the highest step.
-    period_waves = stroke_um / wave_height_um * count / max(count - 1, 1)
+    waves = [height / wave_height_um for height in printed_height_um]
     return Stroke(
         printed_height_um=list(printed_height_um),
         stroke_um=stroke_um,
         stroke_waves=stroke_um / wave_height_um,
         print_gain=gain,
-        blaze_order_1=blaze_efficiency(count, period_waves, 1),
-        blaze_order_0=blaze_efficiency(count, period_waves, 0),
+        blaze_order_1=staircase_efficiency(waves, 1),
+        blaze_order_0=staircase_efficiency(waves, 0),
         levels_for_one_wave=math.ceil(wave_height_um / (gain * level_height_um)) if gain > 0 else None,
         level_height_for_one_wave_um=wave_height_um / (gain * count) if gain > 0 else None,
     )

@@ -29,6 +29,20 @@ def test_formula_equals_the_fourier_coefficient_of_one_period(steps, gain, order
     assert blaze_efficiency(steps, gain, order) == pytest.approx(abs((wave * weight).sum()) ** 2, abs=1e-12)
 
 
+def test_a_grating_of_unequal_steps_has_the_order_of_its_own_heights():
+    """Check the orders of measured levels against a discrete Fourier transform of the relief. Two levels
+    that differ by half a wave send nothing straight through.
+    """
+    heights = 1.2 * (np.arange(13) / 12) ** 1.3
+    stroke = measure_stroke(heights.tolist(), 1.0, level_height_um=0.1)
+    orders = np.abs(np.fft.fft(np.repeat(np.exp(2j * np.pi * heights), 512)) / (13 * 512)) ** 2
+    assert [stroke.blaze_order_0, stroke.blaze_order_1] == pytest.approx(orders[:2], abs=1e-6)
+    equal = measure_stroke(np.linspace(0, 1.2, 13).tolist(), 1.0, level_height_um=0.1)
+    assert equal.blaze_order_1 == pytest.approx(blaze_efficiency(13, 1.2 * 13 / 12))
+    assert abs(equal.blaze_order_1 - stroke.blaze_order_1) > 0.03
+    assert measure_stroke([0.1, 0.6], 1.0, level_height_um=0.1).blaze_order_0 == pytest.approx(0, abs=1e-12)
+
+
 def test_published_values():
     values = [blaze_efficiency(n, 1.0) for n in (2, 4, 8, 12, 13, 16)]
     assert values == pytest.approx([0.4053, 0.8106, 0.9496, 0.9774, 0.9807, 0.9872], abs=5e-5)
