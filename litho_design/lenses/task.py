@@ -293,16 +293,23 @@ def check_lens(settings: LensSettings, *, radial: bool) -> None:
 
 def _check_outermost_zone(settings: LensSettings) -> None:
     """Check that the outermost zone of the lens is at least two cells wide. The width of this zone is the
-    wavelength divided by the sine of the angle between the axis and the ray from the rim to the image.
+    wavelength divided by the sum of two sines: that of the ray from the farthest point of the rim to the
+    image, and that of oblique light, which a side of the rim adds to it.
     """
     layout, optics = settings.layout, settings.optics
-    radius_um = layout.size_px * layout.pitch_um / 2
-    zone_um = optics.wavelength_um * math.hypot(radius_um, optics.distance_um) / radius_um
+    radius_um = layout.size_um / 2 * (math.sqrt(2) if settings.view.aperture == "square" else 1)
+    oblique = math.hypot(optics.incidence_x, optics.incidence_y)
+    zone_um = optics.wavelength_um / (optics.edge_sine(radius_um) + oblique)
     if zone_um < 2 * layout.cell_um:
-        sine = optics.wavelength_um / (2 * layout.cell_um)
+        sine = optics.wavelength_um / (2 * layout.cell_um) - oblique
+        farther = ""
+        # No distance helps if the oblique light alone is too steep. The advised distance is rounded up.
+        if sine > 0:
+            needed_um = math.ceil(10 * radius_um * math.sqrt(1 / sine**2 - 1)) / 10
+            farther = f"--distance-um {needed_um:.1f} or more, or "
         raise InputError(
             f"cells of {layout.cell_um:g} µm",
             got=f"an outermost zone of the lens {zone_um:.3g} µm wide",
             wanted="at least two cells per zone",
-            hint=f"use --distance-um {radius_um * math.sqrt(1 / sine**2 - 1):.4g} or more, or smaller cells",
+            hint=f"use {farther}smaller cells",
         )

@@ -16,7 +16,7 @@ from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import CENTRE_UM, LensBench, RadialLensBench, centre_to_background, sensor_psf
 from litho_design.lenses.score import half_maximum_width_um, lens_score, mtf, mtf_at
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
-from litho_design.lenses.task import lens_task
+from litho_design.lenses.task import check_lens, lens_task
 from litho_design.optics import Optics, blaze_efficiency
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -285,6 +285,32 @@ def test_ring_path_needs_rings(settings, make_printer, change, message):
     changed = settings.model_copy(update=change)
     with pytest.raises(InputError, match=message):
         lens_task(changed, make_printer(changed.layout))
+
+
+@pytest.mark.parametrize("tilt", [{}, {"incidence_x": 0.25}, {"incidence_x": -0.2, "incidence_y": 0.2}])
+@pytest.mark.parametrize("aperture", ["circle", "square"])
+def test_the_outermost_zone_is_one_wave_of_the_steepest_path(aperture, tilt):
+    """Check the zone against the path that a lens has to correct, at the rim point where it is steepest."""
+    half_um, focal_um = 10.0, 20.0
+    s = math.hypot(*tilt.values())
+    r = half_um * (math.sqrt(2) if aperture == "square" else 1)
+    path = [math.hypot(one, focal_um) + s * one for one in (r - 1e-4, r)]
+    zone_um = 0.6328 / ((path[1] - path[0]) / 1e-4)
+
+    def check(cell_um, distance_um=focal_um):
+        layout = {"layout.size_px": 200, "layout.cell_um": cell_um, "optics.distance_um": distance_um}
+        light = {f"optics.{name}": value for name, value in tilt.items()}
+        view = {"view.aperture": aperture, "view.path": "plane"}
+        check_lens(lens_settings(changes=layout | light | view), radial=False)
+
+    check(0.499 * zone_um)
+    with pytest.raises(InputError, match=f"an outermost zone of the lens {zone_um:.3g} µm") as caught:
+        check(0.501 * zone_um)
+    # The advised distance can be used.
+    check(0.501 * zone_um, float(str(caught.value).split("--distance-um ")[1].split()[0]))
+    if tilt:
+        with pytest.raises(InputError, match="use smaller cells"):
+            check(0.6328 / (2 * s) + 0.01)
 
 
 def test_an_mtf_is_interpolated_linearly_between_samples():
