@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from litho_data.foundation.errors import InputError
 from litho_design.lenses.settings import ImagingSettings, LensView
 from litho_design.optics import (
     Optics,
@@ -30,11 +31,22 @@ CENTRE_UM = 1.0
 class LensOptics(nn.Module):
     """Base class of ``LensBench``, which computes on a plane, and ``RadialLensBench``, which computes on
     rings. It provides the numerical aperture, the focal window and the heights of a perfect lens to both.
+
+    Raises:
+        InputError: the source is not a distant, monochromatic point source, or the focal window is smaller
+            than the central box.
     """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
         require_one_wave(optics, "a lens")
+        if view.window_px * layout.pitch_um < CENTRE_UM:
+            raise InputError(
+                "PSF window of a lens",
+                got=f"{view.window_px} px of {layout.pitch_um:g} µm",
+                wanted=f"a side of at least {CENTRE_UM:g} µm, the central box",
+                hint=f"use --window-px {math.ceil(CENTRE_UM / layout.pitch_um)} or more",
+            )
         self.layout, self.optics, self.view = layout, optics, view
         self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
         self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
@@ -48,8 +60,7 @@ class LensOptics(nn.Module):
 
     def ratio(self, psf: Tensor) -> Tensor:
         """Return the centre-to-background ratio of a PSF of shape (window, window)."""
-        centre_px = round(CENTRE_UM / self.layout.pitch_um)
-        return centre_to_background(psf, centre_px, self.layout.size_px)
+        return centre_to_background(psf, CENTRE_UM / self.layout.pitch_um, self.layout.size_px)
 
     def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a PSF, which is -log(centre-to-background ratio), and a dict of named values for
@@ -155,7 +166,7 @@ class RadialLensBench(LensOptics):
         return (rings + 0.5) * self.layout.pitch_um
 
 
-def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
+def centre_to_background(psf: Tensor, centre_px: float, element_px: int) -> Tensor:
     """Return the mean intensity in the central box of a PSF, divided by the mean intensity on the background,
     i.e. on the rest of an image plane that is as large as the element.
 
@@ -163,9 +174,16 @@ def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor
     background, the share of this light (1 minus the share in the box) is therefore divided by the area of the
     element outside the box. A ratio computed only within the PSF window would reward light sent outside the
     window.
+
+    The box is centred on the window, and need not be a whole number of pixels wide. A pixel on its edge
+    counts by the share of its area that lies inside.
     """
-    first = (psf.shape[-1] - centre_px) // 2
-    box = psf[..., first : first + centre_px, first : first + centre_px].sum()
+    side, half_px = psf.shape[-1], centre_px / 2
+    left = torch.arange(side, dtype=torch.float64, device=psf.device) - side / 2
+    inside = ((left + 1).clamp(max=half_px) - left.clamp(min=-half_px)).clamp(min=0).to(psf)
+    first, last = max(math.floor(side / 2 - half_px), 0), min(math.ceil(side / 2 + half_px), side)
+    # The cut comes after the product, so that a box of whole pixels is summed in the order of the PSF's rows.
+    box = (psf * inside[:, None] * inside)[..., first:last, first:last].sum()
     rest = (1 - box) / (element_px**2 - centre_px**2)
     return box / centre_px**2 / rest
 

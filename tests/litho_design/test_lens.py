@@ -215,6 +215,21 @@ def test_light_thrown_out_of_the_window_counts_as_background():
     assert float(centre_to_background(psf / 2, 10, 300)) < 0.5 * float(bright)
 
 
+@pytest.mark.parametrize("pitch_um", [0.05, 0.1, 0.2, 0.3, 0.35])
+@pytest.mark.parametrize("window_px", [24, 25])
+def test_the_central_box_is_centred_and_has_one_size_at_every_pitch(pitch_um, window_px):
+    """Check the light in the box of a linear ramp, which is its value on the axis times 1 µm²."""
+    y, x = np.meshgrid(*((np.arange(window_px) - (window_px - 1) / 2) * pitch_um,) * 2, indexing="ij")
+    psf = torch.from_numpy((2 + x - 0.5 * y) * 1e-3 * pitch_um**2)
+    element_px = 300
+    box = 2e-3 * CENTRE_UM**2
+    wanted = box * ((element_px * pitch_um) ** 2 - CENTRE_UM**2) / (1 - box)
+    ratio = centre_to_background(psf, CENTRE_UM / pitch_um, element_px)
+    assert float(ratio) == pytest.approx(wanted, rel=1e-12)
+    with pytest.raises(InputError, match="PSF window of a lens"):
+        LensBench(LayoutSettings(size_px=64, pitch_um=0.05), OPTICS, LensView(window_px=16))
+
+
 def test_width_of_a_gaussian():
     x = torch.arange(-40, 40).double() * 0.1
     psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.8**2))
