@@ -22,6 +22,7 @@ from litho_models.fitting.fit import common_geometry
 from litho_models.frozen import zoo
 from litho_models.loop.fits import Study
 from litho_models.loop.model import FoldedBase
+from litho_models.loop.prepared import exposed
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
 
@@ -100,7 +101,8 @@ def _frozen(base: str, pitch_um: float) -> dict[str, nn.Module]:
 def train_folds(
     scans: Sequence[PrintedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
 ) -> FoldedBase:
-    """Train one model for each fold on the scans outside this fold, and one model on all scans.
+    """Train one model for each fold on the scans outside this fold, and one model on all scans. The layouts
+    are those that the loop predicts from, i.e. they are multiplied by the doses of the scans.
 
     Args:
         scans: the scans.
@@ -111,7 +113,8 @@ def train_folds(
     fold = {scan.id: int(own) for scan, own in zip(scans, fold_of, strict=True)}
     count = max(fold.values()) + 1
     # The last model is trained on all scans.
-    jobs = [partial(trainer, [one for one in scans if fold[one.id] != out]) for out in range(count + 1)]
+    seen = [exposed(scan) for scan in scans]
+    jobs = [partial(trainer, [one for one in seen if fold[one.id] != out]) for out in range(count + 1)]
     done = run_jobs(call, jobs, workers, name=lambda job: f"fold {jobs.index(job)}")
     trained = dict(progress(done, "training the base model", len(jobs)))
     *models, common = (trained[job] for job in jobs)

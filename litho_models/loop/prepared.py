@@ -29,6 +29,25 @@ _MARGIN_PX = 48
 _SAMPLED_PX = 16384
 
 
+@dataclass(frozen=True, repr=False)
+class ExposedScan(PrintedScan):
+    """A scan whose layout is what was exposed: the nominal height times ``exposure``, the relative dose."""
+
+    exposure: float = 1.0
+
+    @property
+    def layout_um(self) -> np.ndarray:
+        """Return the exposed height of each pixel in µm, a float32 array of shape (ny, nx)."""
+        return super().layout_um * np.float32(self.exposure)
+
+
+def exposed(scan: PrintedScan) -> PrintedScan:
+    """Return the scan with the layout that the loop predicts from. A smaller dose acts like a lower layout. A
+    scan without a dose, or with a dose of 1, is returned unchanged, so that other fits to it stay usable.
+    """
+    return scan if scan.dose in (None, 1) else ExposedScan(**vars(scan), exposure=float(scan.dose))
+
+
 @dataclass(frozen=True)
 class PreparedScan:
     """A scan with the data that are needed to predict it and to compare it with predictions.
@@ -149,8 +168,7 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
         dose = 1.0 if scan.dose is None else float(scan.dose)
         write = scan.write or {}
         context = FieldContext(
-            # The exposure is the nominal height times the dose, so a smaller dose acts like a lower layout.
-            layout_um=torch.from_numpy(scan.layout_um * np.float32(dose))[None, None],
+            layout_um=torch.from_numpy(exposed(scan).layout_um)[None, None],
             pitch_um=scan.pitch_um,
             full_height_um=(scan.levels - 1) * scan.level_height_um,
             slice_um=scan.level_height_um,

@@ -15,6 +15,7 @@ from torch import nn
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
+from litho_data.store.printed_scan import scan_sha256
 from litho_models.effects import FieldContext, get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.frozen.card import ModelCard
@@ -23,6 +24,7 @@ from litho_models.loop.closing import close
 from litho_models.loop.errors import HeldOut
 from litho_models.loop.fits import Study, fit_state
 from litho_models.loop.model import FoldedBase, Twin
+from litho_models.loop.prepared import exposed
 from litho_models.loop.run import close_loop
 from litho_models.loop.search import search
 from litho_models.models import build_model
@@ -116,6 +118,20 @@ def test_a_network_is_trained_without_each_fold_and_once_on_all() -> None:
         rest = [own for own, of in zip(scans, study.fold_of, strict=True) if of != fold]
         assert numbers(model.of_scan(scan.id)) == numbers(model.models[int(fold)]) == numbers(trained(rest))
     assert numbers(model.of_scan("elsewhere")) == numbers(trained(scans))
+
+
+def test_a_trained_base_learns_what_the_printer_does_with_an_exposure() -> None:
+    """Check a noiseless printer whose print depends only on the layout times the dose."""
+    scans = [replace(scan, dose=(0.8, 1.2)[at % 2]) for at, scan in enumerate(planted(count=6))]
+    study = study_of(scans)
+    bare = Twin.bare(base_model())
+    truth = [1.3 * bare.height(scan) + 0.01 for scan in study.scans]
+    learned = Twin.bare(train_folds(with_heights(scans, truth), study.fold_of, trained))
+    for scan, own in zip(study.scans, truth, strict=True):
+        np.testing.assert_allclose(learned.height(scan), own, atol=1e-5)
+        # A fit to nominal layouts must not be taken from the cache for a fit to exposures.
+        assert scan_sha256(exposed(scan.stored)) != scan_sha256(scan.stored)
+        assert exposed(replace(scan.stored, dose=1.0)).layout_um.max() == scan.stored.layout_um.max()
 
 
 class Carrying(nn.Module):
