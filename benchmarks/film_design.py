@@ -115,7 +115,7 @@ def printer(name: str, store: Path, cache: Path, settings: ReliefSettings) -> Pr
     """
     folder = cache / name
     if not (folder / "printer" / "card.json").is_file():
-        train(store, name, folder / "run", settings={"nuisance": "none"})
+        train(store, name, folder / "run")
         freeze(folder / "run", folder / "printer")
     return load_printer(folder / "printer", settings.layout)
 

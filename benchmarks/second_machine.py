@@ -139,7 +139,7 @@ def fit_and_judge(name: str, fold: Fold, bare: Mapping[str, float]) -> dict[str,
     """
     geometry = common_geometry(fold.training)
     if name in LEARNED:
-        config = training_config("fast", name, {"nuisance": "none", **LEARNED[name]})
+        config = training_config("fast", name, LEARNED[name], film=True)
         model = fit(name, fold.training, config).model
     else:
         fits = []

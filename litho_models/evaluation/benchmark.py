@@ -95,7 +95,7 @@ def benchmark(
     scans = dataset.scans()
     film = dataset.instrument == "sem"
     policy, background = policy or usual_policy(film), background or usual_background(film)
-    given = {"seed": seed, **({"nuisance": "none"} if film else {}), **(settings or {})}
+    given = {"seed": seed, **(settings or {})}
     recipe = given.pop("recipe", "fast")
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
@@ -113,7 +113,7 @@ def benchmark(
     facts = {"dataset": {"name": dataset.name}, "split": {"kind": split, "seed": seed}}
     with growing_folder(out, Benchmark.FILE_NAME, facts, holds=CACHE_FOLDER) as begun:
         _require_no_less(begun.folder, models, ids)
-        configs = {name: training_config(recipe, name, given) for name in models}
+        configs = {name: training_config(recipe, name, given, film) for name in models}
         cache = begun.folder / CACHE_FOLDER
         jobs = [
             (name, fold, configs[name], cache, background == "shared") for name in models for fold in plan

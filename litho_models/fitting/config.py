@@ -70,9 +70,9 @@ class TrainingConfig(Record):
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
 
     @classmethod
-    def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
+    def of_recipe(cls, recipe: Recipe, model_name: str, *, film: bool = False, **settings: Any) -> Self:
         """Return the settings that a named recipe has for a model. Values in ``settings`` replace individual
-        values of the recipe.
+        values of the recipe. No terms are fitted to scans of a film, unless ``settings`` say so.
 
         The recipe ``paper`` minimises the mean absolute error with Adam, in batches of 4, over 4,000 epochs
         of 72 quadrants. It uses the learning rates of the paper and fits no per-scan terms. The recipe
@@ -84,6 +84,7 @@ class TrainingConfig(Record):
             InputError: the recipe is unknown.
         """
         require_known("recipe", recipe, RECIPES)
+        settings = {**({"nuisance": "none"} if film else {}), **settings}
         if recipe == "fast":
             usual = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
             if model_name == "pbl" and settings.get("variant", "default") == "default":

@@ -73,8 +73,9 @@ def train(
         InputError: the recipe, variant, model or a setting is unknown, the store cannot be read, or ``out``
             holds another run.
     """
-    config = training_config(recipe, model, {"variant": variant, **(settings or {})})
     dataset = open_store(store)
+    film = dataset.instrument == "sem"
+    config = training_config(recipe, model, {"variant": variant, **(settings or {})}, film)
     scans = dataset.scans()
     lock_box = dataset.locked_ids
     locked = [] if use_lock_box else lock_box
@@ -130,9 +131,12 @@ def train(
     return record
 
 
-def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
+def training_config(
+    recipe: Recipe, model: str, settings: dict[str, Any], film: bool = False
+) -> TrainingConfig:
     """Check the settings of a training and return them. Entries of ``settings`` that are not fields of
     ``TrainingConfig`` must be fields of the model's configuration, and they are passed on to the model.
+    ``film`` says whether the scans are micrographs of films.
 
     Raises:
         InputError: the recipe, the model or a field is unknown, or a value is out of range.
@@ -146,7 +150,7 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
     if own:
         settings["model"] = {**settings.get("model", {}), **own}
     try:
-        return TrainingConfig.of_recipe(recipe, model, **settings)
+        return TrainingConfig.of_recipe(recipe, model, film=film, **settings)
     except ValidationError as error:
         raise refused(error) from None
 

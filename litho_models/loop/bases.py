@@ -72,7 +72,7 @@ def bases_for(
     if is_small(named):
         return {base: named}
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
-    recipe = TrainingConfig.of_recipe("fast", base, seed=study.seed, **given)
+    recipe = TrainingConfig.of_recipe("fast", base, film=study.of_films, seed=study.seed, **given)
     trainer = partial(_trained, base, recipe, cache)
     return {base: train_folds(scans, study.fold_of, trainer, study.workers)}
 

@@ -15,7 +15,12 @@ from scipy.ndimage import gaussian_filter
 from litho_data.store import PrintedScan
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.results import compare
+from litho_models.fitting import TrainingConfig, fit
+from litho_models.fitting.runs import train
 from litho_models.fitting.small_models import fit_small_model
+from litho_models.loop.bases import bases_for
+from litho_models.loop.fits import Study
+from litho_models.loop.model import FoldedBase
 from litho_models.models import build_model
 from litho_models.models.parts import etch, hill, illuminate, project
 from litho_models.scan_terms import NuisanceProtocol
@@ -152,6 +157,18 @@ def test_defaults_of_models_follow_the_pitch_of_another_printer() -> None:
     network = build_model("pbl", pitch_um=0.004).config.surroundings
     assert network is not None
     assert max(network.shifts_um) == pytest.approx(0.04)
+
+
+def test_training_fits_no_terms_to_films_unless_asked(tmp_path: Path) -> None:
+    scans = [replace(scan, seen_by="sem") for scan in make_scans(4, 48)]
+    store = write_store(tmp_path / "films.zarr", scans, instrument="sem")
+    assert train(store, "affine", tmp_path / "run").config.nuisance == "none"
+    asked = train(store, "affine", tmp_path / "asked", settings={"nuisance": "offset"})
+    assert asked.config.nuisance == "offset"
+    base = bases_for("features", Study.dealt(scans, 2), cache=tmp_path)["features"]
+    assert isinstance(base, FoldedBase)
+    free = fit("features", scans, TrainingConfig.of_recipe("fast", "features", nuisance="none")).model
+    assert torch.equal(base.common.weights, free.weights)
 
 
 def test_a_benchmark_of_films_is_led_by_their_edges(tmp_path: Path) -> None:
