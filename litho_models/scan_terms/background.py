@@ -94,9 +94,10 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
     """Learn the smooth background that all scans show in addition to the heights that a model predicts.
 
     All terms of policy ``full``, including offset and gain, are fitted to the valid pixels of each scan. The
-    background is the least-squares fit to the five smooth terms (tilt and bow) of all scans: for whole scans
-    the mean of their coefficients, for parts a surface over the whole field with a free offset in each part.
-    If the fields of the scans differ in size, only the scans with the most frequent field size are used.
+    background is the least-squares fit to the five smooth terms (tilt and bow) of all scans at these pixels:
+    for whole scans the mean of their coefficients, for parts, and for scans that were measured only in part,
+    a surface over the whole field with a free offset in each. If the fields of the scans differ in size, only
+    the scans with the most frequent field size are used.
 
     Args:
         scans: training scans.
@@ -104,14 +105,19 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
             are in the order of ``scans``.
     """
     usual_um = usual_field_um(scans)
-    pairs = [one for one in zip(scans, predictions_um, strict=True) if is_of_size(one[0], usual_um)]
+    pairs = [
+        one
+        for one in zip(scans, predictions_um, strict=True)
+        if is_of_size(one[0], usual_um) and one[0].usable.any()
+    ]
     products, seen = np.zeros((5, 5)), np.zeros(5)
     for scan, prediction in pairs:
-        coefficients, _ = fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])
+        usable = scan.usable
+        coefficients, _ = fitted_terms(scan.height_um, prediction, usable, POLICIES["full"])
         own = np.tensordot(coefficients[2:], smooth_shapes(scan.shape), axes=1)
-        shapes = on_field(scan, smooth_shapes).reshape(5, -1)
+        shapes = on_field(scan, smooth_shapes)[:, usable]
         shapes = shapes - shapes.mean(axis=1, keepdims=True)
         products += shapes @ shapes.T
-        seen += shapes @ own.ravel()
+        seen += shapes @ own[usable]
     x, y, xx, xy, yy = (NM_PER_UM * np.linalg.lstsq(products, seen, rcond=1e-12)[0]).tolist()
     return Background(x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=usual_um, scans=len(pairs))

@@ -114,6 +114,23 @@ def test_quadrants_show_the_background_of_their_whole_field():
             assert np.std(part.height_um - seen.map_um) == pytest.approx(0.001, rel=0.06)
 
 
+def test_a_scan_counts_for_the_background_only_where_it_was_measured(scans):
+    whole, prints = [*scans[1:]], [truth(scan) for scan in scans]
+    for share, tolerance_nm in ((0.1, 0.1), (0.0, 1e-9)):
+        seen = np.arange(128) < 128 * share
+        valid = np.broadcast_to(seen, (128, 128))
+        # Extrapolated from the strip, the ripple of 20 nm is a tilt and a bow of micrometres.
+        ripple_um = 0.02 * np.sin(np.arange(128) / 4)
+        part = replace(
+            scans[0], valid=valid, height_um=np.where(valid, scans[0].height_um + ripple_um, np.nan)
+        )
+        learned = learn_background([part, *whole], prints)
+        without = learn_background(whole, prints[1:])
+        assert learned.scans == without.scans + bool(share)
+        difference_um = (learned.map_um((128, 128)) - without.map_um((128, 128))).std()
+        assert 1000 * difference_um < tolerance_nm
+
+
 def test_a_background_has_zero_mean_and_is_the_sum_of_its_terms():
     background = some_background()
     field = background.map_um((90, 110))
