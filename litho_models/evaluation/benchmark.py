@@ -74,7 +74,7 @@ def benchmark(
         background: ``training``, ``shared`` or ``none``; by default ``training``, or ``none`` for films. With
             ``training``, the smooth background that each fit learns from its training scans is added to its
             predictions. With ``shared``, each fit also learns a measurement model, which is applied to its
-            predictions.
+            predictions. It levels whole scans, so it is refused for the quadrants of ``paper``.
         noise: path of the ``noise.json`` of this dataset, or of its folder. The noise floor that the file
             states is shown beside the errors. By default, the noise floor is estimated from the held-out
             residuals of the best model.
@@ -86,15 +86,23 @@ def benchmark(
 
     Raises:
         InputError: no model is given, or a model is unknown or repeated; the store cannot be read, or is too
-            small for the split or the lock box; ``first_folds`` exceeds the number of folds; the noise
-            analysis belongs to other data; the cache is damaged; or ``out`` holds a benchmark with models or
-            scans that the new benchmark does not contain.
+            small for the split or the lock box; ``shared`` is wanted for ``paper``; ``first_folds`` exceeds
+            the number of folds; the noise analysis belongs to other data; the cache is damaged; or ``out``
+            holds a benchmark with models or scans that the new benchmark does not contain.
     """
     require_models(models)
     dataset = open_store(store)
     scans = dataset.scans()
     film = dataset.instrument == "sem"
     policy, background = policy or usual_policy(film), background or usual_background(film)
+    if (split, background) == ("paper", "shared"):
+        # A scan was levelled as a whole, so the levelling of a quadrant depends on pixels outside it.
+        raise InputError(
+            "background for split paper",
+            got="shared",
+            wanted="training or none",
+            hint="use split grouped, which holds out whole scans",
+        )
     given = {"seed": seed, **(settings or {})}
     recipe = given.pop("recipe", "fast")
     floor = stated_floor(dataset.name, noise)

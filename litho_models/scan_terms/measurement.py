@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.background import is_of_size, on_field
+from litho_models.scan_terms.background import is_of_size
 from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.scan_terms.term import FloatMap
@@ -75,8 +75,7 @@ class SharedPart(Record):
         and return their sum, µm. A background has no constant term. The result has shape (ny, nx).
         """
         own = self.of(scan)
-        shapes = on_field(scan, lambda shape: polynomials(shape, self.degree))
-        return np.tensordot(own, shapes[-len(own) :], axes=1)
+        return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
 
 
 class MeasurementModel(Record):

@@ -13,7 +13,7 @@ import numpy as np
 
 from litho_data.store import PrintedScan
 from litho_data.store.lock_box import drawing_key
-from litho_models.scan_terms.background import on_field, usual_field_um
+from litho_models.scan_terms.background import usual_field_um
 from litho_models.scan_terms.blocks import thinned
 from litho_models.scan_terms.cross_fit import least_squares
 from litho_models.scan_terms.grouped import ALL, Block, Products, groupings
@@ -162,8 +162,7 @@ def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel)
     slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
     count, lateral = polynomial_count(_HIGHEST), polynomial_count(_LATERAL)
     rows = np.empty((count + 2 * lateral + 1, len(at)))
-    shapes = on_field(scan, lambda shape: polynomials(shape, _HIGHEST))
-    np.take(shapes.reshape(count, -1), at, 1, out=rows[:count], mode="clip")
+    np.take(polynomials(scan.shape, _HIGHEST).reshape(count, -1), at, 1, out=rows[:count], mode="clip")
     # The background is added after levelling, so the columns of the background are not levelled.
     surface, moved = rows[[0, *LEVELLED[model.levelling]]], rows[count:]
     np.multiply(rows[:lateral], slope_x, out=moved[:lateral])

@@ -24,9 +24,6 @@ from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scan_terms.background import Background, learn_background, on_field
-from litho_models.scan_terms.grouped import ALL
-from litho_models.scan_terms.measurement import MeasurementModel, SharedPart
-from litho_models.scan_terms.measurement_fit import learn_measurement
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import plan_folds
@@ -104,14 +101,16 @@ def test_quadrants_show_the_background_of_their_whole_field():
     assert learned.field_um == pytest.approx((6.5, 6.5))
     for name in ("x_nm", "y_nm", "xx_nm", "xy_nm", "yy_nm"):
         assert getattr(learned, name) == pytest.approx(getattr(planted, name), abs=0.2)
-    bow = SharedPart(what="background", by=ALL, degree=2, shrinking=1e-6, coefficients={})
-    like = MeasurementModel(levelling="none", parts=[bow], field_um=learned.field_um, scans=0)
-    measured = learn_measurement(fold.training, heights, like=like)
     for part in fold.held_out:
-        own = printed(part)
-        for seen in (Prediction.beside(learned, part, own), Prediction.seen(measured, part, own)):
-            # Only the datum and the noise of 1 nm are left. The background has at least 10 nm rms.
-            assert np.std(part.height_um - seen.map_um) == pytest.approx(0.001, rel=0.06)
+        seen = Prediction.beside(learned, part, printed(part))
+        # Only the datum and the noise of 1 nm are left. The background has at least 10 nm rms.
+        assert np.std(part.height_um - seen.map_um) == pytest.approx(0.001, rel=0.06)
+
+
+def test_quadrants_are_refused_for_a_model_of_whole_scans(store, tmp_path):
+    with pytest.raises(InputError, match="background for split paper, got shared, wanted training or none"):
+        benchmark(store, tmp_path / "out", split="paper", models=("identity",), background="shared")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_scan_counts_for_the_background_only_where_it_was_measured(scans):
