@@ -16,8 +16,8 @@ MODEL_FOLDER = "model"
 SCAN_AXIS = "scan-axis"
 _WITHOUT_IT = (
     f"The stated errors are those of a model that also has {SCAN_AXIS}, a part for predicting measured maps. "
-    "This model "
-    "was frozen without it."
+    "This model was frozen without it, and so without background and values of reference prints, which "
+    "depend on it."
 )
 
 
@@ -35,7 +35,7 @@ def freeze(
             all of these effects, or a mapping from the name of an effect to its side. Effects attributed to
             the printer become part of the frozen model; those attributed to the microscope do not. The card
             records the attribution. The name ``scan-axis`` stands for the part of a base model that acts
-            along the lines of the scan.
+            along the lines of the scan. Without this part, the card states no background and no baseline.
 
     Raises:
         InputError: ``source`` contains no model; an effect to attribute is not of undetermined role; a side
@@ -77,5 +77,7 @@ def freeze(
     if not taken and printer is not simulator:
         simulator = printer
         kept["limitations"] = [*card.limitations, _WITHOUT_IT]
+        # Background and baseline compare the training scans with what the whole model predicted for them.
+        del kept["background"], kept["baseline"]
     save_frozen(simulator, out, name=card.name, process_effects=sides["printer"], **kept)
     return ModelCard.read(Path(out) / CARD_FILE)

@@ -23,6 +23,7 @@ from litho_models.frozen.card import CARD_FILE, ModelCard
 from litho_models.frozen.files import README_FILE, WEIGHTS_FILE
 from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
+from litho_models.scan_terms.background import Background
 
 pytestmark = pytest.mark.numerics
 
@@ -334,7 +335,9 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     model = build_model("pbl", sigma_diffusion_init_um=0.3)
     with torch.no_grad():
         model.scan_axis.linear.weight.fill_(0.02)
-    source = save_frozen(model, tmp_path / "source")
+    bow = dict.fromkeys(("x_nm", "y_nm", "xx_nm", "xy_nm", "yy_nm"), 1.0)
+    learned = Background(**bow, field_um=(10, 10), scans=1)
+    source = save_frozen(model, tmp_path / "source", background=learned, baseline=[{"scan": "S1"}])
     assert "The model also contains `scan-axis`" in (source / README_FILE).read_text(encoding="utf-8")
     cards = {side: freeze(source, tmp_path / side, side) for side in ("printer", "microscope")}
     cards["left"] = freeze(source, tmp_path / "left")
@@ -346,6 +349,10 @@ def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attributi
     assert float((heights["source"] - heights["left"]).abs().max()) > 0.01
     assert (cards["left"].undetermined_effects, cards["left"].attributed) == ({"scan-axis": {}}, {})
     assert cards["microscope"].measurement_effects == {"scan-axis": {}}
+    # Background and baseline belong to the predictions of the whole model.
+    for name, card in cards.items():
+        whole = name in ("printer", "again")
+        assert (card.background, len(card.baseline)) == (learned if whole else None, int(whole))
     assert "a part for predicting measured maps" in cards["microscope"].limitations[-1]
     assert cards["printer"].process_effects == {}
     assert cards["again"].attributed == {"scan-axis": "printer"}
