@@ -14,8 +14,8 @@ from litho_models.simulator import Simulator, Tile
 
 # The frame of an effect: whether the effect rotates with the print or with the scan.
 Frame = Literal["scan", "print"]
-# Key of a cached field. It contains everything on which the field depends: the names and parameter values of
-# the effects before it, and the base.
+# Key of a cached field. It contains everything on which the field depends: the names, frames and parameter
+# values of the effects before it, and the base.
 Key = tuple[object, ...]
 Fields = MutableMapping[Key, Tensor]
 
@@ -92,10 +92,10 @@ class EffectChain(nn.Module):
         for name, values in self.values.items():
             effect = get_effect(name)
             if effect.acts_on == acts_on:
-                key = (*key, name, *values.values())
+                usual = "scan" if effect.stage == "measurement" else "print"
+                scanned = self.frames.get(name, usual) == "scan"
+                key = (*key, name, scanned, *values.values())
                 if key not in known:
-                    usual = "scan" if effect.stage == "measurement" else "print"
-                    scanned = self.frames.get(name, usual) == "scan"
                     known[key] = effect(field, values, context, scanned=scanned)
                 field = known[key]
         return field, key

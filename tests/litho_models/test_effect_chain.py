@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -69,6 +71,16 @@ def test_a_batch_of_two_layouts_gives_the_two_single_prints(name) -> None:
     slopes = torch.autograd.grad(heights[1].sum(), two)[0]
     assert not slopes[0].any()
     assert slopes[1].any()
+
+
+def test_chains_that_share_a_cache_differ_by_the_frames_of_their_effects() -> None:
+    effect, context = "slope-thinning", replace(_context(), quarter_turns=1)
+    values = {effect: {"along_x_um": 0.1, "exponent": 1.0}}
+    scan, turned = (EffectChain(build_model("identity"), values, {effect: f}) for f in ("scan", "print"))
+    known: dict = {}
+    assert torch.equal(scan(LAYOUT, context, known), scan(LAYOUT, context))
+    assert torch.equal(turned(LAYOUT, context, known), turned(LAYOUT, context))
+    assert not torch.equal(turned(LAYOUT, context), scan(LAYOUT, context))
 
 
 def _context():
