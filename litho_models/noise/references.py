@@ -23,7 +23,7 @@ from litho_models.noise.surface import (
     without_background,
 )
 from litho_models.noise.texture import Texture, texture
-from litho_models.scoring.statistics import Interval, interval, rms
+from litho_models.scoring.statistics import Interval, interval
 
 _SQUARE_WITHIN = 0.01
 # Two prints of one layout are compared only if at least this number of pixels is measured in both of them.
@@ -120,7 +120,8 @@ class RepeatedPrints(Record):
 
     A polynomial of second degree is removed from the difference between two prints, so datum, tilt and bow
     are not included. Errors that repeat from print to print are not included either. ``ci95_nm`` is the 95 %
-    confidence interval of ``sigma_nm``, from resampling the pairs of prints.
+    confidence interval of ``sigma_nm``, from resampling whole prints. It is None for fewer than six prints,
+    and if every pair contains the same print.
     """
 
     sigma_nm: float
@@ -146,24 +147,43 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> RepeatedPrints | None:
         group = groups.setdefault((scan.shape, scan.dose, scan.mask_level.tobytes()), [])
         if all(_different_fields(scan, other) for other in group):
             group.append(scan)
-    sigmas, absolute, members = [], [], set()
+    squares, absolute, prints, members = [], [], [], set()
     for first, second in (pair for group in groups.values() for pair in combinations(group, 2)):
         difference = np.where(first.valid & second.valid, first.height_um - second.height_um, np.nan)
         if np.isfinite(difference).sum() < _FEWEST_PIXELS:
             continue
         rest = NM_PER_UM * without_background(difference, "quadratic")
         rest = rest[np.isfinite(rest)] / np.sqrt(2)
-        sigmas.append(rms(rest))
+        squares.append(float(np.mean(rest**2)))
         absolute.append(float(np.abs(rest).mean()))
+        prints.append((first.print_id, second.print_id))
         members |= {first.id, second.id}
-    if not sigmas:
+    if not squares:
         return None
     return RepeatedPrints(
-        sigma_nm=rms(sigmas),
-        ci95_nm=interval(sigmas),
+        sigma_nm=float(np.sqrt(np.mean(squares))),
+        ci95_nm=_sigma_interval(np.array(squares), prints),
         mae_nm=float(np.mean(absolute)),
         scans=len(members),
     )
+
+
+def _sigma_interval(squares_nm2: np.ndarray, prints: Sequence[tuple[str, str]]) -> Interval:
+    """Return the 95 % confidence interval of the root of the mean of ``squares_nm2``, which has one value per
+    pair of prints.
+
+    Pairs that share a print are not independent. Therefore prints are resampled, each with its jackknife
+    pseudo-value: N times the mean over all pairs minus N - 1 times the mean over the pairs without this
+    print. For all pairs of N prints with white noise, it is the variance of the noise of this print.
+    """
+    names = list(dict.fromkeys(name for pair in prints for name in pair))
+    without = np.array([[name not in pair for pair in prints] for name in names])
+    if not without.any(axis=1).all():
+        return None
+    others = without @ squares_nm2 / without.sum(axis=1)
+    ends = interval((len(names) * squares_nm2.mean() - (len(names) - 1) * others).tolist())
+    # A pseudo-value may be negative.
+    return ends and (float(np.sqrt(max(ends[0], 0.0))), float(np.sqrt(max(ends[1], 0.0))))
 
 
 def _different_fields(first: PrintedScan, second: PrintedScan) -> bool:

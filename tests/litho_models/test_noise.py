@@ -39,6 +39,7 @@ from litho_models.noise.variance import (
 from litho_models.scoring import like_layouts
 from litho_models.scoring.like_layouts import like_pixels
 from litho_models.scoring.noise_floor import estimated_floor, floor_of_residuals, freed_by_policy
+from litho_models.scoring.statistics import bootstrap_interval
 from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 
@@ -405,6 +406,30 @@ def test_repeated_prints_give_their_noise():
     # From three pairs of 16,384 white pixels, σ has an error of 0.3 %.
     assert found.sigma_nm == pytest.approx(12, rel=0.02)
     assert found.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * 12, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_the_interval_of_repeated_prints_is_that_of_the_rms_over_prints(count):
+    first = make_scans(1, size_px=64, noise_um=0.0)[0]
+    sigmas_nm = [5.0 if n % 2 else 30.0 for n in range(count)]
+    repeats = [
+        replace(
+            first,
+            id=f"R{n}",
+            print_id=f"R{n}",
+            height_um=(first.height_um + rough((64, 64), sigma / 1e3, n)).astype(np.float32),
+        )
+        for n, sigma in enumerate(sigmas_nm)
+    ]
+    found = repeated_prints(repeats)
+    if count < 6:
+        assert found.ci95_nm is None
+    else:
+        assert found.ci95_nm[0] < found.sigma_nm < found.ci95_nm[1]
+        # The difference of two prints has the sum of their variances.
+        wanted = np.sqrt(bootstrap_interval(np.square(sigmas_nm)))
+        # In 4,096 pixels, the noise of two prints correlates by about 1/64.
+        assert found.ci95_nm == pytest.approx(wanted, rel=0.03)
 
 
 def test_other_doses_are_no_repeats():
