@@ -75,16 +75,17 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
     pitch = scans[0].pitch_um
     edges = np.linspace(0, 0.5 / pitch, TRANSFER_BANDS + 1)
     frequency = (edges[1:] + edges[:-1]) / 2
-    along_x, along_y = np.zeros((5, TRANSFER_BANDS)), np.zeros((5, TRANSFER_BANDS))
+    along_x, along_y = np.zeros((6, TRANSFER_BANDS)), np.zeros((6, TRANSFER_BANDS))
     for scan, prediction in zip(scans, predictions_um, strict=True):
         usable = scan.usable
         height = np.where(usable, scan.height_um, prediction)
         along_x += _band_powers(height, prediction, pitch, edges)
         along_y += _band_powers(height.T, prediction.T, pitch, edges)
     curves: dict[str, Any] = {"frequency_per_um": frequency.tolist()}
-    for axis, (cross, measured, predicted, error, lines) in (("x", along_x), ("y", along_y)):
+    for axis, (*parts, measured, predicted, error, lines) in (("x", along_x), ("y", along_y)):
+        cross = np.hypot(*parts)
         curves |= {
-            f"gain_{axis}": (np.abs(cross) / np.maximum(measured, _TINY)).tolist(),
+            f"gain_{axis}": (cross / np.maximum(measured, _TINY)).tolist(),
             f"coherence_{axis}": (cross**2 / np.maximum(measured * predicted, _TINY)).tolist(),
             f"error_psd_{axis}": (NM_PER_UM**2 * error / np.maximum(lines, 1)).tolist(),
         }
@@ -92,9 +93,9 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 
 
 def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
-    """Compute sums over frequency bands. The result has shape (5, bands). Its rows are the cross power, the
-    power of the measurement, the power of the prediction, the error density, and the number of terms. Each
-    value is a sum over all lines and over the frequencies of one band.
+    """Compute sums over frequency bands. The result has shape (6, bands). Its rows are the real and the
+    imaginary part of the cross power, the power of the measurement, the power of the prediction, the error
+    density, and the number of terms. Each value is a sum over all lines and over the frequencies of one band.
 
     The error density is one-sided, in µm² per cycle/µm. The number of terms is the number of values that were
     added in the sum of the error density.
@@ -106,8 +107,10 @@ def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array
     )
     band = np.digitize(np.fft.rfftfreq(height.shape[1], pitch_um), edges[1:-1])
     density = 2 * pitch_um / np.sum(window**2)
+    cross = (predicted * measured.conj()).sum(axis=0)
     spectra = [
-        (predicted * measured.conj()).real.sum(axis=0),
+        cross.real,
+        cross.imag,
         (np.abs(measured) ** 2).sum(axis=0),
         (np.abs(predicted) ** 2).sum(axis=0),
         density * (np.abs(measured - predicted) ** 2).sum(axis=0),

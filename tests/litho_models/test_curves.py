@@ -46,6 +46,14 @@ def test_a_blurred_prediction_follows_as_far_as_the_gaussian_does():
     assert np.ptp(curves.gain_y[1:]) < 0.05
 
 
+def test_a_shifted_prediction_follows_as_well_as_an_unshifted_one():
+    height = white(4, 0.2, 256)
+    # From pixel to pixel the window is nearly constant, so it hides no part of a shift by one pixel.
+    curves = transfer_curves([scan_of(height)], [np.roll(height, 1, axis=1)])
+    assert curves.gain_x == pytest.approx([1] * len(curves.gain_x), abs=0.005)
+    assert curves.coherence_x == pytest.approx([1] * len(curves.gain_x), abs=0.005)
+
+
 def test_a_perfect_prediction_follows_to_the_end():
     height = white(3, 0.2, 64)
     curves = transfer_curves([scan_of(height)], [height])
