@@ -68,7 +68,7 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
     """Compute the gain, the coherence and the error density from the spectra of all lines. The mean of each
-    line is removed, and a Hann window is applied.
+    line is removed, and a Hann window is applied. Only measured pixels count.
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
@@ -78,42 +78,50 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
     along_x, along_y = np.zeros((6, TRANSFER_BANDS)), np.zeros((6, TRANSFER_BANDS))
     for scan, prediction in zip(scans, predictions_um, strict=True):
         usable = scan.usable
-        height = np.where(usable, scan.height_um, prediction)
-        along_x += _band_powers(height, prediction, pitch, edges)
-        along_y += _band_powers(height.T, prediction.T, pitch, edges)
+        error = np.where(usable, scan.height_um.astype(np.float64) - prediction, 0)
+        along_x += _band_powers(error, prediction, usable, pitch, edges)
+        along_y += _band_powers(error.T, prediction.T, usable.T, pitch, edges)
     curves: dict[str, Any] = {"frequency_per_um": frequency.tolist()}
     for axis, (*parts, measured, predicted, error, lines) in (("x", along_x), ("y", along_y)):
         cross = np.hypot(*parts)
         curves |= {
             f"gain_{axis}": (cross / np.maximum(measured, _TINY)).tolist(),
             f"coherence_{axis}": (cross**2 / np.maximum(measured * predicted, _TINY)).tolist(),
-            f"error_psd_{axis}": (NM_PER_UM**2 * error / np.maximum(lines, 1)).tolist(),
+            f"error_psd_{axis}": (NM_PER_UM**2 * error / np.maximum(lines, _TINY)).tolist(),
         }
     return TransferCurves(**curves)
 
 
-def _band_powers(height: Array, prediction: Array, pitch_um: float, edges: Array) -> Array:
+def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float, edges: Array) -> Array:
     """Compute sums over frequency bands. The result has shape (6, bands). Its rows are the real and the
     imaginary part of the cross power, the power of the measurement, the power of the prediction, the error
     density, and the number of terms. Each value is a sum over all lines and over the frequencies of one band.
 
     The error density is one-sided, in µm² per cycle/µm. The number of terms is the number of values that were
     added in the sum of the error density.
+
+    ``error`` is measured minus predicted height, and 0 at pixels that are not usable. The power of the error
+    in a line is therefore in proportion to the measured share of the line. The power of the prediction is
+    multiplied by this share and the terms are counted by it, so unmeasured pixels have no effect.
     """
-    window = np.hanning(height.shape[1])
-    measured, predicted = (
-        np.fft.rfft((field - field.mean(axis=1, keepdims=True)) * window, axis=1)
-        for field in (height.astype(np.float64), prediction.astype(np.float64))
-    )
-    band = np.digitize(np.fft.rfftfreq(height.shape[1], pitch_um), edges[1:-1])
+    window = np.hanning(error.shape[1])
+    share = usable @ window**2 / np.sum(window**2)
+    means = error.sum(axis=1, keepdims=True) / np.maximum(usable.sum(axis=1, keepdims=True), 1)
+    centred = prediction.astype(np.float64) - prediction.mean(axis=1, keepdims=True, dtype=np.float64)
+    missed = np.fft.rfft(np.where(usable, error - means, 0) * window, axis=1)
+    predicted = np.fft.rfft(centred * window, axis=1)
+    band = np.digitize(np.fft.rfftfreq(error.shape[1], pitch_um), edges[1:-1])
     density = 2 * pitch_um / np.sum(window**2)
-    cross = (predicted * measured.conj()).sum(axis=0)
+    power = share @ np.abs(predicted) ** 2
+    # The measurement is the sum of the prediction and the error.
+    with_error = (predicted * missed.conj()).sum(axis=0)
+    error_power = (np.abs(missed) ** 2).sum(axis=0)
     spectra = [
-        cross.real,
-        cross.imag,
-        (np.abs(measured) ** 2).sum(axis=0),
-        (np.abs(predicted) ** 2).sum(axis=0),
-        density * (np.abs(measured - predicted) ** 2).sum(axis=0),
-        np.full(band.shape, float(len(height))),
+        power + with_error.real,
+        with_error.imag,
+        power + 2 * with_error.real + error_power,
+        power,
+        density * error_power,
+        np.full(band.shape, share.sum()),
     ]
     return np.stack([np.bincount(band, spectrum, minlength=len(edges) - 1) for spectrum in spectra])

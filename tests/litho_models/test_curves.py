@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -33,6 +35,33 @@ def test_white_error_has_a_flat_density_whose_integral_is_its_variance():
         # four are allowed. The lowest band is excluded, because each line's mean is removed.
         assert density[1:] == pytest.approx([100 / 5] * (len(density) - 1), rel=0.07)
         assert np.sum(density) * width == pytest.approx(100, rel=0.03)
+
+
+def test_unmeasured_lines_do_not_change_the_curves():
+    height = white(5, 0.2, 128)
+    prediction = 0.8 * height + white(6, 0.1, 128)
+    scan = scan_of(height)
+    measured = slice(32, 64)
+    scan.valid[: measured.start] = scan.valid[measured.stop :] = False
+    scan.height_um[~scan.valid] = np.nan
+    alone = replace(
+        scan,
+        mask_level=scan.mask_level[measured],
+        height_um=height[measured],
+        valid=scan.valid[measured],
+    )
+    found = transfer_curves([scan], [prediction])
+    wanted = transfer_curves([alone], [prediction[measured]])
+    for curve in ("gain_x", "coherence_x", "error_psd_x"):
+        assert getattr(found, curve) == pytest.approx(getattr(wanted, curve))
+
+
+def test_half_measured_lines_have_the_error_of_their_measured_half():
+    height = white(0, 0.2)
+    scan = scan_of(height)
+    scan.valid[:, :256] = False
+    curves = transfer_curves([scan], [height + white(1, 0.010)])
+    assert curves.error_psd_x[1:] == pytest.approx([100 / 5] * (len(curves.error_psd_x) - 1), rel=0.1)
 
 
 def test_a_blurred_prediction_follows_as_far_as_the_gaussian_does():
