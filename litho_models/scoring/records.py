@@ -121,9 +121,9 @@ class ModelScores(MetricValues, extra="ignore"):
     intervals come from resampling scans.
 
     ``without_background`` contains the same errors as ``by_policy``, but computed without the background of
-    the protocol. It contains only the policies without smooth terms such as tilt, and is empty if the
-    protocol has no background. ``phase_rms_waves`` is the RMS phase error, in waves, of light that passes
-    through the print.
+    the protocol. It is empty if the protocol has no background. If the background is smooth (``training``),
+    it contains only the policies without smooth terms such as tilt. ``phase_rms_waves`` is the RMS phase
+    error, in waves, of light that passes through the print.
     """
 
     model: str

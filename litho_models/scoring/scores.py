@@ -7,7 +7,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scan_terms import CrossFit, NuisanceProtocol, Policy
+from litho_models.scan_terms import POLICIES, BackgroundUse, CrossFit, NuisanceProtocol, Policy
 from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import phase_waves, scan_errors
 from litho_models.scoring.noise_floor import freed_by_policy
@@ -15,9 +15,13 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# Policies without smooth terms such as tilt. Only with these policies do the errors depend on a smooth
-# background, because smooth terms would absorb it.
-_BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
+# The policies with which errors depend on each kind of background. Smooth terms such as tilt would absorb a
+# smooth background, but not the displacements of the shared measurement model.
+_DEPENDENT_POLICIES: Mapping[BackgroundUse, tuple[Policy, ...]] = {
+    "none": (),
+    "training": ("none", "offset", "offset-gain"),
+    "shared": tuple(POLICIES),
+}
 
 
 def score_model(
@@ -43,7 +47,7 @@ def score_model(
     maps = [prediction.map_um for prediction in predictions]
     heights = [prediction.height_um for prediction in predictions]
     freed = freed_by_policy(scans, maps, blocks)
-    bare = _BLIND_POLICIES if protocol.background != "none" else ()
+    bare = _DEPENDENT_POLICIES[protocol.background]
     chosen, rows = freed[protocol.policy], []
     for scan, expected, fit in zip(scans, maps, chosen, strict=True):
         errors = scan_errors(scan.id, scan.height_um, expected, fit).model_dump()

@@ -205,6 +205,25 @@ def test_with_the_true_print_and_background_only_the_noise_is_left(scans):
     assert offset.mae_nm > 9  # the mean absolute value of 40 nm · (y² - 1/3) alone is 10.3 nm
 
 
+def test_smooth_terms_absorb_no_shared_displacement(scans):
+    """Check the errors of the true print without and with the displacement by two pixels that it shares."""
+    true = [truth(scan) for scan in scans]
+    moved = [
+        replace(scan, height_um=(np.roll(height, 2, axis=1) + scan.height_um - height).astype(np.float32))
+        for scan, height in zip(scans, true, strict=True)
+    ]
+    scores = score_model(
+        "truth",
+        moved,
+        [Prediction(one, np.roll(one, 2, axis=1) - one) for one in true],
+        NuisanceProtocol.of_policy("offset", background="shared"),
+    )
+    without = {error.policy: error.mae_nm for error in scores.without_background}
+    by_policy = {error.policy: error.mae_nm for error in scores.by_policy}
+    assert without.keys() == by_policy.keys()
+    assert all(without[policy] > 5 * by_policy[policy] for policy in SMOOTH)
+
+
 def test_the_height_that_a_design_gets_is_the_same_bit_for_bit(tmp_path):
     model = build_model("physics")
     with_it = save_frozen(model, tmp_path / "with", background=some_background(yy_nm=500.0))
