@@ -164,5 +164,5 @@ def lock_box_text(split: ScoredSplit) -> str:
         return "The dataset is too small to lock any scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
-        return f"{len(split.lock_box)} locked scans, on which no model is trained, are not scored."
-    return f"Locked scans, on which no model is trained, are scored too: {', '.join(scored)}."
+        return f"{len(split.lock_box)} locked scans, which are set aside for a final test, are not scored."
+    return f"Locked scans, which are set aside for a final test, are scored too: {', '.join(scored)}."

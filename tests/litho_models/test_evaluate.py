@@ -12,9 +12,11 @@ from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.results import Evaluation
+from litho_models.evaluation.wording import evaluation_verdict
 from litho_models.fitting.runs import train
 from litho_models.noise.residuals import read_residuals
 from litho_models.scoring import metric_registry
+from litho_models.scoring.noise_floor import NoiseFloor
 from tests.litho_models.prints import make_scans, write_store
 from tests.tables import require_tables_equal_record
 
@@ -38,6 +40,29 @@ def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_pat
     require_tables_equal_record(tmp_path / "out", Evaluation.FILE_NAME, above, pivoted=["policies.csv"])
     assert ("not a held-out error" in (tmp_path / "out" / "report.html").read_text()) == same
     assert read_residuals(open_store(store), folder / "model").held_out == (not same)
+
+
+def test_locked_scans_that_were_trained_on_are_not_called_untouched(tmp_path):
+    store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=48))
+    run = train(store, "identity", tmp_path / "run", use_lock_box=True)
+    scored = evaluate(tmp_path / "run" / "model", store, tmp_path / "out", open_lock_box=True)
+    assert scored.split.lock_box
+    assert set(scored.split.lock_box) <= set(scored.trained_on_scored_scans) == set(run.training_ids)
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert f"are scored too: {scored.split.lock_box[0]}." in report
+    assert "no model is trained" not in report
+
+
+@pytest.mark.parametrize("share", [0.5, 1.5])
+def test_no_more_than_the_error_can_be_removed(trained, tmp_path, share):
+    store, _, folder = trained
+    scored = evaluate(folder / "model", store, tmp_path / "out")
+    error_nm = scored.scores.mae_datum_free_nm
+    floor = NoiseFloor(mae_nm=share * error_nm, rmse_nm=None, kind="measured", source="flat prints")
+    text = evaluation_verdict(scored.model_copy(update={"noise_floor": floor}))
+    removable = f"{0.5 * error_nm:.2f} nm can still be removed" in text
+    assert (removable, "is not smaller than this error" in text) == (share < 1, share > 1)
+    assert " -" not in text
 
 
 def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):
