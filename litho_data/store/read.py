@@ -178,6 +178,20 @@ class Store:
         """
         return values_of(group_of(self.root, f"scans/{scan_id}"), name)
 
+    def scan_frame_pitch_um(self, scan_id: str) -> YX:
+        """Return the pitch along y and x, in µm, of the arrays that ``scan_frame`` reads. If the axes of the
+        microscope were calibrated, it is the corrected pitch.
+
+        Raises:
+            InputError: there is no such scan, or its metadata are damaged.
+        """
+        group = group_of(self.root, f"scans/{scan_id}")
+        with damaged(f"pitch of scan {scan_id} in {self.path}"):
+            ome: Any = group.attrs["ome"]
+            (transform,) = ome["multiscales"][0]["datasets"][0]["coordinateTransformations"]
+            pitch_y_um, pitch_x_um = map(float, transform["scale"])
+            return pitch_y_um, pitch_x_um
+
     @cached_property
     def locked_ids(self) -> list[str]:
         """Return the ids of the scans in the lock box, which are set aside for the final test. They are
@@ -217,7 +231,7 @@ class Store:
 
     def recorded_pitches_um(self) -> dict[str, YX]:
         """Return the pitch along y and x, in µm, that the reader recorded for each scan, including reference
-        scans.
+        scans. It is not corrected by a calibration; that of ``scan_frame_pitch_um`` is.
         """
         pitches = {}
         for row in self.manifest.get("files", []):

@@ -61,13 +61,12 @@ def store_references(store: Store) -> list[Reference]:
     """Return the levelled scans of substrates, flat prints and steps in a store. The heights of each scan are
     on the grid of the scan itself, not on that of a layout.
     """
-    pitches = store.recorded_pitches_um()
     return [
         Reference(
             scan_id,
             use,
             store.scan_frame(scan_id, "levelled_height_um"),
-            pitches.get(scan_id, (store.pitch_um, store.pitch_um)),
+            store.scan_frame_pitch_um(scan_id),
         )
         for scan_id, use in store.references().items()
         if use != "grating"

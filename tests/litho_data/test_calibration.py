@@ -226,6 +226,8 @@ def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Pa
     # With corrected lengths, scan and layout have the same scale, up to 0.02 px of 112 due to noise.
     assert quality["singular_max"].max() < 1.004
     assert quality["singular_min"].min() > 0.996
+    pitches = quality[["scan_pitch_y_um", "scan_pitch_x_um"]].to_numpy()
+    assert [store.scan_frame_pitch_um(scan_id) for scan_id in store.ids] == [*map(tuple, pitches)]
     for index, scan in enumerate(store.scans()):
         truth = height_of(layout_of(index), index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
         difference = (scan.height_um - truth)[scan.valid]

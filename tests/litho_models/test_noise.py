@@ -9,16 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import zarr
 from scipy.integrate import quad
 from scipy.stats import norm
 from scipy.stats import t as student
 
 from litho_data.foundation.errors import InputError
+from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
+from litho_data.store.write import write_scan_group
 from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import Stated, _bins, analyse_spread, calibrate
 from litho_models.noise.dose import dose_matrix
-from litho_models.noise.references import repeated_prints
+from litho_models.noise.references import repeated_prints, store_references
 from litho_models.noise.residuals import Residuals
 from litho_models.noise.spread_scores import (
     GAUSSIAN,
@@ -385,6 +388,15 @@ def test_doses_of_narrow_structures_are_left_out_and_named():
     found, (note,) = dose_matrix([narrow_print(0.9), ladder(1.0), ladder(1.1)])
     assert [row.dose for row in found.rows] == [1.0, 1.1]
     assert note.startswith("Left out of the dose matrix: prints at dose 0.9 have")
+
+
+def test_the_pitch_of_a_reference_is_that_of_its_own_arrays(tmp_path):
+    path = write_store(tmp_path / "made.zarr", make_scans(1, size_px=64))
+    pitch_um, height = (0.21, 0.105), rough((32, 48), 0.001).astype(np.float32)
+    heights = {"raw_height_um": height, "levelled_height_um": height}
+    write_scan_group(zarr.open_group(path, mode="r+"), "bare", heights, "substrate", pitch_um)
+    (found,) = store_references(open_store(path))
+    assert (found.id, found.use, found.pitch_um) == ("bare", "substrate", pitch_um)
 
 
 # --- repeats ------------------------------------------------------------------------------------
@@ -778,7 +790,6 @@ def test_residuals_of_a_frozen_model_state_which_scans_it_was_trained_on(store, 
 
 
 def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
-    from litho_data.store import open_store
     from litho_models.evaluation.benchmark import benchmark
     from litho_models.evaluation.evaluate import evaluate
     from litho_models.fitting.runs import train
@@ -805,7 +816,6 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
 
 @pytest.mark.parametrize("instrument", ["afm", "sem"])
 def test_residuals_of_a_store_built_anew_are_of_the_scans_and_terms_of_the_evaluation(tmp_path, instrument):
-    from litho_data.store import open_store
     from litho_models.evaluation.evaluate import evaluate
     from litho_models.fitting.runs import train
     from litho_models.noise.residuals import read_residuals
