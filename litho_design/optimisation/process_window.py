@@ -74,13 +74,21 @@ class ProcessWindow(Record):
     yield_draws: int = setting(100, "Number of random prints for the yield", option="--yield-draws", ge=2)
 
 
-def spreads(window: ProcessWindow) -> list[str]:
+def _without_idle_defocus(window: ProcessWindow, optics: Optics) -> ProcessWindow:
+    """Return the window without a defocus if the light is observed in the far field. There, the image always
+    lies in the focal plane, and another distance would only rescale it.
+    """
+    far = optics.propagation == "far-field"
+    return window.model_copy(update={"defocus_sd_um": 0.0}) if far else window
+
+
+def spreads(window: ProcessWindow, optics: Optics) -> list[str]:
     """Return a list of texts for reports, each of which states one spread of the window with its value and
     unit.
     """
     return [
         f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip()
-        for leaf in leaves(window)
+        for leaf in leaves(_without_idle_defocus(window, optics))
         if leaf.path in _SPREADS
     ]
 
@@ -114,6 +122,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     With ``unseen``, the draws come from a separate random stream, because a yield must hold for prints that
     no search has used.
     """
+    window = _without_idle_defocus(window, optics)
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
     # Each draw uses five random numbers. If another spread is added in future, it needs its own random
@@ -137,17 +146,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
     Raises:
         InputError: the distance in a draw is below the sampling limit of the propagator between ``source``
-            and ``target``, the wavelength in a draw is not positive, ``check_incidence`` rejects a
-            direction of the light, or the defocus of a far field varies.
+            and ``target``, the wavelength in a draw is not positive, or ``check_incidence`` rejects a
+            direction of the light.
     """
-    if optics.propagation == "far-field" and window.defocus_sd_um:
-        # In a draw, the distance would be another focal length, which only rescales the image.
-        raise InputError(
-            "defocus spread of the far field",
-            got=f"{window.defocus_sd_um:g} µm",
-            wanted="0, because the image always lies in the focal plane",
-            hint="use --defocus-sd-um 0",
-        )
     drawn = _all_draws(window, optics)
     lengths_um = [draw.optics.wavelength_um for draw in drawn]
     if min(lengths_um) <= 0:

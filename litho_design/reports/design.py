@@ -181,7 +181,7 @@ def _add_yield(page: Page, design: Design, task: Task, print_um: Any) -> None:
     page.paragraph(
         f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
         f"the axis. The search did not use these prints; its loss {included} the process window. The "
-        f"standard deviations of the process window are: {'; '.join(spreads(window))}."
+        f"standard deviations of the process window are: {'; '.join(spreads(window, design.optics))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
     grown = f", and no error may exceed {100 / PASS_SHARE:.0f} % of it"

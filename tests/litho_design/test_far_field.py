@@ -21,7 +21,7 @@ from litho_design.optics import (
     make_propagator,
 )
 from litho_design.optics.far_field import FarFieldPropagator
-from litho_design.optimisation.process_window import ProcessWindow, check_draws
+from litho_design.optimisation.process_window import ProcessWindow, draws, spreads
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 
@@ -126,7 +126,7 @@ def test_the_resolution_of_the_far_field_is_that_of_its_focus():
 
 def test_a_far_field_has_no_draws_out_of_focus():
     """Check that the focal length only rescales the image, whose peak power falls off as 1 / f^2 without
-    defocus, so that a spread of the defocus is refused.
+    defocus, so that the draws of the process window keep it.
     """
     grid, flat = centred_grid((64, 64), 0.2), torch.zeros(64, 64)
     middle = centred_grid((1, 1), 0.2)
@@ -136,9 +136,11 @@ def test_a_far_field_has_no_draws_out_of_focus():
         wave = make_propagator(grid, middle, optics)(element_field(flat, grid, optics))
         peaks.append(float(intensity_share(wave, middle)))
     assert peaks[1] / peaks[0] == pytest.approx((40 / 46) ** 2, rel=1e-5)
-    with pytest.raises(InputError, match="defocus spread of the far field, got 3 µm"):
-        check_draws(ProcessWindow(), FAR, grid, grid)
-    check_draws(ProcessWindow(defocus_sd_um=0), FAR, grid, grid)
+    window = ProcessWindow()
+    assert {draw.optics.distance_um for draw in draws(window, FAR, 9)} == {FAR.distance_um}
+    near = FAR.model_copy(update={"propagation": "auto"})
+    assert len({draw.optics.distance_um for draw in draws(window, near, 9)}) == 9
+    assert "distance to the image plane 0 µm" in spreads(window, FAR)
 
 
 def test_a_fan_out_in_the_far_field_stands_beside_its_baselines(tmp_path):
