@@ -387,7 +387,7 @@ def test_the_printer_none_prints_nominal_heights_and_a_guard_ring_isolates_the_e
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda t: t[:, :100], "size of the element"),
+        (lambda t: load_target(t, 100), "size of the element"),
         (lambda t: t * 0, "no light"),
         (lambda t: t * 2, r"\[0, 1\]"),
         (lambda t: np.where(t > 0, np.nan, t), r"\[0, 1\]"),
