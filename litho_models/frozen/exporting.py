@@ -141,7 +141,7 @@ def _write_pt2(program: ExportedProgram, file: Path, layout_um: Tensor, facts: d
 def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any]) -> Tensor:
     try:
         import onnxruntime
-        import onnxscript  # noqa: F401
+        from onnxscript.optimizer import fold_constants, remove_unused_nodes
     except ModuleNotFoundError as error:
         raise InputError(
             "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
@@ -149,7 +149,8 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
     # The exporter warns about packages that none of these models needs. Such warnings are hidden.
     with quiet("torch.onnx", "onnxscript", "onnx_ir", above=logging.WARNING):
         try:
-            written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)
+            # The search for patterns to simplify would take most of the time, and the runtime does it anyway.
+            written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False, optimize=False)
         except torch.onnx.errors.OnnxExporterError as error:
             complex_numbers = "complex" in str(error)
             raise InputError(
@@ -160,6 +161,8 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
                 hint="export to .pt2, which supports every model",
             ) from None
     assert written is not None
+    fold_constants(written.model)
+    remove_unused_nodes(written.model)
     written.model.metadata_props.update({key: json.dumps(value) for key, value in facts.items()})
     written.save(str(file))
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
