@@ -147,6 +147,8 @@ def grouped_folds(ids: Sequence[str], fields: Sequence[str], k: int = 5, seed: i
             "printed fields to divide into folds",
             got=len(shuffled),
             wanted="at least 2, so that one field can be held out",
+            hint="scans of one print with the same layout and dose count as one field, unless the "
+            "table of the card states other positions (field_x_um, field_y_um)",
         )
     if k < 2:
         raise InputError("number of folds", got=k, wanted="at least 2")
