@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from litho_data.commands.progress import say
+from litho_data.commands.progress import progress, say
 from litho_data.commands.settings import refused
 from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import require_known
@@ -100,7 +100,7 @@ def train(
         )
         if not first:
             return record
-        heights = [predict_scan(fitted.model, scan) for scan in used]
+        heights = [predict_scan(fitted.model, scan) for scan in progress(used, "predicting")]
         save_frozen(
             fitted.model,
             folder / MODEL_FOLDER,
