@@ -46,7 +46,7 @@ class FabSimulator(nn.Module):
 
     name = "fab"
     # The printer adds no guard ring, because the print job itself adds a frame of level 0.
-    guard_um = 0.0
+    guard_px = 0
 
     def __init__(self, truth: Truth):
         super().__init__()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
@@ -78,7 +77,7 @@ class Printer(nn.Module):
         self.source = source
         self.extrapolate = extrapolate
         self.name = name or ("none" if simulator is None else str(simulator.name))
-        borders_px = (0, 0, 0) if simulator is None else _borders_px(simulator, layout.pitch_um)
+        borders_px = (0, 0, 0) if simulator is None else _borders_px(simulator)
         self.guard_px, self.halo_px, self.strip_halo_px = borders_px
         self._level_heights_um: list[float] = []
         if simulator is not None:
@@ -246,7 +245,7 @@ class Printer(nn.Module):
         return printed
 
 
-def _borders_px(simulator: Any, pitch_um: float) -> tuple[int, int, int]:
+def _borders_px(simulator: Any) -> tuple[int, int, int]:
     """Return three widths in pixels: of the guard ring, of the halo of a patch, and of the halo of a two-row
     strip.
 
@@ -254,8 +253,7 @@ def _borders_px(simulator: Any, pitch_um: float) -> tuple[int, int, int]:
     narrower halo: its two rows lie where the model blends two rows of tiles, and the mean of two tiles has a
     smaller error there than a single tile.
     """
-    # The guard ring is a whole number of pixels wide, up to rounding.
-    guard = math.ceil(simulator.guard_um / pitch_um - 1e-6)
+    guard = simulator.guard_px
     tile = getattr(simulator, "tile", None)
     if tile is None:
         return guard, guard, guard

@@ -2,7 +2,6 @@
 trained.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,7 +39,7 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     exported = export_of(Path(layout))
     says = {"pitch_um": pitch_um, "level_height_um": model.card["level_height_um"], **exported}
     model.check_geometry(says["pitch_um"], says["level_height_um"])
-    around_px = math.ceil(model.guard_um / pitch_um - 1e-6) if exported else 0
+    around_px = model.guard_px if exported else 0
     nominal_um = np.pad(levels.astype(np.float32) * np.float32(says["level_height_um"]), around_px)
     height = model.inside(torch.from_numpy(nominal_um)[None, None], around_px)[0, 0].numpy()
     write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")

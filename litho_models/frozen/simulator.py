@@ -4,6 +4,7 @@ heights of every layout.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -66,11 +67,13 @@ class FrozenSimulator(nn.Module):
         return self.card["pitch_um"]
 
     @property
-    def guard_um(self) -> float:
-        """Return the width, µm, of the border of level 0 that an element that stands alone on the substrate
-        needs, because a model assumes that a layout continues beyond its edge.
+    def guard_px(self) -> int:
+        """Return the width, in pixels, of the border of level 0 that an element that stands alone on the
+        substrate needs, because a model assumes that a layout continues beyond its edge.
         """
-        return _WIDEST_GUARD_UM if self.reach_um is None else self.reach_um
+        width_um = _WIDEST_GUARD_UM if self.reach_um is None else self.reach_um
+        # A reach is a whole number of pixels wide, up to rounding.
+        return math.ceil(width_um / self.pitch_um - 1e-6)
 
     @property
     def tile(self) -> Tile | None:

@@ -29,7 +29,7 @@ class BlurPrinter(nn.Module):
         self.gain = nn.Parameter(torch.tensor(gain))
         self.offset_um = nn.Parameter(torch.tensor(offset_um))
         half = math.ceil(4 * sigma_um / pitch_um)
-        self.reach_um = self.guard_um = half * pitch_um
+        self.reach_um, self.guard_px = half * pitch_um, half
         x = torch.arange(-half, half + 1) * pitch_um
         kernel = torch.exp(-(x**2) / (2 * sigma_um**2))
         self.register_buffer("kernel", kernel / kernel.sum())

@@ -137,7 +137,7 @@ def test_tiles_with_a_halo_print_the_same_as_the_whole(make_printer):
 
 def test_a_model_that_depends_on_the_whole_image_is_detected():
     class Normalising(torch.nn.Module):
-        name, reach_um, guard_um = "normalising", None, 6.4
+        name, reach_um, guard_px = "normalising", None, 64
 
         def forward(self, layout_um, pitch_um):
             return layout_um / layout_um.max()
