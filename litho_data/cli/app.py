@@ -91,9 +91,10 @@ def build(
     Example: litho-data build prints/card.toml --out prints.zarr --workers 2
     """
     if suggest:
+        from litho_data.making.result import folder_beside
         from litho_data.making.suggest import suggest_recipe
 
-        folder = out.parent / f"{out.name.removesuffix('.zarr')}-levelling"
+        folder = folder_beside(out, "levelling")
         found = suggest_recipe(card, folder, data_dir=data_dir)
         for name, of in found.left_nm.items():
             left = ", ".join(f"{scan} {one:.1f} nm" for scan, one in of.items())

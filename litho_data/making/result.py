@@ -36,4 +36,9 @@ class BuildResult(Result):
 
 def report_folder(out: str | Path) -> Path:
     """Return the folder of a store's report, which is ``<name>-report`` beside the store."""
-    return Path(out).parent / f"{Path(out).name.removesuffix('.zarr')}-report"
+    return folder_beside(out, "report")
+
+
+def folder_beside(out: str | Path, what: str) -> Path:
+    """Return the folder ``<name>-<what>`` beside a store."""
+    return Path(out).parent / f"{Path(out).name.removesuffix('.zarr')}-{what}"
