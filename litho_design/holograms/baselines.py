@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import math
 
 import torch
 from torch import Tensor
 
+from litho_data.foundation.hashes import array_sha256
 from litho_design.holograms.bench import HologramBench, camera_ssim, hologram_score
 from litho_design.holograms.loss import counted_pixels, hologram_loss
 from litho_design.holograms.settings import HologramSettings
@@ -23,9 +23,8 @@ _PHASE_ITERATIONS = 100
 _PHASE_RATE = 0.3
 # Names of the scores that are defined for any image.
 _OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
-# The baselines found last, at most this many. They need no printer, so all arms of a comparison share them.
+# The baselines that were found. They need no printer, so all arms of a comparison share them.
 _KEPT: dict[tuple[object, ...], dict[str, dict[str, float]]] = {}
-_MOST_KEPT = 16
 
 
 def hologram_baselines(
@@ -42,11 +41,9 @@ def hologram_baselines(
     forty weighted Gerchberg-Saxton steps.
     """
     parts = settings.layout, settings.optics, settings.loss
-    pixels = hashlib.sha256(target.cpu().numpy().tobytes()).hexdigest()
+    pixels = array_sha256(target.cpu().numpy(), "1", ("y", "x"))
     asked = *(one.model_dump_json() for one in parts), settings.search.seed, pixels, str(target.device)
     if asked not in _KEPT:
-        if len(_KEPT) == _MOST_KEPT:
-            del _KEPT[next(iter(_KEPT))]
         _KEPT[asked] = _baselines(bench, cells, target, settings)
     return copy.deepcopy(_KEPT[asked])
 
