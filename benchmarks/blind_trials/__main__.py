@@ -68,15 +68,15 @@ def _campaign(arguments: argparse.Namespace) -> None:
             hint="give the store, or select other trials with --only",
         )
     open_campaign(out, draws)
-    options = ["--keep-data"] * arguments.keep_data
-    options += ["--measured", str(measured.resolve())] if measured else []
+    passed_on = ["--keep-data"] * arguments.keep_data
+    passed_on += ["--measured", str(measured.resolve())] if measured else []
     run_campaign(
         out,
         draws,
         numbers=numbers,
         workers=Workers(arguments.workers, arguments.dask),
         timeout_s=arguments.timeout_s,
-        options=options,
+        options=passed_on,
     )
     settings = (
         f"--out {out} --board {board} --seed {seed} --scans {draws.n_scans} --size-px {draws.size_px} "
