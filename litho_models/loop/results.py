@@ -151,7 +151,8 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     """
     twin, scans = closed.final.twin, closed.study.scans
     kinds = [independent(scans), [scan.id for scan in scans]]
-    # Half the widths of the intervals of all fitted parameters, for each kind of units.
+    # Half-widths of the confidence intervals of all fitted parameters, first from independent units and then
+    # from single scans.
     reaches = []
     for units in kinds:
         sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))

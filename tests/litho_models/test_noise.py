@@ -440,7 +440,7 @@ def test_the_interval_of_repeated_prints_is_that_of_the_rms_over_prints(count):
         assert found.ci95_nm[0] < found.sigma_nm < found.ci95_nm[1]
         # The difference of two prints has the sum of their variances.
         wanted = np.sqrt(bootstrap_interval(np.square(sigmas_nm)))
-        # In 4,096 pixels, the noise of two prints correlates by about 1/64.
+        # The noise of two prints of 4,096 pixels has a correlation of about 1/64 by chance.
         assert found.ci95_nm == pytest.approx(wanted, rel=0.03)
 
 
