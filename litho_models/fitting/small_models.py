@@ -45,8 +45,8 @@ def fit_small_model(model: Simulator, scans: Sequence[PrintedScan], policy: Poli
     terms = smooth_training_terms(policy)
     rules = replace(RULES, pinned=len(PINNED & terms))
     shown = partial(progress, what=f"fitting {model.name}")
-    fitted = fit_least_squares(ModelProblem(model, scans, terms), _vector(model), rules, shown)
-    _load(model, fitted.vector)
+    fitted = fit_least_squares(ModelProblem(model, scans, terms), fitted_numbers(model), rules, shown)
+    load_numbers(model, fitted.vector)
     return fitted.losses
 
 
@@ -66,12 +66,12 @@ class ModelProblem:
 
     def linearise(self, vector: Array) -> list[Linearised]:
         """Return all scans, linearised at the parameters ``vector``."""
-        _load(self._model, vector)
+        load_numbers(self._model, vector)
         return [sample.linearise(self._model, self._terms) for sample in self._samples]
 
     def residuals(self, vector: Array) -> list[Array]:
         """Return the measured minus predicted heights, µm: for each scan an array of shape (n,)."""
-        _load(self._model, vector)
+        load_numbers(self._model, vector)
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
     def room(self, vector: Array) -> Room | None:
@@ -122,7 +122,7 @@ class _Sample:
         else:
             height, jacobian = self.height_um(model), _jacobian(model, self)
             if model.is_linear:
-                self._expansion = _vector(model).astype(np.float64), height, jacobian
+                self._expansion = fitted_numbers(model).astype(np.float64), height, jacobian
         basis = term_maps(TermPixels(height, at=self._used), terms)
         return Linearised(self.residual(height), self._thinned(jacobian), basis)
 
@@ -130,7 +130,7 @@ class _Sample:
         """Return the predicted height of the window, µm, as a float64 array of shape (ny, nx)."""
         if model.is_linear and self._expansion is not None:
             here, value, jacobian = self._expansion
-            return value + np.tensordot(_vector(model) - here, jacobian, axes=1)
+            return value + np.tensordot(fitted_numbers(model) - here, jacobian, axes=1)
         with torch.no_grad():
             return self.predict(model).double().numpy()
 
@@ -178,15 +178,15 @@ def _jacobian(model: Simulator, sample: _Sample) -> Array:
     return torch.func.jacfwd(predict)(here).movedim(-1, 0).detach().double().numpy()
 
 
-def _fitted(model: Simulator) -> list[nn.Parameter]:
+def _fitted(model: nn.Module) -> list[nn.Parameter]:
     return [parameter for parameter in model.parameters() if parameter.requires_grad]
 
 
-def _vector(model: Simulator) -> Array:
+def fitted_numbers(model: nn.Module) -> Array:
     return torch.nn.utils.parameters_to_vector(_fitted(model)).detach().numpy().copy()
 
 
-def _load(model: Simulator, vector: Array) -> None:
+def load_numbers(model: nn.Module, vector: Array) -> None:
     with torch.no_grad():
         torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), _fitted(model))
 

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
+from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.least_squares import gram, orthonormal
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop.fits import ALL_FREE, Study
 from litho_models.loop.judging import SMALLEST_SHARE
 from litho_models.loop.prepared import PreparedScan, sample_border_px
-from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
+from litho_models.models.features import Features, RandomFeaturesConfig
 from litho_models.scan_terms.grouped import ALL, Block, Products
 from litho_models.scoring.statistics import interval
 
@@ -93,17 +94,13 @@ class Learner:
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
         # These are the layout features that the models of the zoo use for such scans.
-        first = study.scans[0].stored
-        config = RandomFeaturesConfig.of_variant(
-            pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
-        )
-        model = Features(FeaturesConfig(**config.model_dump(include=set(FeaturesConfig.model_fields))))
+        model = Features(RandomFeaturesConfig.of_variant(**common_geometry(study.stored)))
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * 360 // _KEPT_BYTES)
         # The facts about each scan are its position in the writing order and the deviation of its dose from
         # nominal. A dependence on one of these facts can be learned only if the scans have at least three
         # different values of it.
-        facts = np.array([(s.context.order, (s.stored.dose or 1.0) - 1.0) for s in study.scans])
+        facts = np.array([(s.context.order, s.context.dose - 1.0) for s in study.scans])
         varied = [own for own in facts.T.tolist() if len(set(own)) >= 3]
         rows = [self._rows(model, scan, [own[at] for own in varied]) for at, scan in enumerate(study.scans)]
         scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]

@@ -12,13 +12,12 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.utils import vector_to_parameters
 
 from litho_models.effects import Parameter, get_effect
 from litho_models.effects.chain import EffectChain, Fields, Frame
 from litho_models.effects.effect import Kind
 from litho_models.effects.registry import in_forward_order
-from litho_models.fitting.small_models import parameter_room
+from litho_models.fitting.small_models import fitted_numbers, load_numbers, parameter_room
 from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import ALL, label_of
 from litho_models.simulator import Simulator, is_small
@@ -227,7 +226,7 @@ class Twin:
         if not self.own:
             return self.base
         base = copy.deepcopy(self.base)
-        vector_to_parameters(torch.as_tensor(self.numbers, dtype=torch.float32), _parameters(base))
+        load_numbers(base, self.numbers)
         return base
 
     def chain(self, scan: PreparedScan | None = None, extra: Values | None = None) -> EffectChain:
@@ -316,10 +315,5 @@ def is_refitted(base: nn.Module) -> bool:
     return trainable and is_small(base) and not isinstance(base, FoldedBase)
 
 
-def _parameters(base: nn.Module) -> Sequence[nn.Parameter]:
-    return [p for p in base.parameters() if p.requires_grad] if is_refitted(base) else []
-
-
 def _numbers(base: nn.Module) -> np.ndarray:
-    own = [p.detach().numpy().reshape(-1) for p in _parameters(base)]
-    return np.concatenate(own or [np.empty(0)]).astype(np.float64)
+    return fitted_numbers(base).astype(np.float64) if is_refitted(base) else np.empty(0)

@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from litho_data.store import PrintedScan
 from litho_models.effects import FieldContext
@@ -137,12 +136,11 @@ class PreparedScan:
         inside[border : ny - border, border : nx - border] = True
         return inside & self.usable
 
-    def at_sample(self, field_map: Tensor | np.ndarray) -> np.ndarray:
-        """Return the values of a map at the sampled pixels, as float64. The map has shape (ny, nx), possibly
-        with leading axes of length 1, and the result has shape (n,).
+    def at_sample(self, field_map: np.ndarray) -> np.ndarray:
+        """Return the values of a map of shape (ny, nx) at the sampled pixels, as float64. The result has
+        shape (n,).
         """
-        flat = field_map.detach().cpu().numpy() if isinstance(field_map, Tensor) else field_map
-        return flat.reshape(-1)[self.sample].astype(np.float64)
+        return field_map.reshape(-1)[self.sample].astype(np.float64)
 
     def terms_at_sample(self, prediction_um: np.ndarray, terms: Terms) -> FloatMap:
         """Return the smooth maps of the named scan terms at the sampled pixels, for the given predicted

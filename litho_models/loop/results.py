@@ -157,27 +157,23 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     for units in kinds:
         sd = np.sqrt(np.maximum(np.diag(clustered_covariance(closed.final.linear, units)), 0.0))
         reaches.append(t.ppf(0.975, max(len(set(units)) - 1, 1)) * sd)
-    facts = get_effect(name).parameters
     found = dict[str, list[Strength]]()
-
-    def add(key: str, value: float, label: str = "", reach: float = 0.0) -> None:
-        ci95 = (value - reach, value + reach) if reach else None
-        own = Strength(label=label, value=value, unit=facts[key].unit, ci95=ci95)
-        found.setdefault(key, []).append(own)
-
     for at, slot in enumerate(twin.slots, twin.own):
         if slot.effect == name:
             own = [twin.is_of(slot, scan) for scan in scans]
             # A fit makes the scores of a strength add up to zero, so a single unit would show no scatter.
             known = (
-                reach[at]
+                float(reach[at])
                 for reach, units in zip(reaches, kinds, strict=True)
                 if len({*compress(units, own)}) > 1
             )
-            add(slot.parameter, float(twin.vector[at]), slot.label or "", float(next(known, 0.0)))
+            value, reach = float(twin.vector[at]), next(known, 0.0)
+            ci95 = (value - reach, value + reach) if reach else None
+            strength = Strength(label=slot.label or "", value=value, unit=slot.facts.unit, ci95=ci95)
+            found.setdefault(slot.parameter, []).append(strength)
+    # Choices are not fitted.
     for key, value in twin.values()[name].items():
-        if facts[key].kind == "choice":
-            add(key, value)
+        found.setdefault(key, [Strength(value=value, unit=get_effect(name).parameters[key].unit)])
     return found
 
 

@@ -26,7 +26,7 @@ from litho_models.loop.fits import ALL_FREE, State
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products, is_known
 from litho_models.scoring.statistics import sign_flips
 
 # The scan terms and the changes that the model's own parameters can make are projected out of each column. An
@@ -387,25 +387,19 @@ class Screening:
         if not close:
             return None
         best = min(close, key=lambda by: close[by])
-        groupings = {name: np.array(own) for name, own in self.study.groups.items() if name != ALL}
-        rng, judged = np.random.default_rng(self.study.seed), _beside(groupings[best])
+        groupings = [np.array(own) for name, own in self.study.groups.items() if name != ALL]
+        rng, least = np.random.default_rng(self.study.seed), options[best][0] * (1 - 1e-12)
         exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
             order = rng.permutation(len(self.study.scans))
-            moved = [own[order] for own in groupings.values()]
-            if not any((_beside(own) == judged).all() for own in moved):
+            moved = [tuple(own[order]) for own in groupings]
+            if not is_known(self.study.groups[best], moved):
                 exchanged += 1
-                least = options[best][0] * (1 - 1e-12)
-                beaten += any(gains_of(best, tuple(own)).mean() >= least for own in moved)
+                beaten += any(gains_of(best, own).mean() >= least for own in moved)
                 if beaten > EXCHANGED_P * (1 + PERMUTATIONS):
                     return None
         p = beaten / exchanged
         return (best, p) if p <= EXCHANGED_P else None
-
-
-def _beside(labels: np.ndarray) -> np.ndarray:
-    """Return a mask of the pairs of scans that share a label, of shape (scans, scans)."""
-    return labels[:, None] == labels[None, :]
 
 
 def _solved(info: np.ndarray, score: np.ndarray) -> np.ndarray:

@@ -95,7 +95,7 @@ def prints_needed(powers: Sequence[float]) -> int | None:
 
 def surely_better(gain: float, difference: float, sd: float, form: float) -> float:
     """Return by how many standard deviations of the noise a gain (difference of two squared errors) exceeds
-    the allowance for the error of the model itself. The result has the same sign as the gain.
+    the allowance for the error of the model itself. The result is 0 if it does not exceed this allowance.
 
     Let A and B be the predictions of two refitted rivals without per-scan terms, and D = B - A. Suppose that
     A is true except for noise n and an error e in the form of the model, which both rivals share. Prints then
@@ -108,7 +108,7 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
     error of the model. The larger of these two allowances is used.
 
     Args:
-        gain: |y - B|² - |y - A|². A positive gain favours A, and a negative gain favours B.
+        gain: |y - B|² - |y - A|², where A is the rival that fits better.
         difference: |D|², the squared norm of the difference of the two predictions.
         sd: standard deviation that noise causes in the gain.
         form: |e|², the squared norm of the error in the form of the model; 0 if it is unknown. All four
@@ -117,11 +117,10 @@ def surely_better(gain: float, difference: float, sd: float, form: float) -> flo
     if sd <= 0:
         return 0.0
     unknown = 2 * math.sqrt(difference * form)
-    seen = abs(abs(gain) - difference) - Z_DECIDED * sd
     # A gain that exceeds the expected gain |D|² raises no doubt about the form of the model, so it adds no
     # allowance.
-    against = max(unknown, seen if abs(gain) < difference else 0.0)
-    return float(np.copysign(max(abs(gain) - against, 0.0) / sd, gain))
+    seen = difference - gain - Z_DECIDED * sd
+    return max(gain - max(unknown, seen), 0.0) / sd
 
 
 _COUNTS = range(1, MOST_PRINTS + 1)
