@@ -26,7 +26,7 @@ from litho_models.loop.fits import ALL_FREE, State
 from litho_models.loop.judging import EXCHANGED_P, FAMILY_P, SMALLEST_SHARE
 from litho_models.loop.model import Twin
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms.grouped import ALL, Block, Labels, Products, is_known
+from litho_models.scan_terms.grouped import ALL, Block, Labels, Products
 from litho_models.scoring.statistics import sign_flips
 
 # The scan terms and the changes that the model's own parameters can make are projected out of each column. An
@@ -66,9 +66,10 @@ class Trial:
         """
         return multiples @ _steps(self.effect, self.sets)
 
-    def allowed(self, multiples: np.ndarray) -> bool:
+    def allowed(self, multiples: np.ndarray, axis: int | None = None) -> np.ndarray:
         """Return whether every amplitude lies on the allowed side of its null value, after each parameter set
-        has been multiplied by its factor in ``multiples``, which has shape (…, sets).
+        has been multiplied by its factor in ``multiples``, which has shape (…, sets). With ``axis`` -1, each
+        multiple is judged by itself.
 
         An amplitude on the wrong side is attributed to noise and ignored if it is small relative to the
         largest amplitude in all groups.
@@ -76,18 +77,18 @@ class Trial:
         (null, lower, upper, usual), steps = self._facts, self.steps(multiples)
         wrong = ((steps < 0) & (null <= lower)) | ((steps > 0) & (null >= upper))
         sizes = np.abs(steps) / usual
-        return not (sizes[wrong] > 0.3 * sizes.max()).any()
+        return ~(wrong & (sizes > 0.3 * sizes.max(axis=axis, keepdims=True))).any(axis=axis)
 
-    def reach(self, multiples: np.ndarray) -> float:
-        """Return the largest factor, at most 1, by which the steps of all amplitudes can be multiplied so
-        that the amplitudes stay within their ranges.
+    def reach(self, multiples: np.ndarray) -> np.ndarray:
+        """Return for each multiple the largest factor, at most 1, by which the steps of all amplitudes can be
+        multiplied so that the amplitudes stay within their ranges.
 
         The full steps may lead out of the ranges, because they are obtained by linear extrapolation.
         """
         (null, lower, upper, _), steps = self._facts, self.steps(multiples)
         room = np.where(steps > 0, upper, lower) - null
         beyond = (np.abs(room) < np.abs(steps)) & (room != 0)
-        return float(np.min(room[beyond] / steps[beyond], initial=1.0))
+        return np.divide(room, steps, out=np.ones_like(steps), where=beyond).min(axis=-1)
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
         """Return the parameter values from which a fit starts. No amplitude is farther from its null value
@@ -262,13 +263,13 @@ class Screening:
         for trial in self.trials:
             own = found.setdefault(trial.effect.name, {})
             for by, labels in self.study.groups.items():
-                gains, multiples = self._gains(trial, labels)
+                multiples = self.strengths(labels, trial.columns)
                 one = Screened(
                     trial=trial,
                     by=by,
-                    gains_nm2=gains,
+                    gains_nm2=self.gains_by([labels], trial.columns, trial)[0],
                     multiples=multiples,
-                    allowed=trial.allowed(np.stack([*multiples.values()])),
+                    allowed=bool(trial.allowed(np.stack([*multiples.values()]))),
                     retained=float(self._retained[trial.columns].max()),
                     beside_base=float(self._beside_base[trial.columns].max()),
                 )
@@ -311,12 +312,15 @@ class Screening:
         significantly more than a strength that is the same in all scans.
         """
         least = max(own[ALL].gain_nm2, 0.0) + SMALLEST_SHARE * self._mse_nm2
-        better = {by: one for by, one in own.items() if by != ALL and one.allowed and one.gain_nm2 > least}
+        options = {
+            by: (one.gain_nm2, one.numbers)
+            for by, one in own.items()
+            if by != ALL and one.allowed and one.gain_nm2 > least
+        }
         best = self.best_grouping(
-            {by: (one.gain_nm2, one.numbers) for by, one in better.items()},
-            lambda by, labels: self._gains(better[by].trial, labels)[0],
+            options, lambda by, moved: self.gains_by(moved, own[by].trial.columns, own[by].trial)
         )
-        return replace(better[best[0]], group_p=best[1]) if best else None
+        return replace(own[best[0]], group_p=best[1]) if best else None
 
     def cosine(self, a: Screened, b: Screened) -> float:
         """Return the cosine of the angle between the changes that two candidates make to the predictions of
@@ -330,51 +334,47 @@ class Screening:
         inner = np.einsum("asi,sij,bsj->ab", factors, self.freed, factors, optimize=True)
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
-    def _gains(self, trial: Trial, labels: Labels) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return self.gains_by(labels, trial.columns, lambda own: trial.allowed(own) * trial.reach(own))
+    def strengths(self, labels: Labels, columns: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return the strengths of the columns that are fitted to all scans, keyed by label."""
+        products, members = self._products(columns), np.array(labels)
+        return {one: _solved(products[members == one].sum(axis=0)) for one in dict.fromkeys(labels)}
+
+    def _products(self, columns: Sequence[int]) -> np.ndarray:
+        both = np.array([0, *columns])
+        return self.freed[:, both[:, None], both]
 
     def gains_by(
-        self,
-        labels: Labels,
-        columns: Sequence[int],
-        taken: Callable[[np.ndarray], float] = lambda multiples: 1.0,
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return two results for columns whose strengths differ by label. The first is the gain on each scan,
-        nm², for strengths that are fitted without the fold of this scan, as an array of shape (scans,). The
-        second is the strengths that are fitted to all scans, keyed by label.
+        self, groupings: Sequence[Labels] | np.ndarray, columns: Sequence[int], trial: Trial | None = None
+    ) -> np.ndarray:
+        """Return the gain on each scan, nm², for columns whose strengths differ by label and are fitted
+        without the fold of this scan. The result has shape (groupings, scans).
 
         Args:
-            labels: label of each scan.
+            groupings: one or more groupings, each with the label of each scan.
             columns: numbers of the columns in the inner products.
-            taken: function that receives the strengths that are fitted without a fold. It returns the factor
-                by which these strengths are multiplied before the gain is computed.
+            trial: trial with these columns, whose strengths stay within the ranges of its amplitudes. A
+                strength that is not allowed gains nothing.
         """
-        own, members, fold_of = np.array(columns), np.array(labels), self.study.fold_of
-        scores, infos = self.freed[:, own, 0], self.freed[:, own[:, None], own[None, :]]
-        gains, multiples = np.zeros(len(members)), {}
-        for label in dict.fromkeys(labels):
-            inside = members == label
-            score, info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
-            multiples[label] = _solved(info, score)
-            for fold in np.unique(fold_of[inside]):
-                out = inside & (fold_of == fold)
-                if out.sum() < inside.sum():
-                    found = _solved(info - infos[out].sum(axis=0), score - scores[out].sum(axis=0))
-                    found = found * taken(found)
-                    gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
-        return gains * NM_PER_UM**2, multiples
+        products, labels, fold_of = self._products(columns), np.array(groupings), self.study.fold_of
+        # For each scan, the scans with the same label in other folds. Without any, the scan gains nothing.
+        fitted_to = _beside(labels) & ~_beside(fold_of)
+        found = _solved(np.tensordot(fitted_to, products, 1))
+        if trial:
+            found *= (trial.allowed(found, -1) * trial.reach(found))[..., None]
+        gains = found * (2 * products[:, 0, 1:] - np.einsum("sij,gsj->gsi", products[:, 1:, 1:], found))
+        return gains.sum(axis=-1) * NM_PER_UM**2
 
     def best_grouping(
-        self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, Labels], np.ndarray]
+        self, options: Mapping[str, tuple[float, int]], gains_of: Callable[[str, np.ndarray], np.ndarray]
     ) -> tuple[str, float] | None:
         """Choose a grouping of the scans by which strengths differ. Among the groupings whose gains are
         nearly the largest, the one with the fewest parameters is chosen.
 
         Args:
             options: gain in nm² and number of parameters of each grouping, keyed by the name of the grouping.
-            gains_of: function ``gains_of(by, labels)`` that returns the gains, nm², of the candidate for the
-                grouping ``by`` if its strengths differ by the given labels instead. The gains have shape
-                (scans,).
+            gains_of: function ``gains_of(by, moved)`` that returns the gains, nm², of the candidate for the
+                grouping ``by`` if its strengths differ by each of the groupings ``moved`` instead. The gains
+                have shape (groupings, scans).
 
         Returns:
             The name of the chosen grouping, and its p value: the fraction of random permutations of the scans
@@ -387,20 +387,26 @@ class Screening:
         if not close:
             return None
         best = min(close, key=lambda by: close[by])
-        groupings = [np.array(own) for name, own in self.study.groups.items() if name != ALL]
-        rng, least = np.random.default_rng(self.study.seed), options[best][0] * (1 - 1e-12)
+        groupings = np.array([labels for by, labels in self.study.groups.items() if by != ALL])
+        rng, judged = np.random.default_rng(self.study.seed), _beside(np.array(self.study.groups[best]))
         exchanged = beaten = 1
         for _ in range(PERMUTATIONS):
-            order = rng.permutation(len(self.study.scans))
-            moved = [tuple(own[order]) for own in groupings]
-            if not is_known(self.study.groups[best], moved):
+            moved = groupings[:, rng.permutation(len(self.study.scans))]
+            if not (_beside(moved) == judged).all(axis=(1, 2)).any():
                 exchanged += 1
-                beaten += any(gains_of(best, own).mean() >= least for own in moved)
+                gained = gains_of(best, moved).mean(axis=1).max()
+                beaten += int(gained >= options[best][0] * (1 - 1e-12))
                 if beaten > EXCHANGED_P * (1 + PERMUTATIONS):
                     return None
         p = beaten / exchanged
         return (best, p) if p <= EXCHANGED_P else None
 
 
-def _solved(info: np.ndarray, score: np.ndarray) -> np.ndarray:
-    return np.linalg.lstsq(info, score, rcond=1e-8)[0]
+def _beside(labels: np.ndarray) -> np.ndarray:
+    """Return a mask of the pairs of scans that share a label, of shape (…, scans, scans)."""
+    return labels[..., :, None] == labels[..., None, :]
+
+
+def _solved(products: np.ndarray) -> np.ndarray:
+    inverse = np.linalg.pinv(products[..., 1:, 1:], rcond=1e-8, hermitian=True)
+    return (inverse @ products[..., 1:, :1])[..., 0]

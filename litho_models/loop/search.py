@@ -185,16 +185,16 @@ def _regroup(found: Found, name: str) -> None:
     # Parameters that are the same in all scans cannot explain a difference between groups, so the changes
     # that they can make are not projected out.
     screening = Screening(found.state, (), beside_own=False)
-    gained = {by: screening.gains_by(own, [*slots]) for by, own in study.groups.items() if by != ALL}
+    gained = zip(study.groups, screening.gains_by([*study.groups.values()], [*slots]), strict=True)
     best = screening.best_grouping(
-        {by: (float(gains.mean()), len(steps)) for by, (gains, steps) in gained.items()},
-        lambda _, labels: screening.gains_by(labels, [*slots])[0],
+        {by: (float(gains.mean()), len(set(study.groups[by]))) for by, gains in gained if by != ALL},
+        lambda _, moved: screening.gains_by(moved, [*slots]),
     )
     if best is None:
         return
     by, p = best
     known, starts = twin.values()[name], {}
-    for label, steps in gained[by][1].items():
+    for label, steps in screening.strengths(study.groups[by], [*slots]).items():
         starts[label] = dict(known)
         for slot, step in zip(slots.values(), steps.tolist(), strict=True):
             moved = known[slot.parameter] + step

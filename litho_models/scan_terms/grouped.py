@@ -9,7 +9,7 @@ these strengths leave in any other scans.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,14 +71,14 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     found: dict[str, Labels] = {}
     for name in names:
         labels = tuple(label_of(scan, name) for scan in scans)
-        if name == ALL or (_is_grouped(labels) and not is_known(labels, found.values())):
+        if name == ALL or (_is_grouped(labels) and not _is_known(labels, found)):
             found[name] = labels
     if by_order:
         for first in _places(scans, found.get("print")):
             last = max(scan.order for scan in scans if scan.order < first)
             name = f"{_ORDER} {last}-{first}"
             labels = tuple(label_of(scan, name) for scan in scans)
-            if not is_known(labels, found.values()):
+            if not _is_known(labels, found):
                 found[name] = labels
     return found
 
@@ -88,11 +88,13 @@ def _is_grouped(labels: Labels) -> bool:
     return len(counts) > 1 and 2 * sum(count >= FEWEST_IN_GROUP for count in counts) >= len(counts)
 
 
-def is_known(labels: Labels, found: Iterable[Labels]) -> bool:
+def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
     """Return whether a grouping divides the scans in the same way as one of the groupings found so far. The
     names of the labels do not matter.
     """
-    return any(len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found)
+    return any(
+        len(set(zip(labels, own, strict=True))) == len(set(labels)) == len(set(own)) for own in found.values()
+    )
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:

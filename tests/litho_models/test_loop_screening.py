@@ -11,7 +11,7 @@ from litho_models.effects import get_effect
 from litho_models.effects.effect import Effect, Parameter
 from litho_models.loop.fits import State, Study, fit_state
 from litho_models.loop.screening import PERMUTATIONS, Screened, Screening, Trial, trials_of
-from litho_models.scan_terms.grouped import ALL, Labels
+from litho_models.scan_terms.grouped import ALL
 from tests.litho_models.loop_scans import bare_state, planted, study_of
 
 LAW = "slope-size-x-times-r2"
@@ -78,8 +78,8 @@ def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
             assert screening.best_grouping({by: (other.gain_nm2, 1)}, gains_of) is None
 
 
-def _gains_of(screening: Screening, one: Screened, by: str, labels: Labels) -> np.ndarray:
-    return screening.gains_by(labels, one.trial.columns)[0]
+def _gains_of(screening: Screening, one: Screened, by: str, moved: np.ndarray) -> np.ndarray:
+    return screening.gains_by(moved, one.trial.columns)
 
 
 def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
