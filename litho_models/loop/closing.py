@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 from torch import nn
@@ -54,8 +54,8 @@ class Closed:
         described: result of the search for tables, which are added to the model with the causes and laws. A
             table describes the remaining error as a function of one variable, such as level or position.
             Tables act after all other effects of the printer and before those of the microscope.
-        rests: the part of the residual that features of layout and position can still explain after each
-            stage of the loop, keyed by stage (``base``, ``causes``, ``laws``, ``tables``).
+        rest: function that returns the part of a model's residual that features of layout and position can
+            still explain.
         untestable: effects that the scans could not test, each with the reason.
     """
 
@@ -66,7 +66,7 @@ class Closed:
     named: Found
     lawful: Found
     described: Found
-    rests: dict[str, Rest]
+    rest: Callable[[State], Rest]
     untestable: dict[str, str]
 
     @property
@@ -90,6 +90,20 @@ class Closed:
     def ends(self) -> dict[Stage, State]:
         """Return the models at the start and at the end of the loop."""
         return {"base": self.base, "all": self.final}
+
+    @cached_property
+    def rests(self) -> dict[str, Rest]:
+        """Return the part of the residual that features of layout and position can still explain after each
+        stage of the loop, keyed by stage (``base``, ``causes``, ``laws``, ``tables``).
+        """
+        added = {"causes": self.named, "laws": self.lawful, "tables": self.described}
+        stages = {"base": self.base} | {stage: found.state for stage, found in added.items()}
+        # A stage that changes nothing has the same model as the stage before it and is not listed.
+        return {
+            name: self.rest(state)
+            for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
+            if state is not before
+        }
 
     @property
     def traced(self) -> list[Cause]:
@@ -155,7 +169,7 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
         named=named,
         lawful=lawful,
         described=described,
-        rests=_rests(start, named, lawful, described, rest),
+        rest=rest,
         untestable=excluded,
     )
 
@@ -196,10 +210,7 @@ def with_answer(
     named, lawful, described = map(replaced, (closed.named, closed.lawful, closed.described))
     if cause is None:
         named.causes.append(answer)
-    rests = closed.rests
-    if described.state is not closed.final:
-        rests = _rests(closed.base, named, lawful, described, _rest_beside(closed.base))
-    return replace(closed, named=named, lawful=lawful, described=described, rests=rests)
+    return replace(closed, named=named, lawful=lawful, described=described)
 
 
 def _rest_beside(start: State) -> Callable[[State], Rest]:
@@ -207,20 +218,9 @@ def _rest_beside(start: State) -> Callable[[State], Rest]:
     position can still explain. ``start`` is the fitted base model.
     """
     scans = start.study.scans
-    learner = Learner(start.study, start.maps_um(scans))
-    return cache(lambda state: learner.rest(state.maps_um(scans)))
-
-
-def _rests(
-    start: State, named: Found, lawful: Found, described: Found, rest: Callable[[State], Rest]
-) -> dict[str, Rest]:
-    stages = {"base": start, "causes": named.state, "laws": lawful.state, "tables": described.state}
-    # A stage that changes nothing has the same model as the stage before it and is not listed.
-    return {
-        name: rest(state)
-        for (name, state), before in zip(stages.items(), [None, *stages.values()], strict=False)
-        if state is not before
-    }
+    # Selections that are repeated without a print seldom need it.
+    learner = cache(lambda: Learner(start.study, start.maps_um(scans)))
+    return cache(lambda state: learner().rest(state.maps_um(scans)))
 
 
 def freed_scans(state: State) -> list[PrintedScan]:

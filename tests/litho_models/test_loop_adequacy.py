@@ -187,7 +187,7 @@ def test_a_cause_not_needed_on_an_equally_small_base_is_only_described(
         else Found(with_base(own), [gaining("slope-thinning", 10)])
         for name, own in {"affine-mtf": 7, "blur-table": 14}.items()
     }
-    others = dict.fromkeys(("base", "named", "lawful", "described", "rests", "untestable"))
+    others = dict.fromkeys(("base", "named", "lawful", "described", "rest", "untestable"))
     closed = Closed(base_name="physics", rivals=rivals, plain=with_base(7), **others)
     found = results._found(closed, cause, 0.1)
     assert (found.knowledge, found.survives_on) == (knowledge, found_on)

@@ -11,7 +11,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
-from litho_models.loop.closing import Closed
+from litho_models.loop.closing import Closed, _rest_beside
 from litho_models.loop.fits import fit_state, without_terms
 from litho_models.loop.model import Twin
 from litho_models.loop.planting import parse_planted, plant
@@ -26,7 +26,7 @@ def closed_on(scans: Sequence[PrintedScan]) -> Closed:
     study = study_of(scans)
     base = fit_state(Twin.bare(base_model()), study)
     found = search(base, [get_effect(LAW), get_effect("height-power-2")])
-    return Closed("affine-mtf", {}, base, base, found, found, found, {}, {})
+    return Closed("affine-mtf", {}, base, base, found, found, found, _rest_beside(base), {})
 
 
 def test_a_large_amount_is_found_and_a_tiny_one_is_not_and_the_data_stay_as_they_were() -> None:
