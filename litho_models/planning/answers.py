@@ -200,7 +200,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
         drawn = rivalry.drawn(random)
         shown = drawn.contrasts(prints, drawn.refitted(prints, first=first))
         powers.append([[of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in shown])
-    fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2))
+    fitted = rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2, first=first))
     directed = zip(np.mean(powers, axis=0).tolist(), fitted, strict=True)
     ways = dict(zip(rivalry.pairs, directed, strict=True))
     found = []

@@ -10,7 +10,7 @@ to which the models were fitted.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +26,7 @@ from litho_data.layouts.random_layout import quantise, random_layout
 from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
+from litho_models.fitting.least_squares import Linearised
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
@@ -165,12 +166,20 @@ def score(
     ways: tuple[Way, ...],
     place: Place = "centre",
     doses: Sequence[float] = (1.0,),
+    known: dict[tuple[Way, Place, float], list[list[Linearised]]] | None = None,
 ) -> float:
     """Return the separation of the two most similar rivals, in standard deviations. It is computed for an
-    experiment in which the layout is printed once at each of the given doses.
+    experiment in which the layout is printed once at each of the given doses. ``known`` is a cache of what
+    the scans of this layout have in common in several experiments.
     """
+    known = {} if known is None else known
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
-    return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
+    scans = {(way, place, one.dose): replace(one, ways=(way,)) for one in prints for way in ways}
+    known |= {scan: rivalry.linearised([one]) for scan, one in scans.items() if scan not in known}
+    first = [
+        [known[way, place, dose][at][0] for dose in doses for way in ways] for at in range(len(rivalry.twins))
+    ]
+    return float(rivalry.separations(prints, rivalry.refitted(prints, first=first)).min())
 
 
 def climb(
@@ -244,11 +253,12 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
         level: layout on which the ways are tried, as level numbers of shape (ny, nx).
         can_move: whether the write field is larger than a print.
     """
+    separation = partial(score, rivalry, level, known={})
     ways: tuple[Way, ...] = (Way(),)
-    reached = score(rivalry, level, ways)
+    reached = separation(ways)
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
-        scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
+        scores = {way: separation((*ways, way)) for way in WORDS if way not in ways}
         # The report states the separation for the plain scan plus a single other scan. A later round does not
         # overwrite the values that were found in the first round, which are of this kind.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
@@ -258,9 +268,9 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
         ways, reached = (*ways, best), scores[best]
     places: tuple[Place, ...] = ("centre",)
     if can_move:
-        tried["at the edge of the write field"] = at_edge = score(rivalry, level, ways, "edge")
+        tried["at the edge of the write field"] = at_edge = separation(ways, "edge")
         places = ("edge", "centre") if _worth(at_edge, reached) else places
-    one, two = (score(rivalry, level, ways, places[0], (1.0, dose)) for dose in (1.0, SECOND_DOSE))
+    one, two = (separation(ways, places[0], (1.0, dose)) for dose in (1.0, SECOND_DOSE))
     both = "two prints with these scans"
     tried |= {both: one, f"{both}, the second at {SECOND_DOSE:g} of the dose": two}
     return Chosen(ways, places, (1.0, SECOND_DOSE) if _worth(two, one) else (1.0,), tried)

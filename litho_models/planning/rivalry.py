@@ -24,7 +24,7 @@ from torch import Tensor
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import FieldContext
-from litho_models.effects.chain import EffectChain
+from litho_models.effects.chain import EffectChain, Fields
 from litho_models.fitting.least_squares import Linearised, eliminated_sum, orthonormal, solve_damped
 from litho_models.loop.fits import ALL_FREE, RULES
 from litho_models.loop.model import Twin
@@ -113,10 +113,19 @@ class Printing:
             dose=printed.dose,
         )
 
-    def predict(self, chain: EffectChain, printed: PlannedPrint, way: Way) -> Tensor:
-        """Predict the height that a planned scan would show, µm, of shape (ny, nx)."""
+    def predict(
+        self,
+        chain: EffectChain,
+        printed: PlannedPrint,
+        way: Way,
+        known: Fields | None = None,
+        base_key: object = None,
+    ) -> Tensor:
+        """Predict the height that a planned scan would show, µm, of shape (ny, nx). ``known`` and
+        ``base_key`` are those of ``EffectChain.forward``.
+        """
         layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
-        return chain(layout_um, self.context(layout_um, printed, way))[0, 0]
+        return chain(layout_um, self.context(layout_um, printed, way), known, base_key)[0, 0]
 
 
 @dataclass(frozen=True)
@@ -216,7 +225,7 @@ class Rivalry:
             start = twin = self.twins[other]
             prior = np.array(self.question.rivals[other].information)
             for number in range(rounds):
-                here = self._linearise(twin, prints) if number else first[other]
+                here = self._linearise(twin, prints, None) if number else first[other]
                 linear = [
                     replace(part, residual=part.residual + _flat(wanted))
                     for part, wanted in zip(here, predicted[true], strict=True)
@@ -231,7 +240,9 @@ class Rivalry:
         """Linearise the models of all rivals at the parameters from which a refit starts. Return, for each
         model, one linear problem per scan.
         """
-        return [self._linearise(twin, prints) for twin in self.twins]
+        # Rivals with the same base model share its predictions.
+        known: list[Fields] = [{} for one in prints for _ in one.ways]
+        return [self._linearise(twin, prints, known) for twin in self.twins]
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
         """Return the contrast of every ordered pair of rivals on the given prints. The argument ``refitted``
@@ -277,14 +288,24 @@ class Rivalry:
     def _predict(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> list[Tensor]:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
-    def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
+    def _linearise(
+        self, twin: Twin, prints: Sequence[PlannedPrint], known: Sequence[Fields] | None
+    ) -> list[Linearised]:
         """Linearise the predictions of a model for each scan of the prints. The residual in the result is
-        minus the predicted height; the caller must add the target of the fit.
+        minus the predicted height; the caller must add the target of the fit. ``known`` is a cache of
+        intermediate fields of each scan.
         """
+        scans = [(one, way) for one in prints for way in one.ways]
+        known = known or [{} for _ in scans]
+
+        def predicted(own: Twin) -> list[Tensor]:
+            chain, key = _chain(own), own.numbers.tobytes()
+            pairs = zip(scans, known, strict=True)
+            return [self.printing.predict(chain, *scan, fields, key) for scan, fields in pairs]
+
         steps = twin.steps()
-        here = self._predict(_chain(twin), prints)
-        moved = [twin.at(twin.vector + one) for one in np.diag(steps)]
-        aside = [self._predict(_chain(one), prints) for one in moved]
+        here = predicted(twin)
+        aside = [predicted(twin.at(twin.vector + one)) for one in np.diag(steps)]
         return [
             Linearised(
                 -_flat(height),

@@ -84,12 +84,12 @@ def test_a_plan_takes_a_second_dose_where_it_separates(
     plain = layouts.score
     asked: list[tuple[float, ...]] = []
 
-    def score(rivalry, level, ways, place="centre", doses=(1.0,)):
+    def score(rivalry, level, ways, place="centre", doses=(1.0,), known=None):
         asked.append(tuple(doses))
         return plain(rivalry, level, ways, place) * (gain if SECOND_DOSE in doses else 1.0)
 
     monkeypatch.setattr(layouts, "score", score)
-    plan = next_print(loop, tmp_path / "plan", prints=2, field_um=9.6, steps=0, layouts="random")
+    plan = next_print(loop, tmp_path / "plan", prints=2, field_um=6.4, steps=0, layouts="random")
     assert plan is not None
     assert (1.0, SECOND_DOSE) in asked
     assert f"the second at {SECOND_DOSE:g} of the dose" in plan.questions[0].why
