@@ -239,7 +239,7 @@ class _Expanded:
         by: dict[tuple[str, ...], list[int]] = {}
         for scan in scans:
             by.setdefault(tuple(products.groups[block.by][scan] for block in blocks), []).append(int(scan))
-        usual = np.einsum("sii->i", self._grams[scans]) / max(len(scans), 1)
+        usual = np.einsum("sii->si", self._grams)[scans].sum(axis=0) / max(len(scans), 1)
         self.rows: list[dict[str, np.ndarray]] = [{} for _ in blocks]
         self._shrunk = np.empty(0)
         for number, (own, block) in enumerate(zip(self.rows, blocks, strict=True)):
@@ -258,9 +258,14 @@ class _Expanded:
         size, wanted = len(self._shrunk), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows in self.alike:
-            gram = self._grams[members].sum(axis=0)
-            matrix[np.ix_(rows, rows)] += gram[np.ix_(self.columns, self.columns)]
-            right[rows] += gram[np.ix_(self.columns, wanted)]
+            # To take rows and then columns is several times as fast as ``np.ix_``.
+            gram = self._grams[members].sum(axis=0).take(self.columns, axis=0)
+            one, other = gram.take(self.columns, axis=1), gram.take(wanted, axis=1)
+            if len(self.alike) == 1:
+                matrix, right = matrix + one, right + other
+            else:
+                matrix[np.ix_(rows, rows)] += one
+                right[rows] += other
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
         normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
         return np.linalg.solve(normal, right / scale) / scale
