@@ -9,20 +9,22 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-import litho_data
 from litho_data.foundation.errors import InputError
 from litho_data.store import Store, open_store
 from litho_models import PatchDataset
+from tests.litho_models.prints import make_scans, write_store
 
 SIZE_PX, MARGIN_PX = 48, 8
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    folder = tmp_path_factory.mktemp("patches")
-    card = litho_data.simulate(str(folder / "prints"), count=6, size_px=128)
-    litho_data.build_dataset(card, str(folder / "prints.zarr"))
-    return open_store(folder / "prints.zarr")
+    scans = make_scans(6, 128)
+    random = np.random.default_rng(0)
+    for scan in scans:
+        scan.valid[:] = random.random(scan.shape) < 0.9
+        scan.height_um[random.random(scan.shape) < 0.1] = np.nan
+    return open_store(write_store(tmp_path_factory.mktemp("patches") / "prints.zarr", scans))
 
 
 def test_a_patch_is_the_piece_of_the_scan_that_it_names(store: Store) -> None:
@@ -33,6 +35,7 @@ def test_a_patch_is_the_piece_of_the_scan_that_it_names(store: Store) -> None:
         scan = store.scan(patch["scan"])
         rows, columns = (slice(start, start + SIZE_PX) for start in (patch["y_px"], patch["x_px"]))
         height, valid = scan.height_um[rows, columns], patch["valid"][0].numpy()
+        assert 0 < valid.sum() < valid.size
         np.testing.assert_array_equal(valid, scan.valid[rows, columns] & np.isfinite(height))
         np.testing.assert_array_equal(patch["height_um"][0].numpy()[valid], height[valid])
         assert not patch["height_um"][0].numpy()[~valid].any()
