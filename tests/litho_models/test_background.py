@@ -150,6 +150,7 @@ def test_no_fit_of_a_benchmark_takes_its_background_from_the_scans_that_it_is_ju
         assert fit.diagnostics.background == learned
 
 
+@pytest.mark.usefixtures("pageless")
 def test_the_background_changes_only_errors_by_policies_without_smooth_terms(result, store, tmp_path):
     record, out = result
     assert record.nuisance.background == "training"
@@ -171,6 +172,7 @@ def test_the_background_changes_only_errors_by_policies_without_smooth_terms(res
         compare(out, tmp_path / "plain")
 
 
+@pytest.mark.usefixtures("pageless")
 def test_the_shared_part_of_a_prediction_is_learned_on_training_scans_only(result, scans, store, tmp_path):
     """Check scans that have nothing but a bow in common. A background describes this bow equally well."""
     shared = benchmark(store, tmp_path / "shared", models=("affine",), folds=2, background="shared")
@@ -239,6 +241,7 @@ def test_the_height_that_a_design_gets_is_the_same_bit_for_bit(tmp_path):
     assert ModelCard.read(with_it).background == some_background(yy_nm=500.0)
 
 
+@pytest.mark.usefixtures("pageless")
 def test_training_writes_the_background_into_the_card_and_freezing_keeps_it(store, tmp_path):
     run = train(store, "affine", tmp_path / "run")
     card = freeze(tmp_path / "run", tmp_path / "model")

@@ -135,6 +135,7 @@ def test_errors_of_training_and_of_held_out_scans_are_defined_alike(result):
         assert all(fit.diagnostics.inner_validation_nm is None for fit in fits)
 
 
+@pytest.mark.usefixtures("pageless")
 def test_an_unchanged_benchmark_fits_nothing_again(result, store, monkeypatch):
     record, out = result
 
@@ -194,6 +195,7 @@ def test_train_evaluate_and_freeze_agree_bit_for_bit(store, tmp_path):
     assert table["difference_nm"].tolist() == [0.0]
 
 
+@pytest.mark.usefixtures("pageless")
 def test_a_model_of_the_same_prints_is_not_scored_on_locked_scans_unless_asked(store, tmp_path):
     run = train(store, "affine", tmp_path / "run", settings=SETTINGS)
     model = tmp_path / "run" / "model"
@@ -226,6 +228,7 @@ def listed_store(path, scans, lab, name):
 
 
 # With one scan more, another scan is drawn. With one fewer, a sixth is one scan instead of two.
+@pytest.mark.usefixtures("pageless")
 @pytest.mark.parametrize(("before", "after"), [(4, 5), (9, 8)])
 def test_locked_files_stay_locked_in_a_store_of_more_or_fewer_scans(tmp_path, before, after):
     first = listed_store(tmp_path / "first.zarr", make_scans(before, size_px=48), "ours", "first")
@@ -243,6 +246,7 @@ def test_locked_files_stay_locked_in_a_store_of_more_or_fewer_scans(tmp_path, be
     assert len(evaluate(model, others, tmp_path / "scored").split.scored_ids) == after
 
 
+@pytest.mark.usefixtures("pageless")
 @pytest.mark.parametrize(("name", "scored_count"), [("made", 3), ("other", 5)])
 def test_a_card_without_files_locks_its_ids_in_a_dataset_of_the_same_name(tmp_path, name, scored_count):
     first = write_store(tmp_path / "first.zarr", make_scans(4, size_px=48))
@@ -286,6 +290,7 @@ def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_fil
     assert set(run.lock_box) <= set(scored.split.scored_ids)
 
 
+@pytest.mark.usefixtures("pageless")
 def test_comparing_different_protocols_is_refused(store, tmp_path):
     train(store, "identity", tmp_path / "run")
     evaluate(tmp_path / "run" / "model", store, tmp_path / "offset")
@@ -306,6 +311,7 @@ def test_results_meet_by_scan_whatever_the_order_of_their_lists(result, tmp_path
     assert (table["p"] == 1).all()
 
 
+@pytest.mark.usefixtures("pageless")
 def test_other_folds_are_another_protocol_and_another_training_seed_is_not(result, store, noise, tmp_path):
     _, out = result
     benchmark(store, tmp_path / "two", models=["affine"], folds=2, settings=SETTINGS, noise=noise)
@@ -332,6 +338,7 @@ def test_first_folds_are_those_of_the_whole_and_never_replace_it(result, store, 
         benchmark(store, tmp_path / "part", first_folds=2, **same)
 
 
+@pytest.mark.usefixtures("pageless")
 def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
     train(store, "affine", tmp_path / "run", settings=SETTINGS)
     evaluate(tmp_path / "run" / "model", store, tmp_path / "seen")

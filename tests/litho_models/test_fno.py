@@ -17,7 +17,7 @@ from litho_models.prediction.tiles import blend_tiles, blending_window, predict_
 from litho_models.simulator import Tile
 from tests.litho_models.prints import make_scans
 
-pytestmark = pytest.mark.numerics
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("rough_networks")]
 
 SMALL = {"width": 6, "modes": (4, 4), "projection_channels": 16, "tile_px": 32, "overlap_px": 16}
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "precision": "32-true", "nuisance": "offset"}

@@ -22,6 +22,8 @@ from litho_models.noise.residuals import read_residuals
 from litho_models.splits.folds import grouped_folds, plan_folds
 from tests.litho_models.prints import make_scans, write_store
 
+pytestmark = pytest.mark.usefixtures("rough_networks")
+
 # The paper's PBL is fitted in steps only. The default PBL also fits networks to pixels, anew in each call.
 QUICK = {
     "variant": "paper",
@@ -136,6 +138,7 @@ def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, sto
     )
 
 
+@pytest.mark.usefixtures("pageless")
 def test_a_damaged_fit_is_told_with_its_folder(scored, store, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(scored[1], out)

@@ -43,6 +43,7 @@ from litho_models.scoring import like_layouts
 from litho_models.scoring.like_layouts import like_pixels
 from litho_models.scoring.noise_floor import estimated_floor, floor_of_residuals, freed_by_policy
 from litho_models.scoring.statistics import bootstrap_interval
+from tests.figures import undrawn
 from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 
@@ -693,7 +694,8 @@ def test_a_store_without_references_has_the_floor_that_residuals_show(store, tmp
     from litho_models.scoring.noise_floor import stated_floor
 
     assert analyse_noise(store, tmp_path / "without").noise_floor.kind == "unknown"
-    scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=2)
+    with undrawn():
+        scored = benchmark(store, tmp_path / "b", models=("affine", "linear"), folds=2)
     result = analyse_noise(store, tmp_path / "out", residuals=tmp_path / "b")
     assert NoiseAnalysis.read(tmp_path / "out") == result
     # The planted white noise is 4 nm.

@@ -12,7 +12,7 @@ from litho_models.layers.precision import has_bfloat16_unit
 from litho_models.models import build_model
 from tests.litho_models.prints import make_scans
 
-pytestmark = pytest.mark.numerics
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("rough_networks")]
 
 LAYOUT_UM = 0.1 * torch.randint(0, 13, (1, 1, 96, 96), generator=torch.Generator().manual_seed(0))
 SHRINKAGE = {"vertical-shrinkage": {"fraction": 0.1}}

@@ -26,7 +26,7 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
 from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
-pytestmark = pytest.mark.numerics
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("rough_networks")]
 
 QUICK = {"steps": 6, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
 CHANNELS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4)}
