@@ -1,16 +1,14 @@
 """Stop commands after some of their writes: ``python -m tests.stopped_commands NAMES FOLDER [every]``.
 
-This must run in a separate process with one thread, because each stopped command is a fork of that process.
 Every command is a function of its working folder, which already contains its input. The module runs each
-stopped command again, checks that the result equals that of an uninterrupted run, and prints the number of
-stops. NAMES are separated by commas. By default, a command is stopped up to four times. With ``every``, and
-always if it takes little time, it is stopped after each write.
+command from what a stopped run would have left, checks that the result equals that of an uninterrupted run,
+and prints the number of stops. NAMES are separated by commas. By default, a command is stopped up to four
+times. With ``every``, and always if it takes little time, it is stopped after each write.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -24,7 +22,6 @@ from litho_data.exchange.release import export_ro_crate
 from litho_data.layouts import write_layout_set
 from litho_data.making.build import build_dataset
 from litho_data.provenance.verify import verify
-from litho_data.reports import page
 from litho_data.store import open_store
 from litho_data.virtual_fab import simulate
 from litho_data.virtual_fab.films import simulate_films
@@ -57,10 +54,11 @@ from litho_models.noise.analyse import analyse_noise
 from litho_models.planning.rounds import close_loop
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.grouped import ALL
+from tests.figures import undrawn
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import base_model, planted, search_little
 from tests.litho_models.prints import make_scans, write_store
-from tests.stops import stopped_after, writes_of
+from tests.stops import states_after, writes_of
 
 # Fields of records that differ between two runs of the same command.
 _VOLATILE = {
@@ -76,6 +74,8 @@ _VOLATILE = {
     "cost",
     "weights_sha256",
 }
+# What a command replaces for its runs.
+_PATCH = pytest.MonkeyPatch()
 QUICK = {"variant": "paper", "steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
 
 
@@ -176,13 +176,13 @@ def _planted(folder: Path) -> None:
     """Write prints with write-order memory, and make the loop use a small base and try only a few causes."""
     strength = {"": get_effect("write-order-memory").with_values({"strength": 0.3})}
     write_store(folder / "prints.zarr", planted([("write-order-memory", ALL, strength)], count=5))
-    search_little(pytest.MonkeyPatch(), ["write-order-memory", "slope-thinning"])
-    bases.build_model = lambda *name, **facts: base_model()
-    loop_run.close = _once(closing.close)
+    search_little(_PATCH, ["write-order-memory", "slope-thinning"])
+    _PATCH.setattr(bases, "build_model", lambda *name, **facts: base_model())
+    _PATCH.setattr(loop_run, "close", _once(closing.close))
 
 
 def _once(close: Callable[..., Any]) -> Callable[..., Any]:
-    """Cache the result of a search, so that the forks repeat only the other work and all writes."""
+    """Cache the result of a search, so that the runs repeat only the other work and all writes."""
     kept: dict[tuple[str, ...], Any] = {}
 
     def found(study: Any, models: Any) -> Any:
@@ -255,7 +255,7 @@ def export_design(folder: Path) -> None:
 
 def score_design(folder: Path) -> None:
     # The record keeps the path of the design's folder as given, so use a relative path.
-    os.chdir(folder)
+    _PATCH.chdir(folder)
     score("design", "out", judges=["zoo:physics"])
 
 
@@ -340,34 +340,36 @@ def chosen(count: int, most: int) -> list[int]:
     return sorted({*spread, *range(max(0, count - 3), count)})
 
 
-def stop_everywhere(name: str, place: Path, most: int) -> int:
+def stop_everywhere(name: str, place: Path, *, every: bool = False) -> int:
     """Stop a command after some of its writes, run it again each time, and return the number of stops."""
     need, command = COMMANDS[name]
     prepared = place / "prepared"
     prepared.mkdir(parents=True)
-    need(prepared)
-    # The whole run is in this process, so that the forks need not import anything.
-    whole = Path(shutil.copytree(prepared, place / "whole"))
-    count = writes_of(lambda: command(whole), whole)
-    wanted = content(whole)
-    assert wanted, "the command left nothing"
-    stops = chosen(count, most)
-    for stop in stops:
-        folder = Path(shutil.copytree(prepared, place / "stopped"))
-        assert stopped_after(stop, lambda folder=folder: command(folder), folder)  # type: ignore[misc]
-        assert not stopped_after(10**9, lambda folder=folder: command(folder), folder)  # type: ignore[misc]
-        found = content(folder)
-        differing = [one for one in wanted.keys() | found.keys() if wanted.get(one, 0) != found.get(one, 0)]
-        assert not differing, f"{name} stopped after write {stop} of {count}: {sorted(differing)[:5]}"
-        shutil.rmtree(folder)
+    try:
+        need(prepared)
+        whole, run = (Path(shutil.copytree(prepared, place / name)) for name in ("whole", "run"))
+        count = writes_of(lambda: command(whole), whole)
+        wanted = content(whole)
+        assert wanted, "the command left nothing"
+        stops = chosen(count, count if every or name in SHORT else 1)
+        for stop, folder in zip(
+            stops, states_after(stops, lambda: command(run), run, place / "stopped"), strict=True
+        ):
+            command(folder)
+            found = content(folder)
+            differing = [
+                one for one in wanted.keys() | found.keys() if wanted.get(one, 0) != found.get(one, 0)
+            ]
+            assert not differing, f"{name} stopped after write {stop} of {count}: {sorted(differing)[:5]}"
+            shutil.rmtree(folder)
+    finally:
+        _PATCH.undo()
     print(f"{name}: {len(stops)} of {count} stops, all equal")
     return len(stops)
 
 
 if __name__ == "__main__":
-    assert os.environ.get("OMP_NUM_THREADS") == "1", "forks need a single thread: set OMP_NUM_THREADS=1"
     # Pictures are part of the page. They take most of the time and write no files, so they are left undrawn.
-    page.svg_address = lambda figure: "data:,"
-    for name in sys.argv[1].split(","):
-        most = 10**9 if name in SHORT or "every" in sys.argv else 1
-        stop_everywhere(name, Path(sys.argv[2]) / name, most)
+    with undrawn():
+        for name in sys.argv[1].split(","):
+            stop_everywhere(name, Path(sys.argv[2]) / name, every="every" in sys.argv)
