@@ -72,7 +72,10 @@ _VOLATILE = {
     "reused",
     "peak_memory_gib",
     "cost",
+    "dataset_cpu_s",
     "weights_sha256",
+    # The hash of a record that contains such fields.
+    "design_sha256",
 }
 # What a command replaces for its runs.
 _PATCH = pytest.MonkeyPatch()
