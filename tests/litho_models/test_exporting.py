@@ -21,8 +21,13 @@ FEW = {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep
 SETTINGS = {
     "affine-mtf": {"sigmas_um": (0.1, 0.3)},
     "linear": {"sigmas_um": (0.1, 0.3)},
-    # These settings use all operations of the model, with few features.
-    "pbl": {"sigma_diffusion_init_um": 0.2, "surroundings": FEW, "scan_axis": FEW},
+    # These settings use all operations of the model, with few features. Both networks share the code of blurs
+    # and steepness.
+    "pbl": {
+        "sigma_diffusion_init_um": 0.2,
+        "surroundings": FEW,
+        "scan_axis": FEW | {"blurs_um": (), "steep_um": ()},
+    },
 }
 CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 
