@@ -149,11 +149,11 @@ def _correlations(fixed: Array, moving: Iterable[Array]) -> Iterator[tuple[Array
         shape = (ny, nx)
 
         def summed(one: Array, other: Array, shape: Shape = shape) -> Array:
-            return irfft2(np.conj(one) * other, shape)
+            return irfft2(one * other, shape)
 
         if shape not in known:
             measured1, *values1 = _masked(fixed)
-            known[shape] = [rfft2(one, shape) for one in (measured1.astype(float), *values1)]
+            known[shape] = [np.conj(rfft2(one, shape)) for one in (measured1.astype(float), *values1)]
         mask1, height1, square1 = known[shape]
         measured2, *values2 = _masked(image)
         height2, square2 = (rfft2(one, shape) for one in values2)

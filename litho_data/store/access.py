@@ -85,6 +85,20 @@ def values_of(parent: zarr.Group, name: str) -> Array:
     return _all_of(parent, name, array_of(parent, name))
 
 
+def values_if_any(parent: zarr.Group, name: str) -> Array | None:
+    """Return all values of the child array ``name`` of a group, or None if there is no such child.
+
+    Raises:
+        InputError: the child is a group or damaged, or a stored chunk cannot be decoded.
+    """
+    import zarr
+
+    child = _child(parent, name)
+    if child is None:
+        return None
+    return _all_of(parent, name, child) if isinstance(child, zarr.Array) else values_of(parent, name)
+
+
 def decoded(array: zarr.Array[Any], selection: Any, what: str) -> Array:
     """Read a selection of an array; error messages refer to the array as ``what``.
 

@@ -27,7 +27,7 @@ from litho_data.foundation.quantities import (
     PITCH_UM,
     Range,
 )
-from litho_data.store.access import array_of, group_of, has_child, values_of
+from litho_data.store.access import array_of, group_of, has_child, values_if_any, values_of
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     OPTIONAL_COLUMNS,
@@ -101,8 +101,9 @@ def file_names(path: Path) -> set[str]:
     """
     if path.is_dir():
         found = (os.path.join(folder, name) for folder, _, names in os.walk(path) for name in names)
+        start = len(os.path.join(path, ""))
         # A dangling link does not count as a file.
-        return {os.path.relpath(file, path).replace(os.sep, "/") for file in found if os.path.isfile(file)}
+        return {file[start:].replace(os.sep, "/") for file in found if os.path.isfile(file)}
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
     for name in names:
@@ -196,12 +197,13 @@ def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch
     for name, count in (
         (f"{axis}{unit}", n) for axis, n in zip("yx", shape, strict=True) for unit in ("_um", "")
     ):
-        if has_child(root, name):
-            found, wanted = values_of(root, name), pixel_centres_um(count, pitch_um)
-            if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-6, atol=0):
-                got, shown = (f"{', '.join(f'{one:g}' for one in line[:3])}, …" for line in (found, wanted))
-                hint = "a copy may omit scans and be cropped at the end, but not elsewhere"
-                raise InputError(f"{name} of {path}", got=got, wanted=shown, hint=hint)
+        found, wanted = values_if_any(root, name), pixel_centres_um(count, pitch_um)
+        if found is None:
+            continue
+        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-6, atol=0):
+            got, shown = (f"{', '.join(f'{one:g}' for one in line[:3])}, …" for line in (found, wanted))
+            hint = "a copy may omit scans and be cropped at the end, but not elsewhere"
+            raise InputError(f"{name} of {path}", got=got, wanted=shown, hint=hint)
 
 
 def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
@@ -228,14 +230,15 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     columns["order"] = [int(value) for value in order]
     for name, limits in OPTIONAL_COLUMNS.items():
         columns[name] = [None] * len(ids)
-        if has_child(root, name):
-            values = values_of(root, name).tolist()
+        column = values_if_any(root, name)
+        if column is not None:
+            values = column.tolist()
             # The condition is false for NaN, which is not equal to itself.
             limits.require(f"{name} of {path}", [value for value in values if value == value])
             columns[name] = [float(value) if value == value else None for value in values]
     for name in TEXT_COLUMNS:
-        texts = values_of(root, name) if has_child(root, name) else [""] * len(ids)
-        columns[name] = [str(text) for text in texts]
+        texts = values_if_any(root, name)
+        columns[name] = [""] * len(ids) if texts is None else [str(text) for text in texts]
     for word in columns["surround"]:
         require_known(f"surround of {path}", word, ("", *get_args(Surround)))
     for name, values in columns.items():
