@@ -21,7 +21,7 @@ from litho_data.register.geometry import (
 PITCH_UM = 0.1
 LEVEL_HEIGHT_UM = 0.1
 PRINT_BLUR_PX = 2.0
-SHAPE, SCAN_SHAPE = (384, 384), (440, 440)
+SHAPE, SCAN_SHAPE = (320, 320), (376, 376)
 SNR = 10
 BARE_UM = 0.005
 INVERSE = {"rotate-90": "rotate-270", "rotate-270": "rotate-90"}

@@ -15,9 +15,9 @@ pytestmark = [pytest.mark.measured, pytest.mark.slow]
 PITCH_UM = (0.1, 0.1)
 
 
-@pytest.fixture(scope="module", params=[4, pytest.param(1, marks=pytest.mark.long)], ids=["fourth", "all"])
+@pytest.fixture(scope="module", params=[6, pytest.param(1, marks=pytest.mark.long)], ids=["sixth", "all"])
 def registered(measured_prints, request):
-    """Return a dict by id for every fourth scan, or for all scans. Each value consists of the height in µm,
+    """Return a dict by id for every sixth scan, or for all scans. Each value consists of the height in µm,
     the layout, the quality, and the authors' height in µm.
     """
     full_scale_m = json.loads((measured_prints / "src_max_dict.txt").read_text())
