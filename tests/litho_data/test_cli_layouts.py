@@ -46,7 +46,7 @@ def test_layouts_are_made_and_printed(app, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path):
+def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path, without_report):
     made = run(
         app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size-px", 192
     )

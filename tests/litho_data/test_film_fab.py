@@ -73,7 +73,7 @@ def test_a_micrograph_has_a_bright_rim_and_charges() -> None:
 def test_a_run_is_built_into_a_store_of_the_films_that_were_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = "simulate --preset e-beam --count 2 --size-px 160 --knob etch_bias_um=0.004 --out"
+    words = "simulate --preset e-beam --count 1 --size-px 160 --knob etch_bias_um=0.004 --out"
     monkeypatch.setattr("sys.argv", ["litho-data", *words.split(), str(tmp_path / "fab")])
     with pytest.raises(SystemExit) as stop:
         main()

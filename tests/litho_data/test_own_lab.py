@@ -15,7 +15,9 @@ from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe
 from litho_data.making.build import build_dataset
+from litho_data.making.result import BuildResult, report_folder
 from litho_data.making.suggest import RECIPES, left_by_layout, suggest_recipe
+from litho_data.making.verdict import verdict_of
 from litho_data.register.refine import interior_of
 from litho_data.store import open_store
 from tests.litho_data import afm_files
@@ -60,6 +62,8 @@ def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
     assert len(store) == 5
     errors = errors_nm(store)
     assert max(errors.values()) < MOST_NM, errors
+    built = BuildResult.read(report_folder(out))
+    assert first_box(card) == verdict_of(built.findings, 5)
     assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
     assert f"check {MIRRORED}: a mirror image" in build.stderr
     # Level 0 of these prints is two levels higher than the substrate.
@@ -122,12 +126,13 @@ def test_a_wrong_card_is_named_in_the_first_box_and_in_the_terminal(
     changed: dict[str, str],
     change: Callable[[Path], None] | None,
     said: str,
+    without_report: None,
 ) -> None:
     card = lab(tmp_path, FEW, **{"more": BOW} | changed)
     if change is not None:
         change(card)
-    build_dataset(card, card.parent / "prints.zarr")
-    assert re.search(said, first_box(card))
+    result = build_dataset(card, card.parent / "prints.zarr")
+    assert re.search(said, verdict_of(result.findings, result.n_scans))
     assert re.search(said.split(".*")[0], capsys.readouterr().err.replace("check ", ""))
 
 
