@@ -33,6 +33,7 @@ from litho_models.prediction.tiles import predict_field
 from litho_models.scan_terms.term import TermPixels, smooth_shapes
 from litho_models.scoring.shapes import edge_placement
 from tests.grids import UNEQUAL
+from tests.tensors import assert_close
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Made = Callable[[Array, PixelGrid], Array]
@@ -217,7 +218,7 @@ def test_swapping_the_axes_of_a_print_swaps_those_of_the_effect(effect: str, nam
         turned["stretch_um2"] *= -1
     changed = one(field, numbers, here)
     assert not torch.allclose(changed, field, rtol=0, atol=1e-6)
-    torch.testing.assert_close(one(field.mT, turned, there).mT, changed, rtol=0, atol=1e-9)
+    assert_close(one(field.mT, turned, there).mT, changed, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", UNEQUAL)

@@ -11,6 +11,7 @@ import torch
 
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share
 from litho_design.optics.thick_element import wave_through_relief
+from tests.tensors import assert_close
 
 pytestmark = pytest.mark.numerics
 
@@ -57,7 +58,7 @@ def test_a_flat_relief_only_reflects(height_um):
     field = element_field(torch.full((32, 32), height_um), grid, Optics(element="thick"))
     # The reflected share is (0.548 / 2.548)^2, and the height of a plate does not change the wave.
     amplitude = math.sqrt(1 - (0.548 / 2.548) ** 2) / 3.2
-    torch.testing.assert_close(field, torch.full_like(field, amplitude))
+    assert_close(field, torch.full_like(field, amplitude))
 
 
 def test_an_element_is_thick_if_its_optics_state_it():

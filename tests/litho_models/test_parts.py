@@ -24,6 +24,7 @@ from litho_models.models.hopkins import Optics, imaged, intensity, kernel_reach_
 from litho_models.models.parts import PARTS, Number, Part, contrast_curve, register_part
 from litho_models.models.printers import Printer
 from tests.litho_models.prints import make_scans, write_store
+from tests.tensors import assert_close
 
 pytestmark = pytest.mark.numerics
 PITCH_UM, SIZE_PX = 0.05, 24
@@ -165,7 +166,7 @@ def test_kernels_in_a_file_image_as_the_lens_they_come_from(
         build_model("projection", pitch_um=PITCH_UM, **parts)(layout)
         for parts in ({"parts": ("own-lens",)}, {"parts": ("lens",), **numbers})
     )
-    torch.testing.assert_close(own, known, rtol=0, atol=1e-5)
+    assert_close(own, known, rtol=0, atol=1e-5)
     np.save(tmp_path / "even.npy", kernels[:, 1:, 1:])
     for file, said in {"even.npy": "odd", "none.npy": "no such file"}.items():
         with pytest.raises(InputError, match=said):
@@ -189,7 +190,7 @@ def test_physics_is_a_printer_of_spot_threshold_shrinkage_and_transfer() -> None
         },
     )
     layout = 0.1 * torch.from_numpy(random_layout((64, 64))[None, None]).float()
-    torch.testing.assert_close(parts(layout), physics(layout), rtol=0, atol=1e-5)
+    assert_close(parts(layout), physics(layout), rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -248,13 +249,13 @@ def test_pbl_begins_as_the_image_of_any_illumination() -> None:
     own = {"sigma_diffusion_init_um": 0.1, "surroundings": None, "scan_axis": None}
     plain, spot = (build_model("pbl", **own, **more) for more in ({}, {"illumination": "spot"}))
     spot.load_state_dict(plain.state_dict())
-    torch.testing.assert_close(plain(layout), spot(layout), rtol=0, atol=1e-5)
+    assert_close(plain(layout), spot(layout), rtol=0, atol=1e-5)
     numbers = {"na": 0.5, "wavelength_um": 0.4, "kernels": 3}
     pbl = build_model("pbl", illumination="lens", numbers=numbers, **own)
     bare = build_model(
         "projection", parts=("lens",), **{f"lens.{key}": value for key, value in numbers.items()}
     )
-    torch.testing.assert_close(pbl(layout), bare(layout), rtol=0, atol=1e-5)
+    assert_close(pbl(layout), bare(layout), rtol=0, atol=1e-5)
     for wrong in ({"illumination": "lamp"}, {"illumination": "lens", "numbers": {"sigma_um": 1}}):
         with pytest.raises(InputError, match=r"lamp|sigma_um"):
             build_model("pbl", **wrong)

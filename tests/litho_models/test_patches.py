@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from torch.utils.data import DataLoader
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import Store, open_store
 from litho_models import PatchDataset
 from tests.litho_models.prints import make_scans, write_store
+from tests.tensors import assert_close
 
 SIZE_PX, MARGIN_PX = 48, 8
 
@@ -58,7 +58,7 @@ def test_the_same_seed_draws_the_same_and_batches_in_order(store: Store) -> None
     assert places[0] != places[1]
     batch = next(iter(DataLoader(first, batch_size=4)))
     assert batch["layout_um"].shape == (4, 1, SIZE_PX + 64, SIZE_PX + 64)
-    torch.testing.assert_close(batch["height_um"][2], first[2]["height_um"])
+    assert_close(batch["height_um"][2], first[2]["height_um"])
 
 
 @pytest.mark.parametrize(

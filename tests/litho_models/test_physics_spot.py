@@ -7,6 +7,7 @@ import torch
 
 from litho_models.models import build_model
 from litho_models.simulator import Simulator
+from tests.tensors import assert_close
 
 PITCH_UM = 0.1
 SPOTS = ("given", "round", "elliptical")
@@ -50,13 +51,13 @@ def test_spots_of_the_same_width_print_the_same() -> None:
     prints = [printed(model_of(spot), layout()) for spot in SPOTS]
     for other in prints[1:]:
         # The given width is kept in float32.
-        torch.testing.assert_close(other, prints[0], rtol=0, atol=1e-7)
+        assert_close(other, prints[0], rtol=0, atol=1e-7)
 
 
 def test_a_turned_layout_with_swapped_widths_prints_turned() -> None:
     one = printed(model_of("elliptical", spot_y=0.1, spot_x=0.3), layout())
     other = printed(model_of("elliptical", spot_y=0.3, spot_x=0.1), layout().mT)
-    torch.testing.assert_close(other, one.mT, rtol=0, atol=1e-12)
+    assert_close(other, one.mT, rtol=0, atol=1e-12)
     assert (one - printed(model_of("elliptical", spot_y=0.3, spot_x=0.1), layout())).abs().max() > 0.02
 
 
@@ -71,7 +72,7 @@ def test_an_edge_is_blurred_by_the_width_across_it(axis: str) -> None:
         for own, its in ((0.15, 0.1), (0.15, 0.4), (0.3, 0.1))
     )
     # Both kernels are truncated at 4 sigma of the wider one, which loses 6e-5 of a step.
-    torch.testing.assert_close(wide, narrow, rtol=0, atol=6e-5)
+    assert_close(wide, narrow, rtol=0, atol=6e-5)
     assert (across - narrow).abs().max() > 0.02
 
 
@@ -100,7 +101,7 @@ def test_the_inner_part_of_a_field_prints_the_same_without_its_surroundings(spot
     reach = model.reach_px
     assert reach is not None
     inside = model.interior(torch.nn.functional.pad(field, (reach,) * 4, mode="replicate"))
-    torch.testing.assert_close(inside.detach(), printed(model, field), rtol=0, atol=1e-9)
+    assert_close(inside.detach(), printed(model, field), rtol=0, atol=1e-9)
 
 
 def test_a_width_stays_within_its_range() -> None:

@@ -25,6 +25,7 @@ from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.policies import estimate_scan_terms, training_terms
 from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
+from tests.tensors import assert_close
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("rough_networks")]
 
@@ -263,7 +264,7 @@ def test_passes_change_the_memory_and_not_the_step(monkeypatch):
     assert crops == [2] * 4 + [1] * 8
     # Another order of sums changes only float32 rounding, to a few 1e-6 after four steps.
     for name, value in together.model.state_dict().items():
-        torch.testing.assert_close(apart.model.state_dict()[name], value, rtol=1e-4, atol=1e-4)
+        assert_close(apart.model.state_dict()[name], value, rtol=1e-4, atol=1e-4)
     assert apart.history[0].training_mae_nm == pytest.approx(together.history[0].training_mae_nm, rel=1e-4)
 
 
@@ -402,7 +403,7 @@ def test_any_number_of_processes_has_the_gradient_of_one(count, monkeypatch):
     one = of_process(0, 1)
     many = sum(of_process(rank, count) for rank in range(count))
     # The order of the sum over four crops differs. The tolerance is the float32 rounding of its largest term.
-    torch.testing.assert_close(many, one, rtol=0, atol=1e-5 * float(one.abs().max()))
+    assert_close(many, one, rtol=0, atol=1e-5 * float(one.abs().max()))
 
 
 @pytest.mark.long
