@@ -210,10 +210,8 @@ class Element(nn.Module):
         """
         self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
-        ones = torch.ones_like(phase)
-        wave = self.free.cells.average(torch.polar(ones, phase).to(self.free.height.device))
-        area = self.free.cells.total(ones.to(wave.device))
-        self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device), area).float())
+        wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
+        self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
 
     def as_torchoptics(self, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0) -> Any:
         """Return this element as a ``PolychromaticModulationElement`` of torchoptics, which needs the package

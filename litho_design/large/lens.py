@@ -48,11 +48,9 @@ class RadiusMap(CellMap):
         """Return the mean of real or complex pixel values over each ring. The pixels lie along one radius,
         and each is weighted with the area of the circular ring of pixels that it represents.
         """
-        return self.total(pixels) / self.total(torch.ones_like(pixels))
-
-    def total(self, pixels: Tensor) -> Tensor:
-        """Return the sum of pixel values over each ring, each weighted with the area that it represents."""
-        return pixels.new_zeros(self.cells).index_add_(0, self.ring, pixels * self.area.to(pixels))
+        area = self.area.to(pixels)
+        sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
+        return sums[0] / sums[1]
 
 
 class RingLens(DirectLensTask):
@@ -104,8 +102,7 @@ class RingLens(DirectLensTask):
         """Return the levels whose print comes closest to the heights of a perfect lens."""
         ideal = self.bench.ideal_height_um().double() * (2 * math.pi / self.settings.optics.wave_height_um)
         wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
-        area = self.cells.total(torch.ones_like(ideal))
-        return focusing_levels(wave.angle().float().cpu(), level_phase.cpu(), area.cpu())
+        return focusing_levels(wave.angle().float().cpu(), level_phase.cpu())
 
     def printed(self, level: Tensor, printer: Printer) -> Tensor:
         """Return the printed height, µm, of each pixel along the radius. ``level`` contains the levels along

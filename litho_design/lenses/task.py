@@ -141,9 +141,8 @@ class LensTask(Task):
         The levels are computed on the CPU, so that sums over rings are reproducible.
         """
         phase = fresnel_lens_phase(self.cells.cpu(), self.settings.layout.pitch_um, self.settings.optics)
-        area = self.cells.total(self.bench.aperture.cpu())
         self.cells.to(self.printer.device)
-        return focusing_levels(phase, level_phase.cpu(), area)
+        return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore:
         """Return the scores of the PSF behind a print, which is given as heights in µm of shape (size,

@@ -67,14 +67,10 @@ class CellMap(nn.Module):
         if not self.radial:
             blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
             return blocks.mean((-3, -1))
-        count = torch.bincount(self.ring.flatten(), minlength=self.cells[0]).clamp(min=1)
-        return self.total(pixels) / count
-
-    def total(self, pixels: Tensor) -> Tensor:
-        """Return the sum of pixel values over each cell. ``pixels`` has shape (size, size)."""
-        if not self.radial:
-            return self.average(pixels) * self.cell_px**2
-        return pixels.new_zeros(self.cells).index_add_(0, self.ring.flatten(), pixels.flatten())
+        index = self.ring.flatten()
+        total = pixels.new_zeros(self.cells).index_add_(0, index, pixels.flatten())
+        count = torch.bincount(index, minlength=self.cells[0]).clamp(min=1)
+        return total / count
 
 
 class GumbelLevels(nn.Module):

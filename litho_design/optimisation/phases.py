@@ -121,19 +121,18 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
     return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()
 
 
-def focusing_levels(phase: Tensor, level_phase: Tensor, area: Tensor) -> Tensor:
+def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
     """Return the levels whose printed phases are nearest to the phase of a lens. Before the levels are
     chosen, the constant phase that loses the least light is added to the phase of the lens.
 
     If the stroke is below one wave, the phases of the levels leave a gap on the phase circle. The constant
     phase decides which cells fall into this gap. Each constant is judged by the amplitude at the focus, which
-    is the mean of exp(j error) over the cells, weighted with their ``area``, which has the shape of ``phase``
-    and any unit.
+    is the mean of exp(j error) over the cells.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):
         levels = nearest_levels(phase + turn, level_phase)
-        value = float(torch.polar(area.to(phase), level_phase[levels] - phase).sum().abs())
+        value = float(torch.polar(torch.ones_like(phase), level_phase[levels] - phase).mean().abs())
         if value > best_value:
             best, best_value = levels, value
     return best

@@ -18,7 +18,6 @@ from litho_design.lenses.score import half_maximum_width_um, lens_score, mtf, mt
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
 from litho_design.lenses.task import check_lens, lens_task
 from litho_design.optics import Optics, blaze_efficiency
-from litho_design.optimisation.phases import fresnel_lens_phase, nearest_levels, printed_phase
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_lens
@@ -122,26 +121,6 @@ def test_a_staircase_lens_loses_as_much_as_the_blaze_formula_states(levels, step
     # One wave is 11.5 steps of 0.1 µm. A lens with seven zones loses 1 or 2 % more than the formula states.
     steps = {13: 12, 8: 8, 2: 2}[levels]
     assert strehl == pytest.approx(blaze_efficiency(steps, 1.0), abs=0.03)
-
-
-def test_the_start_of_a_lens_counts_its_rings_by_their_area(settings):
-    """Check that no constant phase puts more light on the axis than that of the start. The stroke is 0.52
-    waves, so that a part of the rings has no level; a long focus has few zones, so it matters which part.
-    """
-    layout = settings.layout.model_copy(update={"levels": 7})
-    changes = {"layout": layout, "optics": Optics(distance_um=100.0)}
-    task = lens_task(settings.model_copy(update=changes), Printer(None, layout, source="none"))
-    phase = fresnel_lens_phase(task.cells, layout.pitch_um, task.settings.optics)
-    printed = printed_phase(task.printer.level_heights_um(), task.settings.optics)
-
-    def on_axis(levels):
-        error = task.cells(printed[levels] - phase)
-        return float(torch.polar(task.bench.aperture, error).sum().abs() / task.bench.aperture.sum()) ** 2
-
-    constants = torch.arange(0, 1, 1 / 24) * (2 * math.pi)
-    every = [on_axis(nearest_levels(phase + one, printed)) for one in constants]
-    assert max(every) > min(every) + 0.1
-    assert on_axis(task.start_levels(printed)) == pytest.approx(max(every), abs=1e-5)
 
 
 def test_ring_path_and_plane_path_give_the_same_wave(make_printer):
