@@ -1,5 +1,5 @@
-"""Describe the bend of a scan. A nonlinear scanner causes a bend, which is the smooth displacement from the
-nominal to the true positions of the scan's points.
+"""Describe the bend of a scan: the smooth displacement, caused by a nonlinear scanner, of the scan's points
+from their nominal to their true positions.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class Bend:
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the nominal positions (x, y) of the points whose true positions are given. This is the
-        inverse of ``straighten``. It is exact if ``slope`` is below 1.
+        """Return the nominal positions (x, y) of the points whose true positions are given. This method is
+        the inverse of ``straighten``, and is exact if ``slope`` is below 1.
         """
         at_x, at_y = x, y
         for _ in range(_STEPS):
@@ -118,8 +118,8 @@ class Bend:
     def slope(self) -> float:
         """Return the largest change of the displacement per unit of length that occurs anywhere in the frame.
 
-        It is the spectral norm of the displacement's gradient, and bounds the local stretch and rotation. A
-        bend with a slope of 1 or more may fold the scan.
+        At a point, this change is the spectral norm of the displacement's gradient, which bounds the local
+        stretch and rotation. A bend with a slope of 1 or more may fold the scan.
         """
         # The gradient is computed by differences on a grid. The differences are exact for a quadratic bend,
         # and accurate to a thousandth for creep.
@@ -157,8 +157,8 @@ def _terms(u: Array, v: Array, degree: int) -> list[Array]:
 def _legendre(k: int, x: Array) -> Array:
     """Return the Legendre polynomial P_k of every value, for k of at least 2.
 
-    The operations are those of ``numpy.polynomial.legendre.legval``, and the result is equal to the last bit.
-    They are done in place, which takes half the time.
+    The function does the operations of ``numpy.polynomial.legendre.legval``, with results identical to the
+    last bit. It does them in place, which takes half the time.
     """
     low: Any = -(k - 1) / k
     high = x * ((2 * k - 1) / k)

@@ -4,7 +4,7 @@ fits such scans.
 A bend displaces the image by a quadratic function of position. A scanner creeps while it is still settling.
 Creep displaces the scan lines along both axes, by a smooth function of the position along the slow axis
 alone. A straight warp absorbs the linear part of creep. The nonlinear part, about a tenth of the creep,
-distorts the image of the print. Only this distortion reveals it.
+distorts the image of the print, and creep can be detected only by this distortion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ITERATIONS = 30
 _SETTLED_PX = 5e-3
 _FOLD_PX = 64
 # Creep is accepted if the p-value of the test on held-out blocks is below this value. The p-value is the
-# probability that the blocks favour creep by chance.
+# probability that the blocks of a scan without creep favour creep as clearly by chance.
 _CHANCE = 0.01
 _BACKGROUND = 6
 
@@ -50,8 +50,8 @@ def refine_curved(scan: Array, layout_level: Array, straight: FineFit, curve: Cu
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: the result of ``refine_pyramid``. The position error of its warp, at a quarter of the
-            resolution, may be as large as the width of the printed structures.
+        straight: the result of ``refine_pyramid``. Its warp may be wrong by as much as the width that the
+            printed structures have at a quarter of the resolution, where the refinement starts.
         curve: the distortion to fit: ``quadratic`` for a bend, or, for creep, the number of the oriented
             scan's slow axis (0 = x, 1 = y). The slow axis runs across the scan lines.
     """
@@ -127,8 +127,8 @@ def _is_confirmed(
         held_out = ~fold & np.isfinite(better)
         sums: Array = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
-    # A rank test is used because creep fades along the scan. A few blocks therefore contribute most of the
-    # gain.
+    # Creep fades along the scan, so a few blocks contribute most of the gain. A rank test is used because it
+    # does not depend on how large the gain of these blocks is.
     gain = np.concatenate(gains)
     return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
@@ -139,8 +139,8 @@ class _Images:
     """
 
     def __init__(self, scan: Array, topography: Array, every: int = 1):
-        """Prepare the images. Of the topography, only every ``every``-th row and column is used. Pixel
-        indices of the layout refer to this coarser grid.
+        """Prepare the images. Only every ``every``-th row and column of the topography is used, and pixel
+        indices of the layout count only these rows and columns.
         """
         from scipy.ndimage import spline_filter
 

@@ -35,8 +35,8 @@ _FEWEST_PX = 60
 _LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
-# Tolerance of the fit without the masked pixels. From step to step, pixels at the edge of the mask enter and
-# leave the fit, so the steps do not fall below a thousandth of a pixel.
+# Tolerance of the fit that leaves out masked pixels. From step to step, pixels at the edge of the mask enter
+# or leave this fit, so its steps do not become smaller than a thousandth of a pixel.
 _TOLERANCE_PX = 0.01
 # Suspected areas that cover at least this share of the field may have distorted the warp so much that the
 # misfit in them is small. The warp is therefore fitted without these areas even if their misfit is below the
@@ -81,8 +81,8 @@ def refine_around_defects(
         fine = refine_pyramid(masked, layout_level, start, model, tolerance_px=_TOLERANCE_PX)
         defects = found
         # If the areas are true defects, the other pixels now fit better. If the warp is wrong and shifts
-        # every edge, all edges are suspected. Little more than flat ground then remains, and the correlation
-        # falls.
+        # every edge, all edges are suspected. Little more than flat ground then remains for the fit, and the
+        # correlation falls.
         if not fine.refinement.converged or fine.refinement.correlation < plain.refinement.correlation:
             return plain, None
         ends = corners(layout_level.shape)

@@ -15,9 +15,10 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
-# The shifts of the blocks are averaged at every position along an axis. They count as a curve if these means
-# differ by more than the first value, in pixels, and by more than the second value, in standard errors. On
-# straight scans they differ by no more than 0.2 px and 4 standard errors.
+# Limits above which a scan counts as bent along an axis. The shifts of the blocks are averaged at every
+# position along the axis. The first value limits the range of these means, in pixels. The second limits the
+# root mean square of their deviations from the common mean, in standard errors. Straight scans reach no more
+# than 0.2 px and 4 standard errors.
 SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
@@ -28,7 +29,7 @@ class BlockShifts:
 
     ``middle_px`` contains the centres of the blocks. ``shift_px`` contains, for every block, the displacement
     of its content from the position that the warp predicts. ``held_out_px`` contains the displacement from
-    the position that another warp predicts, which was fitted without the block.
+    the position that a warp fitted without the block predicts.
     """
 
     middle_px: Array
@@ -43,11 +44,12 @@ class BlockShifts:
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
     def curve_px(self, axis: int, along: int) -> float:
-        """Return the range (highest minus lowest value) of the blocks' mean shift as a function of position.
+        """Average the shifts of all blocks at the same position along an axis, and return the largest of
+        these means minus the smallest.
 
         Args:
             axis: the axis of the shifts (0 = x, 1 = y).
-            along: the axis of the positions. The shifts of all blocks at the same position are averaged.
+            along: the axis along which the positions are taken.
 
         If the scanner is linear and the kind of warp is general enough, the shifts vary only by noise. A
         larger variation means that the scanner's axis is not linear or that the scanner creeps, which no warp
@@ -145,8 +147,8 @@ def bootstrap_corner_sd_px(refinement: Refinement, shape: Shape, seed: int) -> f
 def height_correlation(height: Array, layout_level: Array) -> float:
     """Return the Pearson correlation of the layout with the heights, which are smoothed with sigma = 1 px.
 
-    Layout and heights have shape (ny, nx), and heights may be NaN. A pixel is used only if its height is
-    known and it lies at least 8 px from the layout's border.
+    Layout and heights have shape (ny, nx), and heights may be NaN. Only pixels with a known height outside
+    the layout's border (see ``interior_of``) are used.
     """
     chosen = interior_of(height.shape) & np.isfinite(height)
     if chosen.sum() < 16:

@@ -1,5 +1,5 @@
-"""Compute the values in a registration's quality record, from its fit and from the images that the fit
-compared.
+"""Compute the values in a registration's quality record from the fitted warp and from the images that were
+compared in the fit.
 """
 
 from typing import Any

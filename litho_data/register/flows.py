@@ -11,8 +11,8 @@ import numpy as np
 from litho_data.foundation import Array, Shape
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# The number of generators of each kind of warp. Every kind uses the first of the ``GENERATORS``, so it
-# contains all kinds before it.
+# The number of generators of each kind of warp. A kind with n generators uses the first n of ``GENERATORS``,
+# so it contains all kinds before it.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0

@@ -53,9 +53,9 @@ def search_orientation(scan: Array, topography: Array) -> list[Hypothesis]:
         # On a layout that repeats itself, several shifts have nearly equal correlation. This term prefers the
         # shift with the largest overlap.
         handicap = TIE * (1 - overlap / overlap.max())
-        # The centre of a block of `factor` pixels lies (factor - 1) / 2 after its first pixel. If the scan's
-        # size is not a multiple of the factor, rotating the scan moves the cropped rows and columns to the
-        # other side.
+        # The centre of a block of `factor` pixels lies (factor - 1) / 2 pixels after the block's first pixel.
+        # If the scan's size is not a multiple of the factor, rotating the scan moves the cropped rows and
+        # columns to the other side.
         cut_y, cut_x = _cut_off(orientation, scan.shape, factor)
         for polarity in (1, -1):
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
@@ -138,8 +138,8 @@ def masked_correlation(fixed: Array, moving: Array) -> tuple[Array, Array]:
 
 
 def _correlations(fixed: Array, moving: Iterable[Array]) -> Iterator[tuple[Array, Array]]:
-    """Yield ``masked_correlation(fixed, one)`` for each of several images. What depends on the fixed image
-    and on the mask alone is computed once for all images with the same shape and mask.
+    """Yield ``masked_correlation(fixed, one)`` for each of several images. Terms that depend only on the
+    fixed image and on an image's mask are computed once for all images with the same shape and mask.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 

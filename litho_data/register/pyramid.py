@@ -88,7 +88,8 @@ def reduced_levels(scan: Array, layout_level: Array) -> Iterator[tuple[int, Arra
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
-        # A coarse fit may be wrong by a few pixels. The extra blur makes the refinement converge from there.
+        # A coarse fit may be wrong by a few pixels. The extra blur makes the refinement converge in spite of
+        # such an error.
         small_scan = _smooth(scan, factor)[::factor, ::factor]
         yield factor, small_scan, predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
 

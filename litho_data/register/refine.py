@@ -94,7 +94,8 @@ def refine(
         bend: bend of the scan. If a bend is given, ``start`` must be an affine map, and warp and bend are
             evaluated but not refined.
         max_iterations: largest number of Gauss-Newton steps. With 0, ``start`` is evaluated but not refined.
-        tolerance_px: the search ends when a step moves no corner of the layout by this many pixels or more.
+        tolerance_px: the search ends when a step moves every corner of the layout by less than this many
+            pixels.
     """
     from scipy.linalg import expm
     from scipy.ndimage import map_coordinates, spline_filter
@@ -153,8 +154,8 @@ def in_blocks(gram: Array) -> Array:
     """Sum the inner products over blocks of two by two cells. The result has shape (blocks_y, blocks_x, k,
     k).
 
-    An error of the predicted topography extends over one or two printed features. A block is therefore
-    assumed to be the smallest area whose errors are independent of those elsewhere.
+    An error of the predicted topography extends over one or two printed features. A block is therefore taken
+    as the smallest area in which the errors are independent of the errors in other blocks.
     """
     starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
     return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
@@ -185,7 +186,7 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
     """Return the displacements of points under a fitted warp, in layout pixels.
 
     Args:
-        coefficients: coefficients from ``solve_gram``, shape (…, k).
+        coefficients: coefficients as returned by ``solve_gram``, shape (…, k - 1).
         shape: shape (ny, nx) of the layout.
         points: positions (x, y) in layout pixels, shape (n, 2).
 
@@ -202,7 +203,7 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
 
 
 def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
-    """Return a bool mask of shape (ny, nx) that is true at all pixels outside the border.
+    """Return a bool mask of shape (ny, nx) that is false in a border along all sides and true elsewhere.
 
     The border is ``border_px`` wide, but not wider than a sixteenth of the shorter side.
     """

@@ -12,8 +12,9 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
-# Sub-pixel positions over which effects of resampling are averaged; and the scan pixels whose weights are
-# computed, counted relative to such a position.
+# ``_PHASES`` contains the sub-pixel positions, in scan pixels, over which effects of resampling are averaged.
+# ``_LAGS`` contains the positions, relative to a layout pixel, of the scan pixels whose weights are computed;
+# the phase is added to them.
 _PHASES = (np.arange(64) + 0.5) / 64
 _LAGS = np.arange(-128, 129)
 
@@ -73,8 +74,8 @@ def resample_to_layout(
 
 
 def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
-    """Return the share of its variance that white noise (independent from pixel to pixel) keeps when a scan
-    is resampled.
+    """Return the variance of white noise (noise that is independent from pixel to pixel) after a scan is
+    resampled, divided by its variance before.
 
     The share is a mean over sub-pixel positions.
     """
@@ -83,8 +84,8 @@ def noise_variance_factor(scan_pitch_um: YX, layout_pitch_um: float) -> float:
 
 
 def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
-    """Return the share of their variance that offsets of the scan lines keep when the scan is resampled. The
-    offsets are assumed to be independent from line to line.
+    """Return the variance of the scan lines' offsets after a scan is resampled, divided by their variance
+    before. The offsets are assumed to be independent from line to line.
 
     ``pitch_um`` is the pitch of the scan across its lines.
     """

@@ -52,7 +52,8 @@ class Registration:
 
     ``bend_um`` describes how the scanner bent the scan, and is None for a scan that is not bent. For a bent
     scan, ``bend_um.straighten`` gives the true positions of points (x_um, y_um), and ``scan_to_layout`` acts
-    on these. This matrix is the affine map closest to the mapping from scan to layout, bend included.
+    on these. This matrix is the affine map closest to the complete map from scan to layout, which includes
+    the bend.
 
     ``defects`` is a bool array of shape (ny, nx) on the layout's pixels. It marks where the scan shows
     something other than the print, such as dust, or collapsed or lifted parts. It is None if nothing is
@@ -223,8 +224,7 @@ class _Case:
         scan_to_layout, bend_um = fit_bent_affine(
             points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
         )
-        # Only the digits of the bend that have a physical meaning are kept, as in ``_rounded`` for the
-        # matrix.
+        # The bend is rounded to the digits that have a physical meaning, as ``_rounded`` does for the matrix.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 

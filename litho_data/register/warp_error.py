@@ -2,8 +2,8 @@
 to the print.
 
 Gain, quadratic surface and warp are fitted again with each block of the field left out in turn (jackknife).
-Some effects in the heights are not explained by the topography. As far as these effects differ from block to
-block, the spread of the fits includes their influence.
+The spread of these fits includes the influence of effects in the heights that the topography does not
+explain, provided that the effects differ from block to block.
 """
 
 from dataclasses import dataclass
@@ -21,21 +21,21 @@ from litho_data.register.topography import predicted_topography, quadratic_basis
 # exceeds this value. On virtual prints without tilt and bow, the root mean square is at most 1.9.
 _CLEAR = 6.0**0.5
 # Distances, in layout pixels, over which the surroundings of a point affect its height (proximity,
-# shrinkage). A fit that ignores this effect mistakes part of it for a surface. As this part is similar in
-# adjacent blocks, the jackknife would not show the error.
+# shrinkage). A fit that ignores this effect mistakes part of the effect for a quadratic surface. This part is
+# similar in adjacent blocks, so the jackknife would not show the error.
 _REACHES_PX = (4.0, 10.0, 25.0)
 # Near the layout's border, a print has other surroundings than in the interior. Their effect is the same in
-# all blocks at the border, so it changes the fitted magnification by more than the jackknife says. The change
-# is found by a fit without the outermost cells. Such a fit is made only if there are at least this many cells
-# along each side, so that two thirds of the area remain.
+# all blocks at the border, so it may change the fitted magnification by more than the jackknife estimates.
+# The change is found by a second fit, without the outermost cells. Such a fit is made only if there are at
+# least this many cells along each side, so that two thirds of the area remain.
 _FEWEST_CELLS = 12
 _MAGNIFICATION = 3
 
 
 @dataclass(frozen=True)
 class WarpError:
-    """The error of the warp between a scan and its layout. The record also contains the quadratic surface
-    that the heights contain in addition to the print, and the error of this surface.
+    """The error of the warp between a scan and its layout, and the size and error of the quadratic surface
+    that the heights contain in addition to the print.
 
     Attributes:
         covariance: covariance matrix, of shape (k, k), of the coefficients of the warp's generators (see
@@ -60,8 +60,9 @@ class WarpError:
         On average, the mean square of a fitted surface exceeds that of the true surface by the variance of
         the fit. For heights that were not levelled, this variance is therefore subtracted, and the result is
         0 if the surface is not significant. Levelling also removes a quadratic surface that belongs to the
-        print and its roughness. The error of the fit estimates this missing surface. For levelled heights,
-        the mean squares of the fitted surface and of its error are therefore added.
+        print and its roughness. The size of this missing surface is estimated by the error of the fit. For
+        levelled heights, the result is therefore the sum of the mean squares of the fitted surface and of its
+        error.
         """
         if levelled:
             return self.surface_rms**2 + self.surface_error_rms**2
@@ -105,8 +106,8 @@ def warp_error(height: Array, layout_level: Array, blur_px: float, model: str) -
     around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
     cells = aligned_gram(smooth, topography, count, around)
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
-    # The registration does not fit the effect of the surroundings, so its error is that of a fit without the
-    # regressors in ``around``.
+    # The registration does not fit the effect of the surroundings. The error of its warp is therefore
+    # computed from a fit without the regressors in ``around``.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
     _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:
