@@ -42,9 +42,9 @@ def mark_features(
     noise sigma.
 
     The height of the main surface is the median over the selected pixels, and the noise sigma is 1.4826 times
-    the median absolute deviation (MAD) from it. Both are reliable only if features cover less than half of
-    these pixels. Measured pixels that were not selected are marked too, so the mask contains all pixels that
-    later steps should exclude.
+    the median absolute deviation (MAD) from it. Both estimates are reliable only if features cover less than
+    half of the selected pixels. Measured pixels that were not selected are marked too, so the mask contains
+    all pixels that later steps should exclude.
 
     Args:
         z: heights in any unit, already levelled, shape (ny, nx).

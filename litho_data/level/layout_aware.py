@@ -20,14 +20,15 @@ from litho_data.register.topography import smooth_measured
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# Eigenvalues of the normal matrix below this share of the largest are lost in rounding errors, so they are
-# raised to it. The background may still be well determined. For example, if all pixels between two knots have
-# the same level, only the heights at these knots are undetermined.
+# Eigenvalues of the normal matrix below this share of the largest eigenvalue are lost in rounding errors, so
+# they are raised to this share. The background may nevertheless be well determined. For example, if all
+# pixels between two knots have the same level, only the heights at these knots are undetermined.
 _SINGULAR = 1e-9
-# A background is refused if its error due to noise is larger than this number times the error that a fit
-# without a layout would have.
+# A background is refused if noise causes in it an error that is larger than this number times the error in a
+# fit without a layout.
 _MOST_LOSS = 1000.0
-# The response has one knot per level, but not more than this number of intervals between knots.
+# The height as a function of the level has one knot per level, but at most this number of intervals between
+# knots.
 _MOST_INTERVALS = 64
 _ROWS_AT_ONCE = 64
 _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
@@ -88,8 +89,8 @@ def level_layout_aware(
 
 
 def _inside(known: Array, border_px: float) -> Array:
-    """Select the pixels at which ``known`` is true, except those within ``border_px`` of a pixel at which it
-    is false. If this leaves too few, select all known pixels.
+    """Select the known pixels, at which ``known`` is true, except those within ``border_px`` of an unknown
+    pixel. If at most a quarter of the known pixels would be left, select all known pixels.
     """
     if known.all():
         return known
@@ -111,8 +112,7 @@ def layout_in_scan_frame(
         layout_level: levels of the layout, shape (ny, nx).
         scan_to_layout: 3 x 3 matrix that maps homogeneous coordinates (x_um, y_um, 1) in the scan's frame to
             those in the layout's frame.
-        bend_um: bend of the scan lines; it is removed from the coordinates before ``scan_to_layout`` is
-            applied.
+        bend_um: bend of the scan; coordinates are corrected for it before ``scan_to_layout`` is applied.
 
     Returns:
         A float64 array of shape ``scan_shape``. Each value is that of the nearest layout pixel, because
@@ -131,15 +131,15 @@ def layout_in_scan_frame(
 
 
 def level_hats(level: Array, top: int) -> Array:
-    """Compute the hat functions of the level. Their weighted sums are all functions of the level that are
-    linear between the knots.
+    """Compute the hat functions of the level. Every function of the level that is linear between the knots is
+    a weighted sum of them.
 
     Each hat is 1 at its own knot and 0 at all others. There is one knot per level from 0 to ``top``, or 65
     evenly spaced knots if there are more levels.
 
     Args:
         level: levels, which need not be integers, shape (n,).
-        top: highest knot; it is not below the highest level.
+        top: position of the highest knot, at least as high as the highest level.
 
     Returns:
         An array of shape (knots, n).
@@ -150,8 +150,8 @@ def level_hats(level: Array, top: int) -> Array:
 
 
 def _joint_fit(z: Array, blurred: Array, fitted: Array, terms: Terms) -> tuple[Array, float]:
-    """Fit background and structure together. Return the Legendre coefficients of the background, and the sum
-    of squares that the fit explains with a minus sign, so that the best fit has the lowest value.
+    """Fit background and structure together. Return the Legendre coefficients of the background, and the
+    negative of the sum of squares that the fit explains. The best fit therefore has the lowest value.
     """
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0

@@ -17,8 +17,8 @@ from litho_data.level.selection import MaskedLevelling, Masking, as_height, sele
 R = TypeVar("R")
 STEPS: "dict[str, type[Step]]" = {}
 """The classes of the steps that a recipe can contain, keyed by the name of the operation."""
-# Arguments whose values come with the scan, so they are not settings of a step. The values are the phrases
-# with which messages name these arguments.
+# Arguments of operations whose values come with the scan, so that they are not settings of a step. Each is
+# mapped to the phrase with which messages name the argument.
 _OF_SCAN = {
     "pitch_um": "the pixel pitch",
     "layout_level": "the layout in the scan's frame, which only a build finds,",

@@ -1,5 +1,5 @@
-"""Remove the tilt of a scan, and choose which height is zero, by the same rules as Gwyddion. The tilt is that
-of a fitted plane or of the prevailing facet, i.e. the most common orientation of the surface.
+"""Remove the tilt of a scan, and choose which height is zero, by the same rules as Gwyddion. The tilt is
+measured by a fitted plane or by the prevailing facet, i.e. the most common orientation of the surface.
 """
 
 from collections.abc import Callable

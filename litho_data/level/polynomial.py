@@ -154,8 +154,8 @@ def fit_terms(z: Array, weights: Array, terms: Terms) -> Array:
         )
     residual = np.where(weights > 0, z, 0.0)
     coefficients = np.zeros((basis_y.shape[1], basis_x.shape[1]))
-    # If the mask makes the fit badly conditioned, a second round fits what the rounding errors of the first
-    # left over.
+    # If the mask makes the fit badly conditioned, a second round fits the residual that rounding errors left
+    # after the first round.
     for _ in range(1 if scales[-1] <= _WELL_CONDITIONED * scales[0] else 2):
         right = (basis_y.T @ (weights * residual) @ basis_x)[q, p]
         step = np.zeros_like(coefficients)

@@ -51,8 +51,8 @@ def align_rows(
     Args:
         z: heights in µm, shape (ny, nx). The methods ``"matching"`` and ``"modus"`` require this unit,
             because they convert heights to metres to give the same result as Gwyddion. Their results depend
-            on the unit: the weights of ``"matching"`` compare a squared height with a height, and rounding
-            errors decide between windows of equal length in ``"modus"``.
+            on the unit, because the weights of ``"matching"`` compare a squared height with a height, and
+            because in ``"modus"`` rounding errors decide between windows of equal length.
         method: ``median``, ``trimmed-mean`` and ``modus`` shift each row so that the median, trimmed mean or
             modus is the same for all rows. The two ``-of-differences`` methods and ``matching`` estimate the
             step between each pair of neighbouring rows and add up these steps, which preserves large
@@ -121,8 +121,8 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
 
 
 def _level_shifts(shifts: Array, z: Array, chosen: Array, fewest: int) -> Array:
-    """Return the shifts of the rows, from which their mean has been subtracted. Where a row has fewer than
-    ``fewest`` selected pixels, its shift is first replaced by the upper median of all selected heights.
+    """Replace the shift of each row that has fewer than ``fewest`` selected pixels by the upper median of all
+    selected heights. Then subtract the mean shift from all shifts, and return them.
     """
     values = np.sort(z[chosen])
     shifts = np.where(chosen.sum(axis=1) < fewest, values[values.size // 2], shifts)
@@ -162,8 +162,8 @@ def _matching_shifts(z: Array, chosen: Array, last_column_counts: bool) -> Array
 
 
 def _row_polynomials(z: Array, chosen: Array, degree: int) -> Array:
-    """Fit a polynomial to each row. Return the fitted values, minus the mean of all measured pixels, whether
-    they are masked or not.
+    """Fit a polynomial to each row. Return the fitted values minus the mean height of all measured pixels,
+    masked or not.
 
     Subtracting the result from the heights therefore adds this mean back, as in Gwyddion.
     """

@@ -118,7 +118,7 @@ def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -
 
 def _harmonic(z: Array, unknown: Array) -> Array:
     """Return values for the unknown pixels that satisfy Laplace's equation, in the order of ``z[unknown]``.
-    Unmeasured pixels (NaN) are solved for like unknown ones, but their values are not returned.
+    Unmeasured pixels (NaN) are also filled in this solution, but their values are not returned.
     """
     from SurfaceTopography import Topography
 
