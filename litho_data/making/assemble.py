@@ -65,8 +65,8 @@ def assemble(
         root: root group of the store.
         records: records of the finished scans, sorted by id, including reference scans (those whose ``use``
             is not "dataset").
-        load: function that takes the id of a scan and returns a mapping from names to the scan's arrays on
-            the layout's grid.
+        load: function that takes the id of a scan and returns the scan's arrays on the layout's grid, keyed
+            by name.
         source: everything from which the records were made.
         skipped: reasons why scans are not in the store, keyed by the id of the scan.
         build: facts that are not part of any hash, such as time, folder and software.

@@ -196,7 +196,8 @@ def _relative(folder: Path, start: Path) -> str:
     """Return the path of a folder relative to the folder ``start``. A relative path stays valid if raw files
     and store are moved together.
 
-    Links in both paths are followed first, because ``..`` leads out of the folder to which a link points.
+    Links in both paths are resolved first, because ``..`` after a link means the parent of the folder to
+    which the link points.
     """
     try:
         return Path(os.path.relpath(folder.resolve(), start.resolve())).as_posix()
@@ -234,11 +235,11 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str
 
 def _odd_pixels(records: Mapping[str, Facts], jobs: Sequence[Job]) -> dict[str, str]:
     """Find the scans whose pixels have another aspect ratio than the pixels of most scans. The result maps
-    the ids of these scans to the reason for leaving them out. Only scans of the dataset whose size neither
-    their file nor the card's table states are compared.
+    the ids of these scans to the reason for leaving them out. Reference scans, and scans whose size is stated
+    by their own file or by the card's table, are not compared.
 
-    A text file that lacks its last rows can still be read as a matrix. However, the pixels then seem too long
-    along y, because the side length that the card states is divided by too few rows.
+    A text file that lacks its last rows can still be read as a matrix. Its pixels then seem too long along y,
+    because the side length that the card states for all scans is divided by too few rows.
     """
     sized_by_card = {job.id for job in jobs if isinstance(job, FieldJob) and "size_um" not in job.field.read}
     aspects = {

@@ -113,11 +113,11 @@ def standards_of(listing: Listing) -> Standards:
 
 
 def defaults_beside(own: Collection[str]) -> list[str]:
-    """Return the arguments of ``read_scan`` that are only defaults for files that do not state their unit or
-    size, because the card states them for all scans.
+    """Return the arguments of ``read_scan``, out of ``unit`` and ``size_um``, whose values are used only if
+    the file of a scan states none. These are the values that the card states for all scans.
 
-    ``own`` contains the names of the values that the card or its table states for one scan. The file of this
-    scan must agree with these values.
+    ``own`` contains the names of the values that the card or its table states for one scan alone. The file of
+    this scan must agree with these values, so they are not returned.
     """
     return [name for name in ("unit", "size_um") if name not in own]
 

@@ -4,7 +4,7 @@ heights.
 In a micrograph, the film is brighter than the ground, and its rim is brightest. Charging changes the
 brightness from place to place. The edge is therefore placed where the brightness is half way between the
 brightness of the ground nearby and that of the rim nearby. This position is a convention. The wall of the
-film may lie at another point on the flank of the bright rim, and a micrograph cannot show at which point.
+film may lie elsewhere on the flank of the bright rim, and a micrograph cannot show where.
 """
 
 from typing import NamedTuple
@@ -16,12 +16,12 @@ from litho_data.foundation import Array, InputError
 REACH_PX = 8.0
 """Distances from an edge are measured at least up to this many pixels of the micrograph."""
 _NOISE_PX = 1.0
-# Pixels on the film whose distance from the first edge lies in the first range, in px, count as rim. Pixels
-# off the film whose distance lies in the second range count as ground. The last value is the sigma, in px, of
-# the Gaussian with which the brightness of rim and ground is averaged.
+# Before the final edge, a first edge is found with a single threshold for the whole picture. Pixels on the
+# film whose distance from the first edge lies in the first range, in px, count as rim. Pixels off the film
+# whose distance lies in the second range count as ground. The last value is the sigma, in px, of the Gaussian
+# with which the brightness of rim and ground is averaged.
 _RIM_PX, _GROUND_PX, _AROUND_PX = (2, 8), (6, 30), 40.0
-# Largest distance, in px, of the final edge from the first edge, which is found with a single threshold for
-# the whole picture.
+# Largest distance, in px, of the final edge from the first edge.
 _NEAR_PX = 5
 _SPECK_PX = 40
 _DARKEST = 1.0

@@ -13,8 +13,8 @@ from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
 def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
-    """Return the jobs. If their card asks for an estimate of the tip's radius by ``tip = "blind"``, the
-    estimated radius replaces "blind" in the card.
+    """Return the jobs. If ``tip = "blind"`` in their card, estimate the radius of the tip, and put it in
+    place of "blind".
 
     If the scans set no limit on the radius, the jobs are returned without a tip. The estimate is also printed
     on stderr. Scans that cannot be read are not used for the estimate. The build reports later why they
@@ -33,7 +33,7 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]
     else:
         print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
     # The radius is rounded, so that it does not depend on the order in which the scans finish. The rounding
-    # is far smaller than the radius's uncertainty.
+    # changes the radius by far less than its uncertainty.
     rounded = None if radius_um is None else float(f"{radius_um:.9g}")
     card = jobs[0].card
     process = card.process.model_copy(update={"tip": rounded})

@@ -201,8 +201,8 @@ class FieldJob:
 
     def _place(self, chain: Chain) -> dict[str, Any]:
         """Return the parameters that describe the grid of the layout. If the surroundings of the field are
-        unknown or continue the print, ``edge_px`` states how many of the outermost pixels become invalid,
-        because their heights depend on these surroundings.
+        unknown or continue the print, ``edge_px`` states the width, in pixels, of the border whose heights
+        become invalid because they depend on these surroundings.
         """
         grid = {"scan_pitch_um": chain.pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
         grid["layout_shape"] = list(chain.arrays["mask_level"].shape)
@@ -221,8 +221,8 @@ class FieldJob:
 
     @property
     def _layout_files(self) -> dict[str, Path]:
-        """The files from which the levels follow, keyed by their recorded names. They are the layout and, if
-        the design package exported it, its sidecar.
+        """The files from which the levels are read, keyed by their recorded names: the layout file and, if
+        the design package exported the layout, the sidecar file.
         """
         if self.field.layout is None or self.layout_name is None:
             return {}
@@ -260,11 +260,11 @@ class FieldJob:
 
 
 def _without_layout(steps: Sequence[Facts], use: Use) -> list[Facts]:
-    """Return the steps of a recipe with which a reference scan is levelled. Its layout, if it has one, cannot
-    be located in the scan, so no step can be layout-aware.
+    """Return the steps with which a reference scan is levelled. They are the steps of the recipe except
+    layout-aware ones, because no layout can be located in a reference scan.
 
-    On a surface of one level, polynomials of the same degrees take their place. On steps and gratings, these
-    would remove part of the structure, so nothing takes their place.
+    In scans of a flat surface, polynomial steps of the same degrees replace the layout-aware steps. In scans
+    of steps and gratings, polynomials would remove part of the structure, so layout-aware steps are left out.
     """
     kept = []
     for step in steps:

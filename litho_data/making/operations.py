@@ -57,8 +57,8 @@ def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Functi
 def load_recipe(path: Path | None) -> dict[str, Any]:
     """Read a levelling recipe from a file, and return it in canonical form.
 
-    Without a file, return the recipe that subtracts a plane, fitted together with the layout so that no part
-    of the print is removed.
+    Without a file, return a recipe that subtracts a plane. The plane is fitted together with the layout, so
+    that no part of the print is removed.
     """
     from litho_data.level import Recipe
 

@@ -110,7 +110,7 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     shown = quality[[name for name in _COLUMNS["quality"] if name in quality]]
     if len(shown.columns) == 1:
-        # Datasets in the pair format come without their scans, so their table would contain only ids.
+        # Datasets imported from pairs were not registered by a build, so their table would contain only ids.
         return
     page.heading("Quality of every scan, in numbers", folded=True)
     page.table(

@@ -28,8 +28,8 @@ _BETTER = 0.02
 # the correlation of a print with its own layout is about 0.9, and with another layout 0.3 to 0.5.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
-# Standard deviation of the logarithm of the height per level at one dose. The first value holds among prints
-# of the same layout, the second among prints of different layouts.
+# Standard deviation, from scan to scan, of the logarithm of the height per level at one dose. The first value
+# holds for prints of the same layout, the second for prints of different layouts.
 _SCATTER_SAME, _SCATTER_OTHER = 0.01, 0.03
 _CLEAR_SIGMA = 4.0
 
@@ -39,10 +39,11 @@ class Print:
     """One registered scan. Its heights and its blurred layout are sampled at a few points.
 
     ``response`` contains the height per level in µm, and the relative growth of this height with the dose.
-    ``edge_times`` is the rms deviation of the outermost pixels from the layout, divided by that of the inner
-    pixels. ``dihedral`` is the orientation that the registration found, and ``turned`` is true if the card
-    states that the print was rotated under the microscope. Scans in the same ``group`` should have the same
-    height per level. The group is the dose if the card states it, and the print otherwise.
+    ``edge_times`` is the rms deviation of the outermost pixels from the blurred layout, divided by the rms
+    deviation of the inner pixels. ``dihedral`` is the orientation that the registration found, and ``turned``
+    is true if the card states that the print was rotated under the microscope. Scans in the same ``group``
+    should have the same height per level. The group is the dose if the card states it, and the print
+    otherwise.
     """
 
     id: str
@@ -158,9 +159,9 @@ def _correlations(height: Array, layouts: Array) -> Array:
 
 
 def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans that are mirrored relative to their layout, and the scans that are rotated in another
-    way than most scans. Each is yielded as its id and the reason. Scans for which the card states that
-    the print was rotated are left out, and do not count among the others.
+    """Yield the scans that are mirrored relative to their layout, and the scans whose rotation differs from
+    that of most scans. Each is yielded as its id and the reason. Scans for which the card states that the
+    print was rotated are ignored.
     """
     upright = [one for one in prints if not one.turned]
     usual, count = Counter(one.dihedral for one in upright).most_common(1)[0] if upright else ("", 0)
@@ -174,8 +175,9 @@ def _orientations(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
 
 
 def _gains(prints: Sequence[Print]) -> Iterator[tuple[str, str]]:
-    """Yield the scans whose height per level agrees with another group (dose or print) than their own, and
-    the scans whose doses seem to be swapped. Each is yielded as its id and the reason.
+    """Yield the scans whose height per level differs clearly from that of their own group (dose or print) and
+    is closest to that of another group, and the scans whose doses seem to be swapped. Each is yielded as its
+    id and the reason.
     """
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
@@ -213,9 +215,9 @@ def _response(topography: Array, height: Array) -> tuple[float, float]:
     """Return the slope of the heights against the blurred levels of the layout, in µm per level, and the
     relative growth of this slope with the dose, d ln slope / d ln dose.
 
-    The exposure is the level times the dose. Let g be the curve of heights against blurred levels T. It also
-    shows how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). A parabola is
-    fitted for g, so the growth is one plus the share of the slope that comes from the quadratic term. In a
+    The exposure is the level times the dose. The curve g of heights against blurred levels T therefore also
+    shows how a larger dose would change the slope: the growth is cov(T, T g') / cov(T, g). Here, g is a
+    fitted parabola, so the growth is one plus the share of the slope that comes from the quadratic term. In a
     saturated print, the growth is negative.
     """
     seen = np.isfinite(height)
@@ -249,9 +251,9 @@ def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> 
     falls clearly from one dose to a larger one, the result is empty.
 
     Args:
-        rising: for each dose, the logarithm of the height per level and the number of scans. Only doses are
-            included at which a larger dose should raise the height.
-        scatter: standard deviation of this logarithm for one scan.
+        rising: for each dose, the median logarithm of the height per level and the number of scans. It
+            contains only doses at which a larger dose should raise the height.
+        scatter: standard deviation, from scan to scan, of the logarithm of the height per level at one dose.
     """
     doses = sorted(rising)
     values = np.array([rising[dose][0] for dose in doses])

@@ -1,5 +1,5 @@
-"""Run and record a single step of a build. From the record, the origin of the step's arrays is known, and the
-arrays can be reproduced.
+"""Run and record a single step of a build. The record states the origin of the step's arrays, so that they
+can be reproduced.
 """
 
 from __future__ import annotations
@@ -143,7 +143,9 @@ def _one_thread() -> Iterator[None]:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Return the control of the numerical libraries' threads. To find the libraries takes 10 ms."""
+    """Return the control of the numerical libraries' threads. The control is cached, because finding the
+    libraries takes 10 ms.
+    """
     import scipy.linalg  # noqa: F401 - SciPy has its own BLAS, which can be limited only once it is loaded
     from threadpoolctl import ThreadpoolController
 

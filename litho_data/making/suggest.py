@@ -87,8 +87,8 @@ def suggest_recipe(
     The field is divided into blocks of 16 px. In half of the blocks, a free function of the blurred layout is
     fitted to the levelled heights. The recipes are compared by the residual in the other half. This residual
     contains both the tilt that a recipe fails to remove and the part of the print that the recipe wrongly
-    removes. If a step of a recipe gives a warning, the recipe is not suggested. For example, a step gives a
-    warning if it shifts lines that already agree with adjacent lines in many pixels.
+    removes. A recipe is not suggested if one of its steps gives a warning, for example because the step
+    shifts lines that already agree with adjacent lines in many pixels.
 
     Args:
         card_path: path of the card. ``<card>.suggested.toml`` and ``<card>.recipe.toml`` are written beside
@@ -149,9 +149,9 @@ def _best(left_nm: Mapping[str, float]) -> str:
 
 
 def _located(job: FieldJob) -> tuple[Array, Array, Array | None]:
-    """Return the raw heights in µm, the levels of the layout in the frame of the scan, NaN outside the
-    layout, and the file's mask of pixels that levelling ignores, None if there is none. All have the shape
-    (ny, nx) of the scan.
+    """Return three arrays with the shape (ny, nx) of the scan: the raw heights in µm; the levels of the
+    layout in the frame of the scan, NaN outside the layout; and the file's mask of pixels that levelling
+    ignores, or None if the file has no mask.
     """
     chain = job.begin()
     chain.run("locate", job.register_params(chain))

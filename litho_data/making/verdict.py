@@ -25,7 +25,8 @@ _LEAST_VALID = 0.5
 # have the value 2 if the layout has a rim of substrate around the field, and 6 to 8 if it has no rim.
 _EDGE_TIMES = 2.5
 _MOST_TRE_PX = 1.0
-# Largest residual of levelling, as a share of the print's own standard deviation.
+# Largest accepted uncertainty that levelling causes in the heights of a scan, as a share of their standard
+# deviation.
 _LEFT = 0.3
 _SHOWN = 12
 
