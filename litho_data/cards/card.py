@@ -205,9 +205,9 @@ class Ids(Record):
 
 
 class Standard(Record):
-    """A scan of a calibration standard, whose size is known. Options for reading the file that are not given
-    here are taken from the card's ``scan`` table. As for scans, a unit or size from that table is used only
-    if the file states none.
+    """A scan of a calibration standard, whose size is known. Reading options that are not given here are
+    taken from the card's ``[scan]`` table. A unit or size from the ``[scan]`` table is used only if the file
+    states none, as for scans.
     """
 
     file: InsidePath
@@ -237,7 +237,9 @@ class Step(Standard):
 
 
 class Calibration(Record):
-    """The standards that give the scales of the microscope: gratings along x and y, and a step."""
+    """The ``[calibration]`` table: the calibration standards from which the scales of the microscope are
+    measured. They are gratings for x and y, and a step for z.
+    """
 
     x: Grating | None = None
     y: Grating | None = None
@@ -251,8 +253,7 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """The ``[write]`` table: how the printer wrote a field. For facts that are missing here, default
-    assumptions are made; the listing of the card's files names them.
+    """The ``[write]`` table: how the printer wrote a field. If a fact is missing here, a default is assumed.
 
     ``surround`` says what lies around a printed field: the bare substrate, or more of the same print.
     """
@@ -272,8 +273,8 @@ class KnownGrating(Record):
 
 
 class Planned(Record):
-    """Facts about prints that were planned with models: the hash of the dataset from which they were
-    planned.
+    """The ``[plan]`` table of prints that were planned with models. It contains the hash of the dataset from
+    which the prints were planned.
     """
 
     dataset_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
@@ -325,7 +326,7 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":
-        # The message comes from a validator of this module; if it concerns a whole table, it already names
+        # The message was raised by a validator of this module. If it concerns a whole table, it already names
         # the key.
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {_shown(first['input'])}"

@@ -35,10 +35,10 @@ class PrintedField:
     """One printed field to build: its layout file, its scan files, and what the card says about it.
 
     ``columns`` contains the optional numbers and words that the card's table states for this field, such as
-    its dose. ``read`` contains the options for reading that the table states for this scan; they take
-    precedence over the card's options. If the scan is an integer image, ``full_scale_um`` is the height that
-    the largest possible pixel value stands for. ``layout`` may be None only for a reference scan, i.e. a scan
-    whose ``use`` is not ``dataset``.
+    its dose. ``read`` contains the reading options that the table states for this scan; they take precedence
+    over the options in the card's ``[scan]`` table. If the scan is an integer image, ``full_scale_um`` is the
+    height that the largest possible pixel value stands for. ``layout`` may be None only for a reference scan,
+    i.e. a scan whose ``use`` is not ``dataset``.
     """
 
     id: str
@@ -206,8 +206,8 @@ def _require_decoded(name: str) -> None:
 def _without_sidecars(
     layouts: Mapping[str, list[Path]],
 ) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
-    """Separate the layouts from the sidecars of exported layouts, which a pattern such as ``{id}.*`` finds as
-    well. Return the paths of the layouts and those of their sidecars, each keyed by the layout's id.
+    """Separate the layouts from the sidecars of exported layouts, because a pattern such as ``{id}.*`` finds
+    both. Return the paths of the layouts and the paths of the sidecars, each keyed by the layout's id.
     """
     sidecars = {
         scan_id: [path for path in map(sidecar_of, paths) if path] for scan_id, paths in layouts.items()
@@ -255,9 +255,7 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, Any]]:
 
 
 def _assumptions(card: Card, table: Mapping[str, Facts]) -> tuple[str, ...]:
-    """Return sentences that name the assumptions made in place of facts that the card does not state but some
-    effects need.
-    """
+    """Return one sentence for each assumption that is made because the card does not state a fact."""
     assumed = []
     if card.process.level is None and not card.scan.levelled:
         assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")

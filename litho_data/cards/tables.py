@@ -108,7 +108,7 @@ def _value(name: str, text: str) -> Any:
 
 def read_full_scales(path: Path) -> dict[str, float]:
     """Read a JSON file that states, for each image, the height in metres that the largest possible grey value
-    stands for. Return these heights in µm, keyed as in the file, by file name or id.
+    stands for. Return these heights in µm, with the keys of the file, which are file names or ids.
 
     Raises:
         InputError: the file does not exist or is not a JSON object, or a value is not a positive number.
