@@ -34,8 +34,8 @@ _TREAD_UM = 3.0
 
 @dataclass(frozen=True)
 class NamedLayout:
-    """One layout with its id, its relative dose, and the use of its scan (one of the uses that a dataset
-    card's table may state).
+    """One layout with its id, its relative dose, and the use of its scan, as the table of a dataset card
+    states it.
     """
 
     id: str
@@ -98,13 +98,12 @@ def write_layout_set(
         seed: seed of every random draw.
         quantiser: how random layouts are rounded to whole levels, ``round`` or ``floor``; see
             ``random_layout``.
-        field_px: side length, in pixels, of a larger field from whose middle each random layout is cut; None
-            to make the layouts without a larger field.
+        field_px: side length, in pixels, of a larger random field from whose middle each random layout is
+            cut. If None, each layout is a whole field.
 
     Raises:
         InputError: the pattern is unknown or does not fit into the size, a length is not positive, or the
-            folder contains anything but a set that was made with these settings. Scans count as other
-            content, too.
+            folder contains scans or anything else but a set that was made with these settings.
     """
     require_known("pattern", pattern, PATTERNS)
     LEVELS.require("levels of a layout", levels)

@@ -33,8 +33,8 @@ def framed_ladder(frame: Array, *, highest: int, tread_px: int, lowest: int = 0)
     the roughness depend on the level.
 
     A staircase alone looks the same after a shift along its edges, so a scan of it cannot be registered. The
-    frame makes registration possible; on each side, its width is a fifth of the layout's side. The staircase
-    rises evenly from ``lowest`` to ``highest``, with one step for each level if there is room.
+    frame makes registration possible. Its width, on each side, is a fifth of the layout's side length. The
+    staircase rises evenly from ``lowest`` to ``highest``, with one step for each level if there is room.
 
     Args:
         frame: layout of shape (ny, nx) that has no periodic pattern. The staircase replaces its middle.
@@ -110,9 +110,9 @@ def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, g
     """Draw isolated squares of the given widths, to measure the size of the printer's spot and how single
     features shrink and collapse.
 
-    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. The layout is divided into as
-    many rows as columns of cells. The cells are filled in reading order, each with one square in its middle.
-    The space between two neighbouring squares is at least twice the width of the larger one.
+    If ``feature`` is above ``ground``, the squares are pillars, otherwise pits. The layout is divided into
+    cells, in as many rows as columns. The cells are filled in reading order, each with one square in its
+    middle. The space between two neighbouring squares is at least twice the width of the larger one.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)

@@ -42,8 +42,8 @@ def random_layout(
         seed: seed of the noise, as `numpy.random.default_rng` accepts it.
         passband: ``square`` applies the cut-off to the frequencies along x and along y separately. ``round``
             applies it to the length of the frequency vector.
-        quantiser: ``round`` rounds as in the paper's equation; ``floor`` rounds down, so only pixels with the
-            largest value of all get the highest level.
+        quantiser: ``round`` rounds as in the paper's equation. ``floor`` rounds down, so only the pixels with
+            the largest value get the highest level.
         field_px: side length, in pixels, of a larger field from whose middle the layout is cut. Such a layout
             is not periodic and may lack the lowest or the highest level. If None, the layout is the whole
             field.

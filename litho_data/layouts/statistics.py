@@ -23,8 +23,8 @@ class LayoutStatistics(Result):
         jump_share: share of the pairs of neighbouring pixels (along x and y) whose levels differ by 0, 1, 2
             …; the shares sum to 1.
         frequency_per_um: centres of the radial frequency bins, cycles/µm.
-        power_share: share of the spectral power in each frequency bin; the shares sum to 1. The power of the
-            mean level is left out.
+        power_share: share of the spectral power in each frequency bin; the shares sum to 1. The mean level is
+            subtracted first, so its power is not included.
         settings: settings with which ``write_layout_set`` made the layouts; None if it did not make them.
     """
 
