@@ -4,9 +4,9 @@ produced.
 The height of an image pixel is determined by the point at which the tip touches the surface while it scans
 this pixel. If a valley is more sharply curved than the tip, the point of contact jumps from one side of the
 valley to the other, and the tip does not touch the surface in between. This part of the surface leaves only
-one trace in the image: a single pixel at which the image is more sharply curved than the tip. Call it a jump.
-If a jump is the pixel that limits the height which the surface can have at another place, the tip did not
-touch the surface at that place (Villarrubia 1997, section 5).
+one trace in the image: a single pixel at which the image is more sharply curved than the tip. Such a pixel is
+called a jump. At every place, one pixel of the image sets the upper limit to the height of the surface. Where
+this pixel is a jump, the tip did not touch the surface (Villarrubia 1997, section 5).
 """
 
 import numpy as np
@@ -25,13 +25,12 @@ from litho_data.tip.morphology import paraboloid_erosion
 
 # Limits for the curvature of a valley in the image, in units of the tip's curvature. Above the first value,
 # the point of contact may jump there; above the second value, it does jump. With a tip of radius R, a valley
-# of curvature k has the curvature k / (1 − kR) in the image, so 0.6 of the tip's curvature in the image
-# corresponds to 0.375 of it in the surface. Curvatures are fitted over a disc, and if noise requires a disc
-# as wide as the valley, the fit underestimates the curvature. Noise alone reaches 0.6 only at 3.5 standard
-# deviations.
+# of curvature k has the curvature k / (1 − kR) in the image, so a curvature of 0.6/R in the image corresponds
+# to 0.375/R in the surface. Curvatures are fitted over a disc. If noise requires a disc as wide as the
+# valley, the fit underestimates the curvature. Noise alone reaches 0.6 only at 3.5 standard deviations.
 _MAY_JUMP, _JUMPS = 0.35, 0.6
-# A jump also raises, by less, the curvatures fitted to discs whose centres are up to a disc radius away. A
-# pixel counts as part of the jump if its curvature exceeds this share of the maximum around it.
+# A jump also raises, but by less, the curvatures at pixels up to a disc radius away. A pixel counts as part
+# of the jump only if its curvature reaches this share of the highest curvature within a disc radius.
 _CORE = 0.55
 _SMOOTHING = 0.25
 

@@ -87,8 +87,8 @@ def curvature_noise(noise: Noise, pitch_um: YX, radius_px: float) -> float:
 @lru_cache(maxsize=64)
 def disc_kernels(radius_px: float, pitch_um: YX) -> Array:
     """Return three sets of weights for the heights on a disc. The weighted sums of the heights are the second
-    derivatives of the quadratic surface that fits them best. The result has shape (3, n, n) and the unit
-    1/µm².
+    derivatives of the quadratic surface that fits the heights best. The result has shape (3, n, n) and the
+    unit 1/µm².
 
     The order of the derivatives is xx, xy, yy.
     """

@@ -1,5 +1,5 @@
-"""Estimate the radius of the tip or an upper bound for it from scans, and find where the tip did not touch
-the surface.
+"""Estimate the radius of the tip, or an upper bound on the radius, from scans, and find where the tip did not
+touch the surface.
 """
 
 import math
@@ -82,7 +82,7 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     result is only an upper bound.
 
     Args:
-        scans: scans that all have the same pitch. It matters little whether they are levelled.
+        scans: scans that all have the same pitch. Whether they are levelled changes the result little.
 
     Raises:
         InputError: there is no scan, a scan has no pitch, the pitches differ, or a scan has fewer than 64 ×

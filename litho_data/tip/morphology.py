@@ -1,4 +1,4 @@
-"""Reconstruct a surface from the image that a tip produced of it. The image is the surface dilated by the
+"""Reconstruct a surface from its image, which was produced by a tip. The image is the surface dilated by the
 shape of the tip. Eroding the image by the same shape restores the surface wherever the tip touched it.
 
 Unmeasured pixels (NaN) are ignored.
@@ -24,7 +24,8 @@ class Eroded(NamedTuple):
 
 
 def paraboloid_erosion(image: Array, pitch_um: YX, radius_um: float) -> Eroded:
-    """Return the highest surface from which a paraboloid tip would produce an image of shape (ny, nx) in µm.
+    """Return the highest surface from which a paraboloid tip would produce the given image, whose heights are
+    in µm and whose shape is (ny, nx).
 
     ``radius_um`` is the radius of the end of the tip. Pixels that are NaN in the image are NaN in the result.
     The erosion is a minimum over all image pixels. A paraboloid is the sum of a parabola in x and one in y,

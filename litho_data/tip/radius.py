@@ -19,9 +19,9 @@ from litho_data.tip.curvature import QUIET, noise_of
 
 # Half side lengths, in pixels, of the square windows in which curvatures are measured.
 _HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-# Half side lengths of windows as shares of the reach, i.e. of the radius of the image of a spike: the
-# preferred one and the largest allowed one. A window of the preferred size is about the largest that still
-# fits on the image of an edge.
+# Preferred and largest allowed half side length of a window, as shares of the reach. The reach is the radius
+# of the image that the tip produces of a spike. A window of the preferred size is about the largest that
+# still fits on the image of an edge.
 _HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
 # The upper edge of the distribution of curvatures is the 98 % quantile of the sharp curvatures, i.e. of those
 # above half of the 50th highest. Noise raises this quantile by 1.4 standard deviations of the noise, which
@@ -31,21 +31,21 @@ _FEWEST_TOPS = 50
 # Share of a line that is excluded at each end, because the scan is unreliable near the turning points.
 _TURN = 0.02
 _SMALLEST_REACH_PX = 5.0
-# Of the curvatures above 0.4 of the edge, at least this share must lie above 0.8 of the edge. On surfaces
-# whose sharpness no tip limits, the share is at most 0.16.
+# Of the curvatures above 0.4 of the edge, at least this share must lie above 0.8 of the edge. If the surface
+# and not the tip limits the sharpness of the peaks, the share is at most 0.16.
 _TIP_SHARE = 0.25
-# The tip is the same everywhere in a scan, but the sharpest peaks of a surface are in a few places. The scan
-# is therefore divided into 5 x 5 parts, and the share of the parts whose own edge exceeds 0.9 of the whole
-# scan's edge is computed. The product of this share and the share of sharp peaks above must reach 0.13. Among
-# the estimates that are more than 10 % too large, this limit rejects most of those from rounded bumps, but
-# only one in twenty of those from steep walls and spikes.
+# The tip limits the sharpness everywhere in a scan, but the sharpest peaks of a surface are in a few places.
+# The scan is therefore divided into 5 x 5 parts, and the share of the parts whose own edge exceeds 0.9 of the
+# whole scan's edge is computed. This share times the share that ``_TIP_SHARE`` limits must reach 0.13. Of the
+# estimates that are more than 10 % too large, this limit rejects most that come from rounded bumps, but only
+# one in twenty that come from steep walls and spikes.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
-# If the tip limits how sharp peaks appear, valleys are sharper than peaks by at least this factor. If the
-# surface limits it, and in most noise, they are not.
+# If the tip limits how sharp peaks appear, valleys are sharper than peaks by at least this factor. They are
+# not if the surface limits the sharpness of the peaks, or, in most cases, if the peaks are noise.
 _SHARPER_VALLEYS = 1.2
-# The first value is the relative error of the method, i.e. the scatter of the estimates for known tips that
-# the scatter among the parts of a scan does not explain. The second is the number of standard uncertainties
-# that are added to the radius to give an upper bound.
+# The first value is the relative error of the method: the part of the scatter of estimates for known tips
+# that the scatter among the parts of a scan does not explain. The second is the number of standard
+# uncertainties that are added to the radius to give an upper bound.
 _METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
 _SPAN = (0.5, 99.5)
 
@@ -191,8 +191,8 @@ class _Tops:
 def _tops(lines: Array, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
     from scipy.signal import savgol_coeffs
 
-    # The sum of the heights in a window with these weights is the second derivative of the parabola that fits
-    # them best.
+    # The sum of the heights in a window, multiplied by these weights, is the second derivative of the
+    # parabola that fits the heights best.
     weights = savgol_coeffs(2 * half_px + 1, 2, deriv=2, delta=pitch_um)
     noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
     curvature = -_along_lines(lines, weights)

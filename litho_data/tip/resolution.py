@@ -24,8 +24,8 @@ def lateral_resolution_um(height_um: Array, pitch_um: YX, radius_um: float) -> f
         radius_um: radius of the end of the tip, µm.
 
     Returns:
-        The wavelength. None means that no peak reaches this curvature at any distance, so the tip does not
-        limit the resolution.
+        The wavelength. None means that no peak reaches half of the tip's curvature at any λ, so the tip does
+        not limit the resolution.
     """
     found = [
         _along(np.moveaxis(height_um, axis, 0), pitch, _SHARE / radius_um)
