@@ -23,8 +23,8 @@ def croissant(root: Facts, files: Sequence[Facts], file: str, table: pd.DataFram
         root: the entry that describes the dataset in the RO-Crate.
         files: the entries that describe the files of the release in the RO-Crate.
         file: name of the CSV file that contains the table.
-        table: the table, with one row per scan; the description lists its columns. The types of the columns
-            are not read from the CSV file, in which an id such as 01 looks like a number.
+        table: the table, with one row per scan. The description states the columns of this table and their
+            types. The types are not read from the CSV file, in which an id such as 01 looks like a number.
     """
     said = {name: root[name] for name in ("name", "description", "datePublished")}
     said |= {"license": root["license"]["@id"]} if "license" in root else {}

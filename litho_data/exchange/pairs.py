@@ -59,9 +59,9 @@ def import_pairs(
     The height of a pixel is grey value / 255 · full scale. In the authors' own files, heights were rounded
     down to a grey value, so they are too low by half a grey value (about 2 nm) on average.
 
-    If the folder contains ``valid/``, the heights of its black pixels are not valid. Otherwise, all pixels
-    are valid, and a field is reported if the height is 0 along a whole side, as in a frame that was not
-    measured.
+    If the folder contains ``valid/``, heights are not valid at the black pixels of these masks. Otherwise,
+    all pixels are valid, and a field is reported if its heights are 0 along a whole side, because this side
+    was probably not measured.
 
     Args:
         folder: folder that contains ``mask/``, ``afm/``, ``src_max_dict.txt`` and possibly ``valid/``.
@@ -73,8 +73,8 @@ def import_pairs(
         strict: if true, nothing is built if any field cannot be used; if false, such fields are skipped.
 
     Raises:
-        InputError: the folder has no ``src_max_dict.txt`` or no complete pair, the name of a file cannot be
-            printed, or the pitch or the level height is not positive.
+        InputError: the folder has no ``src_max_dict.txt`` or no complete pair, the name of a file contains
+            unprintable characters, or the pitch or the level height is not positive.
     """
     root = Path(folder).resolve()
     scales = read_full_scales(root / SCALES_FILE)
@@ -135,8 +135,8 @@ class PairsJob:
         return {name: self.root / name for name in names}
 
     def key(self) -> str:
-        """Return a hash of everything that determines the finished field, by which a resumed build recognises
-        it.
+        """Return a hash of everything that determines the finished field. By this hash, a resumed build
+        recognises fields that are already finished.
         """
         operation = OPERATIONS["stitch-pairs"]
         card = self.card.model_dump(mode="json")
@@ -144,8 +144,8 @@ class PairsJob:
         return record_sha256([plan, {name: file_sha256(path) for name, path in self.files.items()}])
 
     def run(self) -> Piece:
-        """Join the field from its quadrants, and return it in the form in which a store under construction
-        takes it.
+        """Join the quadrants of the field, and return the field as a ``Piece``, which a build can add to the
+        store.
         """
         chain = Chain()
         chain.run("stitch-pairs", self._params, self.files)
@@ -175,8 +175,8 @@ class PairsJob:
 def _fields(
     root: Path, kinds: Sequence[str], scales: Mapping[str, float]
 ) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Return the file names keyed by field and quadrant, and a dict that maps each unusable file to the
-    reason.
+    """Return the file names, keyed by field and then by quadrant, and a dict that maps each unusable file to
+    the reason why it cannot be used.
     """
     masks, heights, *seen = ({path.name for path in (root / kind).glob("*.tif")} for kind in kinds)
     if unprintable := [name for name in sorted(masks.union(heights, *seen)) if not name.isprintable()]:
@@ -220,11 +220,12 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format. Return one note for each scan that has negative heights or unmeasured
-    pixels, which the format cannot represent.
+    """Write a store in the pair format. Return notes about the scans that have negative heights or unmeasured
+    pixels, because the format can represent neither.
 
-    Heights are rounded to the nearest grey value; pixels that were not measured become 0, and are black in
-    the masks ``valid/<id><q>.tif``.
+    If a scan has negative heights, all its heights are raised so that the lowest is 0. Heights are rounded to
+    the nearest grey value; pixels that were not measured become 0, and are black in the masks
+    ``valid/<id><q>.tif``.
 
     Raises:
         InputError: a field cannot be cut into four quadrants, or the output folder contains files of another
