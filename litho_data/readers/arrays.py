@@ -21,7 +21,7 @@ _MATLAB_7 = b"MATLAB 7.3 MAT-file"
 _APPLIED = ("scale_factor", "add_offset")
 _MISSING = ("_FillValue", "missing_value")
 _RANGE = ("valid_min", "valid_max", "valid_range")
-# Names of attributes whose numbers may scale the values in a way that is not known here.
+# Names of attributes whose numbers may scale or shift the values in a way that this module cannot interpret.
 _UNKNOWN = re.compile(
     r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb|sensitiv|"
     r"_per_(?!pixel|px)|^to_|(z|height|vertical)_?resolution",
@@ -54,8 +54,8 @@ class Coordinate:
     """The positions of the pixels along one dimension of an array.
 
     ``values`` contains the positions, in ``unit``. If the file states only a length, ``values`` is None and
-    ``length`` contains this length. ``axis`` is "x" or "y" if the file names an axis in addition to the
-    dimension.
+    ``length`` contains this length. ``axis`` is the axis that the attributes of the positions name, such as
+    "x"; it is empty if they name none.
     """
 
     values: Array | None
@@ -99,8 +99,8 @@ class Held:
 
     @classmethod
     def in_memory(cls, values: Array, *described: Any) -> Held:
-        """Wrap an array that has already been read. ``described`` contains the values of the fields after
-        ``read``, in order.
+        """Wrap an array that has already been read. ``described`` contains the values of those fields of this
+        class that follow ``read``, in order.
         """
         native = np.array(values, dtype=values.dtype.newbyteorder("="))
         return cls(native.dtype, native.shape, partial(np.array, native), *described)
@@ -115,7 +115,7 @@ def array_channel(name: str, held: Held) -> Channel:
     """Make the channel of a two-dimensional array. The array is indexed [y, x] unless the names of its
     dimensions say otherwise.
 
-    In the channel, x grows to the right. Rows keep the order of the file, even if their coordinate decreases.
+    In the channel, x grows to the right. Rows keep the order of the file, even if y decreases downwards.
 
     Raises:
         InputError: the array has attributes that may scale its values in an unknown way (the message names
@@ -215,8 +215,8 @@ def _values(raw: Read, says: Facts, turned: bool, mirrored: bool) -> Loaded:
 def channels_of(arrays: Mapping[str, Held], around: Facts | None = None) -> list[Channel]:
     """Make one channel per two-dimensional array in a file without groups.
 
-    One-dimensional arrays are taken as coordinates, and single values as descriptions of all two-dimensional
-    arrays (maps). ``around`` contains the attributes of the whole file.
+    One-dimensional arrays are taken as coordinates of the two-dimensional arrays (maps). Single values, such
+    as a unit, are taken to apply to all maps. ``around`` contains the attributes of the whole file.
     """
     lines = {name: _coordinate(one.read(), one.attributes) for name, one in arrays.items() if _is_line(one)}
     single = {name: one.read().ravel()[0] for name, one in arrays.items() if _size(one) == 1}
@@ -256,8 +256,8 @@ def _masks(arrays: Iterable[tuple[str, Any]]) -> dict[Shape, str]:
 
 
 def _refuse_mask(shape: Shape, masks: Mapping[Shape, str]) -> None:
-    """Reject a map if the file has a mask of the same shape, because the file does not say what the mask
-    marks.
+    """Reject a map if the file has a mask of the same shape, because the file does not say whether the mask
+    marks valid or missing pixels.
     """
     if shape in masks:
         raise InputError(f"mask {masks[shape]!r}", wanted="no mask, and NaN in unmeasured pixels")

@@ -30,7 +30,7 @@ _MIB = 1 << 20
 _COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
 _MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
 # The longest wait for a result, in multiples of the allowed computing time. The wait is long enough for a
-# parser on a busy computer. It ends a parser that uses no computing time because it waits for something.
+# parser on a busy computer. This limit also ends a parser that only waits, which uses no computing time.
 _WAITING_PER_COMPUTING = 20
 _START = "from litho_data.readers.confined import serve; serve({descriptor})"
 
@@ -44,8 +44,8 @@ def parse(function: Callable[[], T], path: Path, kind: str, parsers: tuple[str, 
         path: the file that it parses. The limits depend on the size of the file.
         kind: name of the format that messages show.
         parsers: names of other projects' modules that the function needs. If any are named, the function runs
-            in the child process and must be picklable. On systems other than POSIX, it always runs in this
-            process.
+            in the child process and must be picklable. On systems other than POSIX, the function always runs
+            in the calling process.
     """
     guarded = partial(_guarded, function, kind)
     return _CHILD.call(guarded, path, parsers) if parsers and os.name == "posix" else guarded()
@@ -90,7 +90,8 @@ class _Child:
         return result
 
     def _start(self) -> None:
-        # A forked copy of this process must start its own child and not use that of the original process.
+        # A forked copy of this process must start its own child instead of using the child of the original
+        # process.
         if self._process is not None and self._owner == os.getpid() and self._process.poll() is None:
             return
         self._pipe, far_end = Pipe()

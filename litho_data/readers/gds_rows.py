@@ -16,7 +16,7 @@ from litho_data.foundation import Array, Shape
 _UNIT_M, _PRECISION_M = 1e-6, 1e-9
 # Side of the blocks into which the design package divides a layout, in px.
 _BLOCK_PX = 128
-# Number of shapes that are read at once.
+# Number of rectangles that are read at once.
 _CHUNK = 1 << 10
 _CELL_NAME, _REFERENCE_NAME, _PLACE, _END_LIBRARY = 0x0606, 0x1206, 0x1003, 0x0400
 
@@ -80,7 +80,7 @@ class GdsRows:
         """Find, for every cell, where its rectangles lie in the file, and which other cells it places."""
         at, cell, name = 0, "", ""
         while True:
-            # 64 bytes hold any record that is used here. Only records of rectangles are longer.
+            # The records that are evaluated here fit in 64 bytes. The records of rectangles are skipped.
             part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
             length, kind = struct.unpack(">HH", part[:4])
             body = part[4:length]

@@ -41,9 +41,9 @@ def read_layout(
             square are cropped.
 
     Raises:
-        InputError: the file does not exist, is damaged, has a format that is not supported, or has pixels
-            whose colours differ; its values are neither levels nor multiples of the grey step; or its sidecar
-            belongs to another file.
+        InputError: the file does not exist, is damaged, has a format that is not supported, or is not grey;
+            its values are neither levels nor multiples of the grey step; or its sidecar belongs to another
+            file.
     """
     file = require_file(path)
     if says := export_of(file):

@@ -20,8 +20,8 @@ _FEWEST_VALUES = 8
 # Values count as equal within these relative tolerances, because they may be stored as float32. Values above
 # the limit _LARGE are written with few digits, so their tolerance is wider.
 _SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
-# The lowest or highest value is suspicious if the number of pixels with this value reaches all of three
-# limits. These are a share of all pixels, a number of pixels, and a multiple of the mean number of pixels per
+# The lowest or highest value is suspicious if the number of pixels with this value reaches all three limits:
+# a share of all pixels, a fixed number of pixels, and a multiple of the mean number of pixels per distinct
 # value.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 

@@ -21,8 +21,8 @@ def read_picture(path: str | Path, what: str = "picture") -> Array:
         what: the word that messages use for the file, such as "layout".
 
     Raises:
-        InputError: the file does not exist, is damaged, has a format that is not supported, has pixels whose
-            colours differ, or contains numbers that are not finite.
+        InputError: the file does not exist, is damaged, has a format that is not supported, is not grey, or
+            contains numbers that are not finite.
     """
     file = require_file(path)
     with about(f"{what} {file}"):

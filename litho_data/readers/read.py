@@ -60,8 +60,9 @@ def read_scan(
         missing: numbers (as stored in the file) and words that mark pixels without a measurement, in addition
             to the marks that the file itself states. An empty list states that there are no such additional
             marks.
-        defaults: those of the names ``unit`` and ``size_um`` whose argument is only used if the file does not
-            state the unit or the size. Otherwise, the argument must agree with what the file states.
+        defaults: those of the arguments ``unit`` and ``size_um`` that are mere default values: a value that
+            the file states takes precedence over them. Arguments that are not named here must agree with what
+            the file states.
 
     Raises:
         InputError: the file is unreadable; it has no height channel, or it has several and ``channel`` is not
@@ -126,8 +127,8 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
 
 
 def own_reader_sha256(path: str | Path, format: str = "auto") -> str:
-    """Return the hash of the source of the registered reader with which ``read_scan`` reads a file. The
-    result is empty if a reader of this package reads the file.
+    """Return the hash of the source code of the registered reader that ``read_scan`` uses for a file. The
+    result is empty if it uses a reader of this package.
 
     Raises:
         InputError: a reader has been registered, and the file is unreadable or has an unknown format.

@@ -58,7 +58,7 @@ class Channel:
         fast_axis: axis along which the tip moved fast; None if the file does not state it.
         header: everything that the file states about the channel, as strings.
         problem: the reason why the channel cannot be read; empty if it can be read.
-        x_is: which direction in the file runs along x, in words, such as "a row of the file".
+        x_is: what in the file runs along x, in words, such as "a row of the file".
         extent: side lengths (y, x) of the map from edge to edge, if the file states them without a unit.
         words: words that stand in the file in place of numbers, each with the line where it first occurs.
             Pixels with such a word are NaN.

@@ -23,7 +23,7 @@ _READERS = [
     tiff.READER,
     text_matrix.READER,
 ]
-# Maps the name of each registered reader to the hash of its source.
+# Maps the name of each registered reader to the hash of its source code.
 _REGISTERED: dict[str, str] = {}
 PICTURE = "image"
 _PICTURE_MAGIC = (b"\x89PNG\r\n\x1a\n", b"BM")
@@ -52,7 +52,7 @@ def register_reader(reader: Reader) -> Reader:
 
 
 def registered() -> dict[str, str]:
-    """Return a dict that maps the name of each registered reader to the hash of its source."""
+    """Return a dict that maps the name of each registered reader to the hash of its source code."""
     return dict(_REGISTERED)
 
 

@@ -22,10 +22,11 @@ _SEPARATORS = re.compile(r"[\s;]+|,\s*")
 _STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 _LOOKED_AT = 400
 _FEWEST_NULS = 0.8
-# A line with at least this many equal words is a row of missing pixels.
+# A line that repeats a single word at least this many times is a row of missing pixels.
 _FEWEST_EQUAL = 4
 _CELLS = re.compile(r"\t|;|,")
-# Cells that contain a comma are matched too. Otherwise, their closing mark would count as an opening mark.
+# Cells that contain a comma are matched too. Otherwise, their closing quotation mark would count as the
+# opening mark of the next cell.
 _QUOTED = re.compile(r'"([^",\n]*)"|("[^"\n]*")')
 # Keys are compared only by their letters and digits.
 _NO_LETTER = re.compile(r"[\W_]+")
@@ -133,7 +134,7 @@ class Block:
 
 
 def refuse_scales(header: Mapping[str, str]) -> None:
-    """Reject a header that contains a scale of a kind that no known format uses.
+    """Reject a header that scales the values in a way that no known format uses.
 
     Raises:
         InputError: the header contains a scale of an unknown kind.
@@ -182,8 +183,8 @@ def blocks_of(text: str) -> list[Block]:
     """Find the blocks of numbers in a text. A blank line or a line of words ends a block.
 
     A line counts as a line of words only if less than half of its cells are numbers. Otherwise it is a row of
-    the block in which words stand in place of some numbers. If every second line is blank, all rows belong to
-    one block.
+    the block, with words in place of some numbers. If every second line is blank, all rows belong to one
+    block.
     """
     found = list(_blocks(text))
     if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):

@@ -14,8 +14,9 @@ from litho_data.foundation import YX, Array, InputError, is_length, um_per
 # step.
 _UNEVEN = 0.02
 _FEWEST_STEPS = 3
-# A first row or column alone, or a pair of both with uneven steps, is recognised as an axis only if it has at
-# least this many numbers.
+# If only the first row or only the first column is evenly spaced, it is taken as an axis only if it has at
+# least this many numbers. A first row and column with uneven steps are rejected as axes only if each has this
+# many numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
 _COLUMN = re.compile(
@@ -32,9 +33,9 @@ class Map:
     """A map of heights without its axes, with row 0 at the top and x to the right.
 
     ``size_um`` contains the side lengths (y, x) in µm, if the table states them with a unit. ``extent``
-    contains the side lengths (y, x) in the unit of the coordinates, which the table may not state. ``x_is``
-    says in words whether rows or columns of the file run along x. ``corner`` is true if the first cell of the
-    table does not belong to the map. This cell may then contain a word.
+    contains the side lengths (y, x) in the unit of the coordinates, even if the table does not state this
+    unit. ``x_is`` says in words whether rows or columns of the file run along x. ``corner`` is true if the
+    first cell of the table does not belong to the map. This cell may then contain a word.
     """
 
     values: Array

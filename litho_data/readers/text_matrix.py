@@ -13,8 +13,9 @@ from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
 
 _MOST_HEADER_LINES = 1000
-# A table with few columns and many rows may contain points instead of the lines of a map. It may if it has at
-# most this many columns and at least this many rows per column. The two pairs of limits are alternatives.
+# A table with few columns and many rows may contain points instead of the lines of a map. Points are looked
+# for if the table has at most 3 columns and at least 3 rows per column, or at most 8 columns and at least 16
+# rows per column.
 _POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = (3, 8), (3, 16)
 _IGOR = "IGOR\n"
 

@@ -121,8 +121,8 @@ def _plain(text: str, first_line: int) -> tuple[str, str | None]:
 def _refuse_decimal_commas(text: str, first_line: int) -> None:
     """Reject rows like ``0,9000,0,3100``, where commas seem to be both decimal commas and separators.
 
-    Such rows are recognised by the numbers of characters. All cells in even places have the same number of
-    characters, and no cell in an odd place has this number.
+    Such rows are recognised by the lengths of their cells: every row has an even number of cells, all cells
+    in even places have the same length, and no cell in an odd place has this length.
     """
     if "." in text:
         return
@@ -181,8 +181,7 @@ def refuse_cut_end(text: str) -> None:
     as 5.4 m.
 
     Raises:
-        InputError: the exponent of the last number is missing, or is shorter than that of the number before
-            it.
+        InputError: the last number has no exponent or a shorter one than the number before it.
     """
     if text.endswith("\n"):
         return

@@ -228,7 +228,7 @@ def single_sample(pixels: Array) -> Array:
     grey and opaque.
 
     Raises:
-        InputError: the colours of a pixel differ, so it has no single grey value, or a pixel is transparent.
+        InputError: a pixel is not grey or is transparent, or the image has another shape.
     """
     if pixels.ndim == 3 and 1 <= pixels.shape[2] <= 4:
         if pixels.shape[2] in (2, 4) and (pixels[..., -1] != pixels[..., -1].max()).any():
