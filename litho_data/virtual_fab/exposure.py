@@ -166,8 +166,8 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
 
 
 def _slice_by_slice(nominal: Array, line_energy: Array | float, spot: Array, printer: Printer) -> Array:
-    """Return the effective dose if doses of different slices do not add up. Each slice is then exposed only
-    where its own dose exceeds the threshold.
+    """Return the effective dose for a resist in which the doses of different slices do not add up. Each slice
+    is then exposed only where its own dose exceeds a threshold.
     """
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)

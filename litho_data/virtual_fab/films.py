@@ -26,8 +26,9 @@ from litho_data.layouts.card_text import CARD_NAME, write_layout
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import blur
 
-# First value: number of pixels per layout pixel, along each axis, in the micrograph and in the image in which
-# edges are located. Second value: number of pixels by which the latter image is padded.
+# First value: factor by which the pixels of the micrograph, and of the image in which edges are located, are
+# smaller than the pixels of the layout. Second value: number of pixels by which the image with the edges is
+# padded.
 _FINER, _AROUND = 4, 64
 # Width, in px, of the rim without film around a random layout.
 _RIM_PX = 12
@@ -91,7 +92,7 @@ _KNOB_RANGES = {
     "diffusion_um": Range(0, LENGTH_UM.high, LENGTH_UM.unit),
     "etch_bias_um": PLACE_UM,
     "defocus_um": PLACE_UM,
-    # The dose itself is 1 plus its error.
+    # The relative dose is 1 plus ``dose_error``.
     "dose_error": Range(DOSE.low - 1, DOSE.high - 1),
     "charging": Range(-1, 1),
 }
@@ -110,7 +111,8 @@ class FilmPrinter:
         threshold: dose above which film remains, relative to the dose of a large exposed area.
         wavelength_um: wavelength of the light. It is used only for projection.
         na: numerical aperture of the lens.
-        source: radius of the light source divided by that of the lens aperture (partial coherence factor).
+        source: radius of the light source divided by the radius of the lens aperture (partial coherence
+            factor).
     """
 
     process: Literal["e-beam", "projection"]

@@ -32,7 +32,7 @@ class Knob:
             means that it is either the process or the measurement, but not known which.
         unit: unit of the strength.
         limit: largest strength that is accepted.
-        meaning: text that says what the strength means, and what is drawn with the seed.
+        meaning: text that says what the strength means, and which properties are drawn at random.
         nuisance_span: True if the offset, gain, plane and bow fitted to each scan absorb nearly all of the
             effect.
         refit_absorbs: True if other parameters of the plain model of printing can imitate most of the effect.

@@ -60,8 +60,8 @@ class Job:
 
     @property
     def printed(self) -> int:
-        """Return the number of the print. The random draws for the print depend on this number. Those for the
-        scan depend on ``index``.
+        """Return the number of the print. The random draws for the print depend on this number; the random
+        draws for the scan depend on ``index``.
         """
         return self.index if self.print_index is None else self.print_index
 

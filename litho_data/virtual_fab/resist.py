@@ -72,7 +72,7 @@ def _field_shape(canvas: Canvas, knobs: KnobBoard) -> Array:
 
 
 def _shrink(height: Array, conversion: Array, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> Array:
-    """Return the heights after the shrinkage that the knobs add to that of plain drying."""
+    """Return the heights after the shrinkage that the knobs cause in addition to the shrinkage by drying."""
     if strength := knobs["vertical-shrinkage"]:
         height = height * (1 - strength)
     if strength := knobs["dose-dependent-shrinkage"]:

@@ -57,7 +57,7 @@ class Microscope:
 
     Args:
         margin_px: number of pixels by which a scan extends beyond the layout on each side, for a layout of
-            512 px. It grows in proportion to the layout.
+            512 px. For other layouts, the margin is proportional to their side lengths.
         rotation_deg: largest random rotation, in degrees.
         scale: largest relative error of the scale of each axis.
         shear: largest random shear.

@@ -14,7 +14,8 @@ from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
-# This knob is noise, so scans without noise do not show it. Its strength is its rms in nm.
+# This knob adds roughness, so its effect is not measured in noise-free scans. Its strength is the rms of this
+# roughness in nm.
 NOISE_KNOB = "line-roughness"
 _RELATIVE_PRECISION = 0.01
 _MAX_STEPS = 40
@@ -47,8 +48,8 @@ def strength_for_rms(
     Args:
         name: name of the knob.
         rms_nm: wanted rms change of the scans in nm.
-        jobs: the fields on which the change is measured. By default, they are four random layouts of
-            256 × 256 px, two for each of the two cut-off frequencies.
+        jobs: the fields on which the change is measured. By default, they are four random layouts of 256 ×
+            256 px, two at each of the two cut-off frequencies that random layouts use.
         seed: seed of the knob.
 
     Raises:
@@ -130,7 +131,7 @@ def knob_rms_nm(setting: KnobSetting, jobs: Sequence[Job], printer: Printer | No
 
 
 def _free_of_nuisances(change: Array, prediction: Array) -> Array:
-    """Fit a gain times ``prediction``, plus a quadratic surface, to ``change``, and return the residual."""
+    """Fit ``change`` by a multiple of ``prediction`` plus a quadratic surface, and return the residual."""
     y, x = (
         axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
     )

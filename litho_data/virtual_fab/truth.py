@@ -94,7 +94,7 @@ def noise_floor(noise_um: Array) -> dict[str, float]:
     noise, in nm.
 
     Values whose names begin with ``floor_full`` are computed after offset, tilt and bow have been removed.
-    For the other values named ``floor``, only the offset has been removed.
+    For the other values whose names begin with ``floor``, only the offset has been removed.
     """
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = level_polynomial(centred_nm, total_degree=2).height
