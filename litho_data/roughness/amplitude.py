@@ -94,13 +94,13 @@ def _pairs(shape: Shape, rows: Array, columns: Array) -> Array:
 
 def effective_samples(height_um: Array) -> float:
     """Return the effective number of samples of a surface, n_eff = pixels / Σ ρ², where ρ is the
-    autocorrelation. So many independent heights would determine the variance as precisely as the correlated
+    autocorrelation. n_eff independent heights would determine the variance as precisely as the correlated
     heights of the surface do.
 
     The formula holds for Gaussian surfaces, whose estimated mean square has the relative variance ``2 Σ ρ² /
     pixels``. The sum excludes lags beyond a quarter of the field, because the estimated ρ is nothing but
-    noise there. The noise of the other estimates, whose expected square is Σ ρ² divided by the number of
-    pixel pairs, is subtracted.
+    noise there. At all other lags, the estimated ρ contains noise, whose expected square is Σ ρ² divided by
+    the number of pixel pairs at this lag. The sum is corrected for this noise.
     """
     correlation = autocorrelation(height_um)
     centre = correlation.shape[1] // 2
@@ -113,7 +113,7 @@ def effective_samples(height_um: Array) -> float:
         return float(2 * np.sum(values) - np.sum(values[0]))
 
     noise = 1 / _pairs(height_um.shape, rows, columns)
-    # At lag 0, ρ is 1 without noise.
+    # At lag 0, ρ is exactly 1.
     noise[0, reach] = 0
     summed = total(correlation[np.ix_(rows, centre + columns)] ** 2) / (1 + total(noise))
     return float(min(height_um.size, max(1.0, height_um.size / summed)))

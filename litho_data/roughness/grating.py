@@ -15,9 +15,9 @@ from litho_data.scan import Axis
 # by up to this factor.
 SEARCHED = 1.25
 # Width of the windows in which phases are measured, and smallest accepted length of the scan, both in
-# periods. In a Hann window of two periods, all harmonics cancel, apart from a change of the phase that is the
-# same in all windows, because these are one period apart. A line is fitted to the phases, which needs several
-# windows side by side.
+# periods. A Hann window of two periods suppresses the harmonics of the grating. What is left of them changes
+# all phases equally, because the windows are one period apart. A straight line is fitted to the phases, so
+# several windows side by side are needed.
 _WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
 # Largest accepted scatter of the phases. Phases of pure noise scatter by 1.8 rad.
 _MOST_SCATTER_RAD = 0.5
@@ -51,9 +51,9 @@ def find_wave(height_um: Array, pitch_um: YX, period_um: float, axis: Axis) -> W
     """Find the fundamental wave of a grating that repeats along an axis, or within 15° of this direction.
 
     The phase is measured in Hann windows that are two periods wide along the axis and extend over the whole
-    length of the other axis. The slope of a straight line fitted to the phases corrects the frequency. The
-    scatter of the phases about this line gives an uncertainty that includes noise, drift and a bent scanner
-    axis.
+    length of the other axis. A straight line is fitted to the phases, and its slope is the correction of the
+    frequency. The scatter of the phases about this line gives an uncertainty that includes the effects of
+    noise, drift and a bent scanner axis.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
@@ -161,8 +161,8 @@ def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]
     carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
     places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
     slope, error, scatter = _line(places, phases)
-    # The angle of the grating is small, so the phases of four bands of rows are enough to measure it. Within
-    # each band, all other waves average out.
+    # The grating is only slightly rotated, so the phases of four bands of rows are enough to measure its
+    # angle. Within each band, all other waves average out.
     window = np.hanning(len(x))
     bands = [band @ window for band in np.array_split(carried, 4)]
     centres = np.array([band.mean() for band in np.array_split(y, 4)])
@@ -174,8 +174,8 @@ def _advance(flat: Array, pitch_um: YX, at: Array) -> tuple[Array, float, float]
 def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array]:
     """Measure the phase of a wave in windows one period apart.
 
-    The tilt and the bow of a scanner have a slope in each window, which a Hann window does not cancel. So the
-    wave, its conjugate, a constant and a slope are fitted together.
+    In each window, the tilt and the bow of the scanner appear as a slope, which a Hann window does not
+    cancel. So the wave, its conjugate, a constant and a slope are fitted together.
 
     Args:
         carried: profile multiplied by the conjugate of the wave exp(2πi x / period_um), shape (nx,), complex.
@@ -184,7 +184,8 @@ def _phases(carried: Array, x_um: Array, period_um: float) -> tuple[Array, Array
     places = np.arange(x_um[0] + width_um / 2, x_um[-1] - width_um / 2, width_um / 2)
     distance = (x_um[None, :] - places[:, None]) / width_um
     windows = np.where(np.abs(distance) < 0.5, np.cos(np.pi * distance) ** 2, 0.0)
-    # The multiplication turns a constant into this, and the conjugate wave into its square.
+    # Multiplied by the conjugate wave, a constant becomes this function, and the conjugate wave becomes the
+    # square of this function.
     constant = np.exp(-2j * np.pi * x_um / period_um)
     columns = [np.ones_like(constant), constant**2, constant, (x_um - x_um.mean()) / width_um * constant]
     design = np.column_stack(columns)

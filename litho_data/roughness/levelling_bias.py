@@ -1,5 +1,5 @@
-"""Compute by how much levelling lowers the measured rms roughness Sq. It does so because the fitted
-background also follows some of the roughness.
+"""Compute by how much levelling lowers the measured rms roughness Sq. Sq falls because the fitted background
+also follows some of the roughness.
 
 The background is a least-squares fit of basis functions that are orthonormal over the N pixels; they are the
 columns of a matrix Q. After the background is subtracted, a surface with variance σ² and correlation matrix C

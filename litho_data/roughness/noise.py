@@ -12,8 +12,8 @@ from litho_data.scan import Axis
 
 # The median absolute deviation of a Gaussian is 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
-# Order of the differences. A wave at 0.84 of the Nyquist frequency keeps half of its amplitude, and a wave at
-# 0.56 of it (0.28 cycles per pixel) keeps a fiftieth.
+# Order of the differences. Relative to a wave at the Nyquist frequency, a wave at 0.74 of this frequency is
+# weakened to a half, and a wave at 0.42 of it (0.21 cycles per pixel) to a fiftieth.
 _FINE_ORDER = 8
 
 
@@ -27,7 +27,7 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.
-        fast_axis: axis along which the tip moved.
+        fast_axis: axis along which the tip moved fast.
 
     Returns:
         Standard deviations of the pixel noise and of the line noise; NaN if there are too few pixels to

@@ -12,7 +12,7 @@ from litho_data.scan import Axis
 # An edge counts only if the profile changes there by more than this many times the median change. On a rough
 # surface without a step, the largest change is 4 to 5 times the median change.
 _EDGE_SIGMA = 9.0
-# Two treads of three pixels each.
+# Smallest number of measured positions: two treads of three pixels each.
 _FEWEST_COLUMNS = 6
 
 
@@ -21,7 +21,7 @@ class StepHeight(Record):
 
     Args:
         height_nm: height of the step, averaged over the lines.
-        line_sd_nm: standard deviation of the heights of the single lines.
+        line_sd_nm: standard deviation of the step heights of the individual lines.
         uncertainty_nm: standard uncertainty of ``height_nm``, computed from the standard deviation and the
             number of independent lines. It does not include the uncertainty of the microscope's height scale.
         lines: number of lines that were fitted.
@@ -107,8 +107,8 @@ def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Arr
 
 
 def _fit_steps(lines: Array, background: list[Array], treads: list[Array]) -> list[StepHeight]:
-    """Fit the heights of all treads and the functions of the background, which all treads have in common, to
-    each line. Return the height of each step, averaged over the lines.
+    """Fit one height per tread, plus background functions that all treads have in common, to each line.
+    Return the height of each step, averaged over the lines.
     """
     used = np.any(treads, axis=0)
     centred = [function - function.mean() for function in background]
@@ -157,8 +157,8 @@ def find_step(height_um: Array, pitch_um: float, *, axis: Axis = "x") -> StepHei
     profile is at least half as large as its largest change. The heights of the steps are fitted as in
     ``stair_steps``, and their absolute values are averaged. A raw scan shows the bow of the scanner, so a
     curvature common to all treads is fitted too. Steps of one scan share treads, so their errors are not
-    independent. The stated uncertainty is therefore that of a single step, not that of a mean of independent
-    values.
+    independent. The stated uncertainty is therefore the uncertainty of a single step; it is not divided by
+    the root of the number of steps.
 
     Args:
         height_um: heights in µm, shape (ny, nx); NaN where not measured.

@@ -16,8 +16,8 @@ FEWEST_LINES = 64
 # the peak are left out, because a Hann window spreads the peak over them.
 _AROUND = 16
 _OWN = 3
-# Effective share of independent powers. With a Hann window, powers at frequencies that are 0, 1 or 2 steps
-# apart have a correlation of 1, 4/9 or 1/36.
+# Effective share of the powers that are independent of one another. With a Hann window, powers at frequencies
+# that are 0, 1 or 2 steps apart have a correlation of 1, 4/9 or 1/36.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
 _QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
 # Lowest frequency that is used, in cycles per field. Lower frequencies contain what levelling left of a bow.
@@ -50,8 +50,8 @@ class LinePeriod:
         share: share of the power of the line means (the mean height of each line) that lies in the peak.
         p: probability that a surface with a smooth spectrum shows such a peak at any frequency by chance.
         amplitude_um: amplitude of the wave with this period, as a root mean square over the surfaces.
-        coherence: agreement between the surfaces in the phase of this wave. Each surface contributes a
-            complex number of modulus 1 that has its phase, and the coherence is the modulus of the mean of
+        coherence: agreement between the surfaces in the phase of this wave. For each surface, the phase of
+            the wave is written as a complex number of modulus 1. The coherence is the modulus of the mean of
             these numbers. It is 1 if all surfaces have the same phase, and about 1 / √F if the phases of F
             surfaces are independent.
     """
@@ -107,7 +107,7 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
     # Frequencies beyond the Nyquist frequency of the axes exist only in the four corners of the spectrum.
-    # They would favour the directions of the corners.
+    # They would favour the diagonal directions.
     used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
     power, angle = power[used], np.arctan2(fy, fx)[used]
     total = power.sum()
@@ -121,8 +121,8 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
     """Find the strongest period that the line means (the mean height of each line) of all scans have in
     common. Return None if a scan has fewer than 64 lines.
 
-    If the line means are random, the mean periodogram of F scans, divided by the smooth spectrum from which
-    it scatters, is distributed as Gamma(F) / F. At each frequency, the smooth spectrum is estimated by a
+    If the line means are random with a smooth spectrum, the mean periodogram of F scans, divided by this
+    spectrum, is distributed as Gamma(F) / F. At each frequency, the smooth spectrum is estimated by a
     parabola fitted to the logarithms of the powers at the surrounding frequencies. The p-value is averaged
     over the uncertainty of this estimate. The p-value of the largest peak is corrected for the number of
     frequencies that were searched (Bonferroni).
@@ -138,7 +138,7 @@ def line_period(means_um: Sequence[Array], pitch_um: float) -> LinePeriod | None
     spectra = np.stack(
         [np.abs(np.fft.rfft(taper * (own[:count] - own[:count].mean()))) ** 2 for own in means_um]
     )
-    # Scans differ in roughness, so the power of each is divided by its own mean level.
+    # Scans differ in roughness, so the power spectrum of each is divided by its own median.
     floor = np.finfo(float).tiny
     spectra = (spectra / np.maximum(np.median(spectra, axis=1, keepdims=True), floor))[:, _FIRST:]
     power = np.maximum(spectra.mean(axis=0), floor)
