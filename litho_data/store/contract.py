@@ -185,8 +185,8 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array[Any]]:
 
 
 def require_own_pixels(root: zarr.Group, path: Path, shape: Sequence[int], pitch_um: float) -> None:
-    """Refuse a copied store whose coordinates show that other rows or columns than the last ones were
-    removed, or that their order was changed.
+    """Refuse a copied store if its coordinates show that rows or columns were reordered, or that rows or
+    columns other than the last ones were removed.
 
     Positions in the store, such as the transforms of the scans, are relative to the first pixel, so a copy
     may leave out only the last rows and columns.

@@ -18,8 +18,8 @@ class PrintedScan:
     """One printed field: the layout sent to the printer and the height measured on the layout's grid.
 
     Args:
-        id: name of the scan. ``print_id`` names the block of fields with which it was printed, and ``order``
-            is its position in the writing order.
+        id: name of the scan. ``print_id`` names the print, i.e. the block of fields to which this field
+            belongs, and ``order`` is the position of the field in the writing order.
         mask_level: level of each pixel of the layout (the layout is also called mask), shape (ny, nx); uint8,
             or uint16 if there are more than 256 levels.
         height_um: measured height of each pixel in µm, shape (ny, nx), float32; NaN where not measured.

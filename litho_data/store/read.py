@@ -65,7 +65,7 @@ def open_store(path: str | Path) -> Store:
     root = open_root(path)
     require_complete(Path(path))
     store = Store(root, Path(path))
-    # These properties are read only because they check the hash and the manifest.
+    # Reading these properties checks the hash and the manifest. Their values are not used here.
     _ = store.sha256, store.manifest
     return store
 
@@ -195,8 +195,8 @@ class Store:
 
     @cached_property
     def locked_ids(self) -> list[str]:
-        """Return the ids of the scans in the lock box, which are set aside for the final test. They are
-        always the scans of the same sixth of the printed fields.
+        """Return the ids of the scans in the lock box, which are set aside for the final test. The lock box
+        consists of all scans of a sixth of the printed fields; it is always the same for the same dataset.
         """
         fields = [
             field_sha256(
@@ -207,8 +207,8 @@ class Store:
         return lock_box(self.ids, self._print_ids, fields)
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Return the hashes of the scans' raw files, keyed by scan id. They do not depend on levelling or
-        registration.
+        """Return the hashes of the scans' raw files, keyed by scan id. The hashes do not depend on levelling
+        or registration.
 
         A scan is omitted if the store does not list its file. The hashes of layout files are left out,
         because a layout may be printed more than once.
@@ -232,7 +232,8 @@ class Store:
 
     def recorded_pitches_um(self) -> dict[str, YX]:
         """Return the pitch along y and x, in µm, that the reader recorded for each scan, including reference
-        scans. It is not corrected by a calibration; that of ``scan_frame_pitch_um`` is.
+        scans. Unlike the pitch that ``scan_frame_pitch_um`` returns, this pitch is not corrected by a
+        calibration.
         """
         pitches = {}
         for row in self.manifest.get("files", []):
