@@ -21,8 +21,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
     Args:
         path: where the result will be.
-        holds: paths in the folder, such as ``layouts/*.tif``, or patterns of paths, of all files that such a
-            result may contain. A folder that is named without its files may contain anything.
+        holds: paths, or patterns of paths such as ``layouts/*.tif``, of all files that such a result may
+            contain, relative to the folder. If a path names a subfolder, this subfolder may contain anything.
 
     Raises:
         InputError: the path is the current folder, a file, or a folder that contains anything else; the
@@ -38,7 +38,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
     _refuse_a_file(folder)
     patterns = [pattern.split("/") for pattern in holds]
     paths = sorted(path.relative_to(folder) for path in folder.rglob("*"))
-    # Only as many parts are compared as the shorter path has, so the folders of a file fit its pattern.
+    # A path and a pattern are compared only up to the length of the shorter one. The parent folders of a file
+    # therefore match the file's pattern too.
     strangers = (one for one in paths if not any(all(map(fnmatch, one.parts, held)) for held in patterns))
     if stranger := next(strangers, None):
         raise InputError(
@@ -66,12 +67,13 @@ def first_difference(then: Facts, now: Facts, *above: str) -> str:
     """Return the first setting of ``now`` that is missing in ``then`` or has another value there; return ""
     if there is none.
 
-    A part of a record, such as the dataset, may hold fields that ``now`` does not state. If the value of such
-    a field is itself a mapping, such as the values that were set by name, it must hold nothing else.
+    The older record, and the mappings directly in it, such as the dataset, may contain keys that ``now``
+    lacks. Mappings nested more deeply, such as the values that were set by name, may not contain such keys.
 
     Args:
         then, now: the older and the requested settings.
-        above: keys under which both are found in the whole record.
+        above: keys, from the outermost to the innermost, under which ``then`` and ``now`` are found in the
+            whole record.
     """
     path = "".join(f"{key}." for key in above)
     for name, after in now.items():

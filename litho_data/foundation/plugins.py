@@ -21,8 +21,8 @@ from litho_data.foundation.hashes import file_sha256, record_sha256, source_sha2
 SOURCES = ("litho_data", "litho_models", "litho_design")
 _PACKAGES = [Path(__file__).parents[2] / name for name in SOURCES]
 GROUP, OPTION = "litholoop.plugins", "--plugin"
-# Maps the name of each loaded plug-in to its version, or the file of the plug-in to the beginning of the
-# file's hash.
+# Maps the name of each installed plug-in to its version, and the path of each plug-in file to the beginning
+# of the file's hash.
 _LOADED: dict[str, str] = {}
 
 
@@ -55,8 +55,8 @@ def plugin_versions() -> dict[str, str]:
 
 
 def foreign_sha256(function: Callable[..., Any]) -> str:
-    """Return the hash of the source that defines a function or a class, which is a file, a package or the
-    cell of a notebook. The result is empty for the code of this project and for compiled code.
+    """Return the hash of the source code that defines a function or a class: a file, a package or a cell of a
+    notebook. The result is empty for the code of this project and for compiled code.
     """
     code = inspect.unwrap(function.func if isinstance(function, partial) else function)
     named = inspect.isroutine(code) or inspect.isclass(code)
