@@ -84,7 +84,7 @@ def takes(run: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> 
 
 
 def keyword(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
-    """Make a parameter of a command that typer turns into an option."""
+    """Make a parameter that typer turns into an option of a command."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 

@@ -15,8 +15,8 @@ T = TypeVar("T")
 # Shortest elapsed time from which the remaining time is estimated, and shortest remaining time that is
 # reported, in seconds.
 _TELLING_S, _MINUTE_S = 3.0, 60.0
-# A command that has printed nothing for this time says that it is at work. Together with the time that a
-# command takes to start, this is five seconds.
+# A command that has printed nothing for this time, in seconds, reports that it is at work. Together with the
+# time that the command takes to start, users wait for five seconds.
 _SILENT_S = 3.0
 _silent = threading.Event()
 
@@ -57,7 +57,7 @@ def progress(
     """Iterate over items, and show a progress bar on stderr if stderr is a terminal.
 
     If the remaining items will take more than a minute, one line states the remaining time as soon as it can
-    be estimated. The time of the first items includes start-up, so it does not count towards the estimate
+    be estimated. The first ``at_once`` items include start-up, so their time is left out of the estimate
     unless it exceeds a minute.
 
     Args:

@@ -35,7 +35,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of ``verify``. ``findings`` report damage or changes; ``notes`` are remarks that do not."""
+    """The result of ``verify``. ``findings`` report damage or changes; ``notes`` are other remarks."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]

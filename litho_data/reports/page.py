@@ -33,7 +33,7 @@ Words = Mapping[str, Sequence[str]]
 _SPELT = table_beside(__file__, "words.toml")
 # Columns whose cells are names of models; each cell is shown in the colour of its model.
 _OF_MODELS = {"model", "designed with", "arm", "judge"}
-# Columns whose cells are keys; the page spells them out as it does the keys of columns.
+# Columns whose cells are keys. The page spells out these keys in the same way as the keys of columns.
 _OF_KEYS = {"name", "figure", "covariate", "number", "parameter", "share of the squared error"}
 
 
@@ -43,7 +43,8 @@ class Page:
     Args:
         title: heading of the page: what was done, and with which data or model.
         lead: one line below the title.
-        run: facts about the run that made the result; by default those of the run that writes the page.
+        run: facts about the run that made the result; by default the facts about the run that writes the
+            page.
         facts: further facts that identify the result, such as hashes and seeds, keyed by name.
         words: titles and meanings of table columns, keyed by the column's key, or a TOML file that contains
             them. The title of a column that is not listed is made from its key.

@@ -36,8 +36,8 @@ class Known:
 
 @dataclass(frozen=True)
 class Away:
-    """A wrapper with which a function of this process runs in another process, with the working directory of
-    this process. Results of the function record the command line of this process.
+    """A wrapper that lets another process run a function of this process in the working directory of this
+    process. Results of the function record the command line of this process.
 
     ``plugins`` are plug-in files that the other process loads first. ``software`` states the versions and the
     commit that a Dask worker must also have; it is None for local processes.

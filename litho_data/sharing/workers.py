@@ -39,8 +39,8 @@ _TRIES = 3
 
 class Pool(NamedTuple):
     """Running workers, to which ``submit`` gives a job. ``present`` returns the current number of workers. An
-    error of a type in ``lost`` means that a job was lost because its worker died; ``fate`` is the phrase with
-    which messages say what happened to the worker.
+    error of a type in ``lost`` means that a job was lost because its worker died; ``fate`` is the phrase that
+    messages use for what happened to this worker.
 
     ``tries`` is the maximum number of times that a job is started; ``restart`` is called before lost jobs are
     started again.
