@@ -64,7 +64,7 @@ def simulate(
         cause: an effect that you define yourself and that is not a knob. The truth does not record it.
         noise: ``default``, ``off``, or your own standard deviations.
         microscope: ``default`` (scans with a margin and small affine errors), ``aligned`` (scans with a
-            margin only), or your own microscope.
+            margin but without affine errors), or your own microscope.
         printer: your own printer; None stands for the default printer.
         fields_per_print: number of fields in each print.
         write_field_um: side, in µm, of the write field that all fields of a print share. With None, each
@@ -73,7 +73,7 @@ def simulate(
         jobs: your own layouts, which are printed in place of random ones. Arguments about random layouts are
             then ignored.
         name: name of the dataset, which is written to the card.
-        plan_of: hash of the dataset from which the layouts were planned, which is written to the card.
+        plan_of: hash of the dataset with which the layouts were planned. It is written to the card.
         print_pattern: regular expression that finds the print of a scan in the scan's id, which is written to
             the card.
 
@@ -160,7 +160,7 @@ def simulate(
 
 def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
     """Write the file of one scan in the format that the microscope's settings name. An id may contain dots,
-    so the ending is appended to the id.
+    so the suffix is appended to the whole id.
     """
     if microscope.files == "gsf":
         pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
