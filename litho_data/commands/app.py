@@ -204,7 +204,7 @@ def _not_allowed(error: Exception) -> InputError | None:
         return InputError(
             "input", got="parts nested too deeply", wanted="a file with fewer levels of nesting"
         )
-    if type(error).__name__.endswith("LinAlgError"):  # that of NumPy or of PyTorch, which may not be loaded
+    if type(error).__name__.endswith("LinAlgError"):  # of NumPy or PyTorch; PyTorch may not be loaded
         return InputError(
             "numbers to fit", got=error, wanted="data that determine them, such as layouts of several levels"
         )
