@@ -38,7 +38,7 @@ Loop = Callable[[Path, Path], Answer]
 
 
 def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
-    """Draw the trials of a board.
+    """Choose at random which causes each trial of a board contains.
 
     Raises:
         InputError: no trials can be drawn with these settings, or the fields have a size that cannot be
@@ -59,8 +59,8 @@ def new_board(
     n_scans: int = 12,
     size_px: int = 256,
 ) -> Draws:
-    """Make the dataset stores of a board in ``out/stores`` and write their causes to ``out/hidden``. If the
-    call is interrupted, repeating it resumes the work.
+    """Make the dataset stores of a board in ``out/stores`` and write the hidden causes of each store to
+    ``out/hidden``. If the call is interrupted, repeating it resumes the work.
 
     Args:
         out: folder of the board.
@@ -142,8 +142,8 @@ def judge_board(
 
 
 def command_loop(command: str) -> Loop:
-    """Turn a shell command into a loop function. The command receives the paths STORE and FOLDER as its last
-    two arguments and writes its answer to FOLDER/answer.json.
+    """Turn a shell command into a loop function. The last two arguments of the command are the path of a
+    store and the path FOLDER of an empty folder. The command writes its answer to FOLDER/answer.json.
 
     Raises:
         InputError: the command cannot be run. The returned function raises the same error if the exit code of
@@ -196,8 +196,8 @@ def cpu_s() -> float:
 
 def trial_line(trial: Trial) -> str:
     """Describe a judged trial in one line. The line states the outcome of each planted cause, the causes that
-    the loop named wrongly and the error of the corrected model. For a failed trial, it also states the reason
-    for the failure.
+    the loop named wrongly, and the error of the corrected model as a multiple of the error of the true
+    models. For a failed trial, it also states the reason for the failure.
     """
     causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
     false = [f"false name: {name}" for name in trial.false_names]

@@ -1,5 +1,6 @@
-"""Draw at random which causes are planted in the trials of a board. They are drawn from all causes that the
-virtual fab can simulate.
+"""Choose at random which causes of error the virtual fab adds to the prints and scans of each trial of a
+board. The causes are knobs of the virtual fab (all but a few, which are listed below) and the forms in
+``other_forms``.
 
 One seed determines all draws. They are made before the loop runs on any trial.
 
@@ -20,16 +21,15 @@ from litho_models.boards.other_forms import FORMS, Rng
 from litho_models.boards.records import Board, CauseDraw, Draw, Kind
 
 SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-# Smallest and largest drawn size of a cause. The strength that gives the drawn size is found on four scans.
-# Measured on all scans, the size may be 13 % smaller. On the board ``singles``, the smallest size is chosen
-# so that a cause exceeds the size from which causes count even then.
+# Smallest and largest size (rms, nm) that is drawn for a cause. The strength for the drawn size is found on
+# four scans. Measured on all scans, the size may be 13 % smaller. On the board ``singles``, even a cause of
+# the smallest size then still exceeds ``COUNTS_FROM_RMS_NM``.
 SINGLES_RMS_NM = (10.0, 25.0)
 MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
 MIXTURES_RMS_NM = (8.0, 25.0)
-# Number of trials of each kind on the board ``mixtures``: LINEAR have a linear slope loss whose strength
-# differs by batch; S_SHAPED have an S-shaped scanner axis in half of the scans; GROUPED have another cause
-# whose strength differs by batch or field; BEYOND_PHYSICS have a printer that the Physics model cannot
-# imitate.
+# Numbers of trials on the board ``mixtures`` that contain the following. LINEAR: a linear slope loss whose
+# strength differs by batch. S_SHAPED: an S-shaped scanner axis in half of the scans. GROUPED: another cause
+# whose strength differs by batch or field. BEYOND_PHYSICS: a printer that the Physics model cannot imitate.
 LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
 BASE_RMS_NM = (5.0, 15.0)
 
@@ -37,8 +37,8 @@ BASE_RMS_NM = (5.0, 15.0)
 # of the default noise. Long-range proximity leaves a residual of less than 10 nm after the base model is
 # refitted.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
-# Some of these causes differ randomly from scan to scan, and the others do not change the height map. A
-# single model of all scans therefore cannot represent them.
+# A single model of all scans cannot represent these causes: they differ randomly from scan to scan or, like
+# quantisation, only round the heights.
 _OF_SINGLE_SCANS = {
     "quantisation",
     "registration-residual",
@@ -64,12 +64,13 @@ _PRINTER_RANGES = {
 
 
 def draw_board(board: Board, seed: int) -> list[Draw]:
-    """Draw the trials of a board. They are in random order, and each has its own printer parameters.
+    """Choose at random the causes of each trial of a board. The trials are in random order, and each has its
+    own printer parameters.
 
     Each knob (setting of the virtual fab) and each form (law that the loop's catalogue does not contain) is
-    used once before any of them is used again. The kind of a trial is ``alias`` if its cause is a knob whose
-    effect the base model can imitate or the per-scan terms can absorb. With any other knob, the kind is
-    ``in-form``. The sizes of the causes are drawn log-uniformly.
+    used once before any of them is used again. On the board ``singles``, the kind of a trial is ``alias`` if
+    its cause is a knob whose effect the base model can imitate or the per-scan terms can absorb. With any
+    other knob, the kind is ``in-form``. The sizes of the causes are drawn log-uniformly.
 
     Raises:
         InputError: the seed is negative.
@@ -127,8 +128,8 @@ def _draw_singles(rng: Rng) -> list[Draw]:
 def _draw_mixtures(rng: Rng) -> list[Draw]:
     """Draw the trials of the board ``mixtures``.
 
-    About half of the causes have a form that is in the loop's catalogue. No name counts as the right answer
-    for two causes of the same trial.
+    About half of the causes have a form that is in the loop's catalogue. No two causes of a trial share a
+    name that counts as the right answer.
     """
     in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
     other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
@@ -165,7 +166,8 @@ def _draw_mixtures(rng: Rng) -> list[Draw]:
 
 def _in_groups(cause: CauseDraw, at: int, rng: Rng) -> CauseDraw:
     """For the first trials of the board ``mixtures``, make the strength of a cause differ by batch or by
-    field. ``at`` is the number of the trial. In later trials, the cause stays unchanged.
+    field. ``at`` is the index of the trial before the trials are shuffled. In all other trials, the cause is
+    left unchanged.
     """
     if at < LINEAR:
         return _by_batch(cause, rng)
@@ -205,7 +207,8 @@ def _deal(names: Sequence[str], rng: Rng) -> Iterator[str]:
 
 def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
     """Draw causes from ``deck`` and add them to those in ``started`` until there are ``size`` causes. Skip a
-    cause if one of its right names is in ``refused`` or belongs to an earlier cause.
+    cause if a name that counts as its right answer is in ``refused``, or also counts for a cause chosen
+    before.
     """
     names = list(started)
     while len(names) < size:

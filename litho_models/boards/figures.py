@@ -1,5 +1,5 @@
-"""Make the scoreboard of a board: all drawn trials with their outcomes, and the headline results computed
-from them.
+"""Make the scoreboard of a board, which contains all trials with their outcomes, and compute the headline
+results from it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SEEN: tuple[Verdict, ...] = (*_LAWFUL, "noticed")
 
 class Figure(NamedTuple):
     """A headline result in words. ``wanted`` is the target that was set before the board was run; it is empty
-    if there is none.
+    if no target was set.
     """
 
     what: str

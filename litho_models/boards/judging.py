@@ -32,8 +32,8 @@ _OF_LINES, _LINES = "periodic-lines", "scan-line-stripes"
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Return the findings without the effects that are part of the fab's default noise in every scan, such as
-    datum, bow or line offsets.
+    """Return the findings without those about effects of single scans in the loop's catalogue, such as datum,
+    bow or line offsets. The default noise of the virtual fab adds such effects to every scan.
     """
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
@@ -44,7 +44,8 @@ def judged(
     """Judge one trial.
 
     Args:
-        draw: the trial as drawn; ``planted``: causes at their strengths, as returned by `plant`.
+        draw: the trial as drawn; ``planted``: the planted causes with their strengths, as returned by
+            `plant`.
         answer: answer of the loop; ``used_s``: CPU time that the loop used, s.
         jobs: the printed fields; ``store``: dataset store that the loop received.
     """
@@ -109,8 +110,8 @@ def judge(
 
 
 def false_names(planted: Sequence[Planted], answer: Answer) -> list[str]:
-    """Return the findings that are wrong, which are those whose set of names contains no planted cause. The
-    form that changes the printer (``base`` of the draw) also counts as a planted cause.
+    """Return the wrong findings. A finding that names causes is wrong if it is the right answer for none of
+    the planted causes. These include the form that changes the printer (``base`` of the draw).
     """
     return [
         " | ".join(named.names)
@@ -206,7 +207,7 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
-    # If the width of the spot is fitted in the base model, this value is the standard deviation of the
+    # If the base model fits the width of the spot, its value ``spot_um`` is the standard deviation of the
     # squared spot.
     true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
 
@@ -219,8 +220,8 @@ def bias_of(draw: Draw, answer: Answer) -> tuple[float, float] | None:
 def broken(draw: Draw, error: Exception, planted: list[Planted], places: Mapping[Path, str]) -> Trial:
     """Make the record of a trial that ended with an exception, and print the exception.
 
-    The reason is published. Local paths in it are therefore replaced by the names that ``places`` gives for
-    them.
+    The text of the exception is published. Local paths in this text are therefore replaced by names;
+    ``places`` contains the name for each path.
     """
     traceback.print_exception(error)
     reason = f"{type(error).__name__}: {error}"

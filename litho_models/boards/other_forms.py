@@ -38,8 +38,8 @@ _MOST_SCANS = 256
 
 @dataclass(frozen=True)
 class Form:
-    """One functional form of a cause. Its function ``draw`` draws the random values of the form and returns
-    its law.
+    """One functional form of a cause. Its function ``draw`` draws the random values of the form and returns a
+    ``Law``, i.e. a function that applies the form.
 
     Attributes:
         limit: largest allowed strength, in ``unit``. At strength 0 the form has no effect.
@@ -238,8 +238,8 @@ def _diagonal_slope_loss(rng: Rng) -> Law:
 @_form("lee-side-loss", "surface", "µm", 2.0, names=("slope-thinning", "line-shortening"))
 def _lee_side_loss(rng: Rng) -> Law:
     """Height lost per slope, only on flanks that fall along one direction."""
-    # This loss is equivalent to half of it on all flanks plus a displacement of the print. Registration
-    # removes the displacement.
+    # This loss is the sum of a loss of half the strength on all flanks, rising and falling, and a
+    # displacement of the print. Registration removes the displacement.
     direction = rng.uniform(0, 2 * np.pi)
     return lambda surface, strength, canvas, job: (
         surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)

@@ -14,7 +14,7 @@ def own_loop(
     store: Path, folder: Path, *, base: str, report: Callable[[str], None] = lambda message: None
 ) -> Answer:
     """Run the closed loop of this package on a store and return its answer. The results of the loop are
-    written to ``folder/loop``; ``base`` is the model that it corrects.
+    written to ``folder/loop``; ``base`` is the model that the loop corrects.
     """
     return answer_of(close_loop(store, folder / "loop", base=base, report=report))
 

@@ -1,8 +1,8 @@
 """Find the strengths of the causes of a trial, and simulate its prints and scans with these causes.
 
 The size of a cause is the rms of the residual that remains after the base model is refitted to prints with
-this cause. To find it, the Physics model is fitted to noise-free scans that contain the cause. (Without
-causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine
+this cause. To measure this size, the Physics model is fitted to noise-free scans that contain the cause.
+(Without causes, the Physics model represents the virtual fab exactly.) Datum, gain, tilt, bow and an affine
 registration error are fitted to each scan at the same time.
 """
 
@@ -71,7 +71,7 @@ def fab_of(
 
     Args:
         draw: the trial as drawn.
-        planted: causes at their strengths, as returned by `plant`.
+        planted: the planted causes with their strengths, as returned by `plant`.
         noise, microscope: if given, they replace the default noise and the default microscope of the virtual
             fab.
         without: names of causes to leave out.

@@ -117,8 +117,8 @@ class Outcome(Record):
 
 
 class TrialErrors(Record):
-    """Mean absolute errors, nm, of the base model, of the corrected model and of the true models. All are
-    computed on held-out scans, with one term (the datum) fitted to each scan.
+    """Mean absolute errors, nm, of the base model, of the corrected model and of the true models. All three
+    errors are computed on held-out scans, with one term (the datum) fitted to each scan.
 
     ``floor_nm``, the error of the true models, is None for measured prints, whose true models are unknown.
     """
@@ -186,7 +186,8 @@ class Trial(Result, extra="ignore"):
     failed.
 
     Attributes:
-        false_names: wrong findings. Each is a set of names that contains no planted cause.
+        false_names: the wrong findings, each given by its names. None of these names is the right answer for
+            a planted cause.
         bias: median relative error of the base model's values, without and with the findings; None if the
             printer or the base model is not a Physics model.
         dataset_cpu_s: CPU time that the loop used, s. In the published boards, it includes the time to build
