@@ -176,8 +176,8 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 
 
 def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
-    """Draw a quarter of all quadrants at random, and return these quadrants as the held-out crops. The paper
-    draws 24 of 96 quadrants in this way.
+    """Choose a quarter of all quadrants at random, and return these quadrants as the held-out crops. The
+    paper chooses 24 of 96 quadrants in this way.
 
     The training set and the held-out set both contain quadrants of the same scans, so errors are
     underestimated. Use this split only for comparison with the paper.
@@ -190,8 +190,8 @@ def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
 
 
 def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose the ids of the training scans that are set aside to choose the best round of a training. There
-    are ``count`` such scans, but at most a quarter of all scans.
+    """Return the ids of the training scans that are set aside for selecting the best round of a training.
+    ``count`` scans are chosen, but at most a quarter of the training scans in ``ids``.
     """
     require_unique(ids)
     shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
