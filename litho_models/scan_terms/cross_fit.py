@@ -1,4 +1,4 @@
-"""Subtract from a scan the terms that it adds to the height, after fitting them to pixels that are not
+"""Subtract from a scan its per-scan terms, such as datum and bow, which are fitted to pixels that are not
 scored.
 
 For example, the datum and the bow of a scan contain no information about the printer, so the error of a model

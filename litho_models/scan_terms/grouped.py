@@ -18,8 +18,8 @@ from litho_data.store import PrintedScan
 
 Labels = tuple[str, ...]
 ALL = "all"
-# Smallest number of scans in a group for which their common part can be distinguished from the parts of
-# single scans.
+# Smallest number of scans in a group. If a group had only one scan, an effect of the group could not be
+# distinguished from an effect of this scan alone.
 FEWEST_IN_GROUP = 2
 _STATED = ("tip", "direction", "turned_deg")
 _ORDER, _CHARACTER = "order", "character"
@@ -60,9 +60,9 @@ def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[st
     scan and may state further groups. They are also derived from the scan ids: each position at which the
     character varies gives a grouping by this character. With ``by_order``, groupings are also derived from
     the printing order. Such a grouping has two groups: the scans before and the scans after a position at
-    which something may have changed. Every other grouping must have at least two labels, and at least half of
-    its labels must have two or more scans. If two groupings divide the scans in the same way, only the first
-    is used.
+    which something may have changed. A grouping that is not derived from the printing order must have at
+    least two labels (except ``all``), and at least half of its labels must have two or more scans. If two
+    groupings divide the scans in the same way, only the first is used.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -203,9 +203,10 @@ class Products:
         """Fit the given blocks to all scans, and project them out of the residual and of the other columns.
         Return the new products.
 
-        The columns of the blocks become zero. A later fit of other columns gives the same result as a joint
-        fit with the blocks if its strengths are the same in all scans. If its strengths differ by group, this
-        holds only if the part that was projected out is the same in all groups.
+        The columns of the blocks become zero. If the strengths of other columns are the same in all scans, a
+        later fit of these columns gives the same result as a joint fit with the blocks. If these strengths
+        differ by group, the two results agree only if the part that was projected out is the same in all
+        groups.
         """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
@@ -229,8 +230,8 @@ class _Expanded:
     Attributes:
         columns: indices of the columns of all blocks.
         rows: for each block and label, the row numbers of its strengths.
-        alike: sets of scans whose labels agree in all groupings. Each set is given as a pair: the indices of
-            its scans, and the row numbers of their strengths in the order of ``columns``.
+        alike: sets of scans whose labels agree in the groupings of all blocks. Each set is given as a pair:
+            the indices of its scans, and the row numbers of their strengths in the order of ``columns``.
     """
 
     def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):

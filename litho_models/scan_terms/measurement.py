@@ -1,5 +1,5 @@
-"""The measurement model: changes of the measured height map that microscope, registration and levelling cause
-and that several scans share.
+"""The measurement model. It describes the changes of the measured height map that the microscope, the
+registration and the levelling cause in the same way in several scans.
 
 In a scan, the image of the print is displaced by the uneven motion of the scanner, multiplied by a gain,
 levelled, and added to a background. The changes that all scans share, or that all scans of a group share, are
@@ -49,8 +49,8 @@ class SharedPart(Record):
         by: name of the grouping whose groups have separate coefficients.
         coefficients: coefficients for each label of the grouping, in µm; the coefficient of a gain is
             dimensionless. A part without coefficients changes nothing.
-        shrinking: weight of the prior that the coefficients are zero, which was used in their fit. It is
-            stated as a number of scans.
+        shrinking: weight that the fit gave to the prior that the coefficients are zero, stated as a number of
+            scans.
     """
 
     what: Shared
@@ -71,8 +71,8 @@ class SharedPart(Record):
         return self.coefficients.get(label_of(scan, self.by), [])
 
     def map_um(self, scan: PrintedScan) -> FloatMap:
-        """Evaluate the polynomials of this part, a background or a displacement, on the field of the scan,
-        and return their sum, µm. A background has no constant term. The result has shape (ny, nx).
+        """Return this part, which must be a background or a displacement, as a map over the field of the
+        scan, µm, of shape (ny, nx). A background has no constant term.
         """
         own = self.of(scan)
         return np.tensordot(own, polynomials(scan.shape, self.degree)[-len(own) :], axes=1)
@@ -109,7 +109,8 @@ class MeasurementModel(Record):
         """Return the map that the scan is expected to show, given the predicted height of the print. Both
         maps have shape (ny, nx) and are in µm.
 
-        If the field of the scan is larger or smaller than those fields, only the levelling is applied.
+        If the field of the scan differs in size from the fields of the training scans, only the levelling is
+        applied.
         """
         parts = self._parts(scan)
         seen = displaced(scan, prediction_um, parts)
@@ -119,8 +120,8 @@ class MeasurementModel(Record):
         return levelled(seen, scan.usable, self.levelling) + self.background_um(scan)
 
     def freed(self, scan: PrintedScan, prediction_um: np.ndarray) -> PrintedScan:
-        """Subtract from the scan the changes that this model makes to the predicted height of the print,
-        which is a map of shape (ny, nx) in µm.
+        """Return the scan after subtracting the changes that this model makes to the predicted height.
+        ``prediction_um`` is the predicted height of the print, µm, of shape (ny, nx).
         """
         added = self.expected_um(scan, prediction_um) - prediction_um
         return replace(scan, height_um=(scan.height_um - added).astype(np.float32))

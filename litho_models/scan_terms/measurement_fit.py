@@ -52,7 +52,8 @@ _SHRINKING = (0.3, 1.0, 3.0)
 # of the decrease, and by more than the fraction ``_LEAST_SHARE`` of the squared error.
 _LEAST_Z, _LEAST_SHARE = 0.5, 0.003
 _SAMPLED_PX = 16384
-# Displacements are linearised in each round. The second round linearises them at the displaced print.
+# Each round linearises the displacements. The second round linearises them at the displacements that the
+# first round has found.
 _ROUNDS = 2
 _INNER_FOLDS = 5
 
@@ -70,9 +71,10 @@ def learn_measurement(
 ) -> MeasurementModel:
     """Learn the measurement model of the given scans, relative to the predicted heights of their prints.
 
-    Parts are added one at a time as long as they significantly lower the cross-validated error. If the fields
-    of the scans differ in size, only the scans with the most frequent field size are used. For electron
-    micrographs of films, the returned model has no parts.
+    Parts are added one at a time, as long as each part lowers the cross-validated squared error by more than
+    0.3 % and by more than half the standard error of this decrease. If the fields of the scans differ in
+    size, only the scans with the most frequent field size are used. For electron micrographs of films, the
+    returned model has no parts.
 
     Args:
         scans: the scans from which the model is learned.
@@ -206,7 +208,7 @@ def _best_levelling(pairs: Sequence[_Pair]) -> Levelling:
             seen = expected - least_squares(surface, expected) @ surface
             rests[levelling].append(least_squares(shapes, height - seen))
     # Legendre polynomials are nearly orthogonal over a field, so the squared error that a levelling leaves is
-    # a weighted sum of the variances of their coefficients.
+    # a weighted sum of the variances of the polynomial coefficients over the scans.
     weights = np.mean(polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
     return min(LEVELLED, key=lambda one: float((np.var(rests[one], axis=0) * weights)[1:].sum()))
 

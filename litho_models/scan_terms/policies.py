@@ -49,8 +49,8 @@ def usual_policy(film: bool) -> Policy:
 
 
 def usual_background(film: bool) -> BackgroundUse:
-    """Return which background is added to predictions by default: that of the training scans, or none for
-    films.
+    """Return which background is added to predictions by default: the background of the training scans, or
+    none for films.
     """
     return "none" if film else "training"
 

@@ -82,8 +82,9 @@ class ScanTerm:
         unit: unit of the coefficients: ``µm`` for a height, ``px`` for a displacement, or ``1`` for a
             dimensionless number.
         labels: descriptions of the k maps, one per map. A term of line offsets has a single description.
-        maps: function that returns the smooth maps at given pixels, of shape (k, n). All maps except the
-            datum have zero mean over the scan. None for line offsets.
+        maps: function that returns the smooth maps at given pixels, of shape (k, n). The built-in maps have
+            zero mean over the scan, except those of the datum and of registration errors. None for line
+            offsets.
         lines: for line offsets, function ``lines(shape, scan_line)`` that returns the line index of each
             pixel, given the shape of the scan and the index of the scan line of each pixel (or None).
         frame: for line offsets, a description of the lines that the offsets follow, such as "the scan lines".
