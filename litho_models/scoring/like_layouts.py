@@ -18,7 +18,7 @@ from litho_data.store import PrintedScan
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
 # Number of pixels (partners) with which each pixel is compared. With more partners, some partners would be
-# less similar. With fewer partners, the mean of the products of two differences would be noisier.
+# less similar. With fewer partners, the estimate in ``noise_squared`` would be noisier.
 PARTNERS = 4
 _PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
 

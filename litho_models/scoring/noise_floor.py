@@ -26,7 +26,7 @@ NOISE_FILE = "noise.json"
 
 class PolicyFloor(Record):
     """The noise floor for one nuisance policy (set of per-scan terms), nm, with 95 % confidence intervals
-    over prints.
+    from resampling prints.
 
     ``k`` is the number of terms that are fitted to each scan; with line offsets, it is their effective
     number. The intervals are None if there are fewer than six prints.
@@ -47,8 +47,7 @@ class NoiseFloor(Record):
     ``mae_nm`` and ``rmse_nm`` are the floors of the mean absolute and the root-mean-square error for the
     policy ``offset``, with which an offset is fitted to each scan. ``by_policy`` contains the floors for each
     policy. It is empty in older result files, or if only the floor for the policy ``offset`` is known. The
-    kinds ``lower-bound`` and ``literature`` occur in older files; ``lower-bound`` is also used by closed
-    loops on fewer than three scans.
+    kinds ``lower-bound`` and ``literature`` occur only in older files.
     """
 
     mae_nm: float | None
@@ -120,8 +119,8 @@ def estimated_floor(
         model: name of the model, which is stated in the field ``source`` of the result.
         scans: held-out scans.
         maps_um: height map that the model predicts for each scan, µm, of shape (ny, nx).
-        blocks: blocks of pixels that determine to which pixels terms are fitted and which pixels are scored.
-            The floor is comparable only with errors that were computed with the same blocks.
+        blocks: division of the pixels into those to which terms are fitted and those that are scored. The
+            floor is comparable only with errors that were computed with the same blocks.
         seed: decides which pixels are drawn.
     """
     return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
@@ -133,8 +132,8 @@ def freed_by_policy(
     blocks: Blocks | None = None,
     policies: Iterable[Policy] = tuple(POLICIES),
 ) -> dict[Policy, list[CrossFit]]:
-    """Return the residuals of each scan after the terms of each policy are removed. ``maps_um`` contains the
-    predicted map of each scan, µm, of shape (ny, nx).
+    """For each policy (set of per-scan terms), fit its terms to each scan, subtract them, and return the
+    residuals. ``maps_um`` contains the predicted map of each scan, µm, of shape (ny, nx).
     """
     return {
         policy: [
@@ -156,7 +155,7 @@ def floor_of_residuals(
     On a random sample of pixels, ``LikePixels`` estimates which fraction of the squared error is noise, i.e.
     not common to pixels with similar surroundings. The floor is the error over all scored pixels times the
     square root of this fraction. For the mean absolute error, this assumes that noise and residual have the
-    same ratio of mean absolute value to standard deviation. The noise need not be Gaussian for this, because
+    same ratio of mean absolute value to standard deviation. This holds for noise of any distribution if
     nearly all of the residual is noise. If half of the squared error came from a misfit with another
     distribution (a Laplace distribution beside Gaussian noise, or the reverse), the floor would be wrong by
     up to 6 %.

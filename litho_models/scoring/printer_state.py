@@ -90,8 +90,8 @@ def scan_figures(
 def baseline_of(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, held_out: bool
 ) -> list[dict[str, Any]]:
-    """Return the ``ScanFigures`` of the scans on which a model was trained, as entries of its card. The list
-    is empty if the scans are too small.
+    """Return the ``ScanFigures`` of the scans on which a model was trained, as entries of the model card. The
+    list is empty if the scans are too small.
     """
     pairs = zip(scans, predictions_um, strict=True)
     try:

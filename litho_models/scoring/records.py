@@ -35,8 +35,8 @@ class Prediction(NamedTuple):
 
     @classmethod
     def beside(cls, background: Background | None, scan: PrintedScan, height_um: Array) -> Prediction:
-        """Make a prediction from the height of a print and, if there is one for fields of this size, a
-        learned background.
+        """Make a prediction from the height of a print and a learned background. The background is left out
+        if it is None or was learned on fields of another size.
         """
         if background is None or not background.fits(scan):
             return cls(height_um)
@@ -55,7 +55,7 @@ class Prediction(NamedTuple):
 
 class PolicyError(Record):
     """The mean absolute error for one nuisance policy (set of per-scan terms), nm, with its 95 % confidence
-    interval over scans. ``k`` is the number of terms that are fitted to each scan.
+    interval from resampling scans. ``k`` is the number of terms that are fitted to each scan.
     """
 
     policy: Policy
@@ -122,7 +122,7 @@ class ModelScores(MetricValues, extra="ignore"):
 
     ``without_background`` contains the same errors as ``by_policy``, but computed without the background of
     the protocol. It is empty if the protocol has no background. If the background is smooth (``training``),
-    it contains only the policies without smooth terms such as tilt. ``phase_rms_waves`` is the RMS phase
+    only the policies without smooth terms such as tilt are listed. ``phase_rms_waves`` is the RMS phase
     error, in waves, of light that passes through the print.
     """
 

@@ -15,8 +15,8 @@ from litho_models.scoring.records import ModelScores, PolicyError, Prediction, S
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
-# The policies with which errors depend on each kind of background. Smooth terms such as tilt would absorb a
-# smooth background, but not the displacements of the shared measurement model.
+# For each kind of background, the policies with which the errors depend on this background. Smooth terms such
+# as tilt would absorb a smooth background, but not the displacements of the shared measurement model.
 _DEPENDENT_POLICIES: Mapping[BackgroundUse, tuple[Policy, ...]] = {
     "none": (),
     "training": ("none", "offset", "offset-gain"),

@@ -69,8 +69,8 @@ def edges_of_scan(scan: PrintedScan, prediction_um: Array, residual_um: Array) -
     """Compare the measured edges of a scan with the predicted edges. The measured map without the per-scan
     terms is the prediction plus the residual.
 
-    If no edge of a film has a partner, the distances are the search distance, because the edges are at least
-    that far apart. They are 0 if neither map has an edge.
+    If no edge of a film has a partner, the distances are set to the search distance, because the edges are at
+    least that far apart. If neither map has an edge, the distances are set to 0.
     """
     measured_um = prediction_um + residual_um
     if scan.seen_by != "sem":

@@ -24,8 +24,8 @@ PERMUTATIONS = 1999
 # last bits, which would change published results.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 # Largest number of scans for which a test uses every combination of signs, in screening and in a comparison
-# of two models. Screening tests all directions at once and therefore needs more memory. Its limit is one scan
-# lower, which halves the size of its table of signs.
+# of two models. Screening tests all candidates at once and therefore needs more memory. The limit for
+# screening is one scan lower, which halves the table of signs.
 EXACT_SCANS, EXACT_PAIRED_SCANS = 13, 14
 # The combinations of signs include the observed signs. With this factor, rounding errors cannot exclude the
 # observed signs from the combinations that are counted.
@@ -130,7 +130,7 @@ def smallest_flip_p(count: int) -> float:
 
 
 class OverUnits(Record):
-    """The confidence interval and the p value of a mean difference over scans. The units that are resampled
+    """The confidence interval and the p value of the mean of a difference over scans. The independent units
     are scans or prints.
 
     ``count`` is the number of units, and ``positive`` is the number of units with a positive difference.
@@ -150,8 +150,8 @@ class OverUnits(Record):
 def over_units(
     differences_nm: Sequence[float], groups: Sequence[Hashable] | None = None, seed: int = 0
 ) -> OverUnits:
-    """Test whether the mean of a difference could be chance. The difference is given for each scan. The
-    independent units are scans or, if ``groups`` states the print of each scan, prints.
+    """Test whether the mean of a difference could differ from zero by chance. The difference is given for
+    each scan. The independent units are scans or, if ``groups`` states the print of each scan, prints.
 
     Raises:
         InputError: no difference is given.
@@ -179,7 +179,7 @@ class ByPrint(Record):
     """A one-way analysis of variance of one estimate per scan, with prints as groups.
 
     Args:
-        f: F statistic: mean square between prints divided by the mean square within prints.
+        f: F statistic, i.e. the mean square between prints divided by the mean square within prints.
         degrees: degrees of freedom between prints and within prints.
         icc: intraclass correlation, which is the share of the variance that scans of one print have in
             common. A negative estimate is set to 0.

@@ -67,8 +67,8 @@ def level_errors(scans: Sequence[PrintedScan], residuals_um: Sequence[Array]) ->
 
 
 def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array]) -> TransferCurves:
-    """Compute the gain, the coherence and the error density from the spectra of all lines. The mean of each
-    line is removed, and a Hann window is applied. Only measured pixels count.
+    """Compute the gain, the coherence and the power spectral density of the error from the spectra of all
+    lines. The mean of each line is removed, and a Hann window is applied. Only measured pixels count.
 
     The frequency axis has ``TRANSFER_BANDS`` equal bands up to the Nyquist frequency of the layout pitch.
     """
@@ -95,14 +95,14 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[Array
 def _band_powers(error: Array, prediction: Array, usable: Array, pitch_um: float, edges: Array) -> Array:
     """Compute sums over frequency bands. The result has shape (6, bands). Its rows are the real and the
     imaginary part of the cross power, the power of the measurement, the power of the prediction, the error
-    density, and the number of terms. Each value is a sum over all lines and over the frequencies of one band.
+    density, and the number of terms in its sum. Each value is a sum over all lines and over the frequencies
+    of one band.
 
-    The error density is one-sided, in µm² per cycle/µm. The number of terms is the number of values that were
-    added in the sum of the error density.
+    The error density is one-sided, in µm² per cycle/µm. Its mean is the sum divided by the number of terms.
 
     ``error`` is measured minus predicted height, and 0 at pixels that are not usable. The power of the error
-    in a line is therefore in proportion to the measured share of the line. The power of the prediction is
-    multiplied by this share and the terms are counted by it, so unmeasured pixels have no effect.
+    in a line is therefore proportional to the measured share of the line. The power of the prediction and the
+    number of terms are multiplied by the same share, so that unmeasured pixels have no effect.
     """
     window = np.hanning(error.shape[1])
     share = usable @ window**2 / np.sum(window**2)
