@@ -1,9 +1,9 @@
 """Check whether an effect that was found is the true cause of a part of the residual. The check uses a model
 that also contains all other effects that were found.
 
-If it is the true cause, the residual no longer depends on the change that the effect makes. If it only
-resembles the true cause, the residual contains variants of this change: the change scaled with height or
-position, blurred, displaced or squared.
+If the effect is the true cause, the residual no longer depends on the change that the effect makes to the
+prediction. If the effect only resembles the true cause, the residual contains variants of this change: the
+change scaled with height or position, blurred, displaced or squared.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Check:
             reason = f"its best-fitting length is outside the range of this effect: {outgrown}"
         elif share > FORM_SHARE and (exhausted := self.state.twin.at_limits(cause.name, "amplitude")):
             reason = f"its best-fitting strength exceeds the largest possible value: {exhausted}"
-        # If the model still lacks a cause, variants of the change that any other effect makes explain part of
-        # the missing cause. If the gain of such variants is small relative to the unexplained error, it is
+        # If the model still lacks a cause, variants of the change that any effect makes can explain part of
+        # the missing cause. A gain of the variants that is small relative to the unexplained error is
         # therefore no evidence against the effect.
         elif share > FORM_SHARE and reshaped_nm2 > 0.3 * self.left_nm2:
             added = (
@@ -149,8 +149,8 @@ class Check:
 
 
 def reshaped_gain(without: State, state: State) -> float:
-    """Return by how much the squared error on held-out scans falls, nm², if variants of the change that a
-    cause makes to the prediction are added to the model.
+    """Return the decrease of the squared error on held-out scans, nm², if variants of the change that a cause
+    makes to the prediction are added to the model.
 
     Args:
         without: model without the cause.

@@ -177,15 +177,16 @@ def close(study: Study, bases: Mapping[str, nn.Module]) -> Closed:
 def with_answer(
     closed: Closed, cause: Cause | None, name: str, values: Mapping[str, float], **known: Any
 ) -> Closed:
-    """Return the result of a loop in which a cause or law is replaced by the effect that remains after later
-    prints were compared. The models with the cause are fitted again with this effect instead.
+    """Replace a cause or law in the result of a loop by the effect that remains possible after the comparison
+    with later prints, and return the new result. The models that contain the cause are fitted again with this
+    effect in its place.
 
     Args:
         closed: the result.
         cause: the cause or law to replace, or None if the effect is added as a further cause.
         name: name of the effect, which may be the cause itself.
         values: parameter values of the effect from which its fits start.
-        known: the fields ``alike``, ``excluded`` and ``role`` of the effect.
+        known: the fields ``alike``, ``excluded`` and ``role`` of the new `Cause`.
     """
     if cause and cause.name == name:
         fitted, answer = (lambda state: state), replace(cause, **known)
@@ -218,7 +219,8 @@ def _rest_beside(start: State) -> Callable[[State], Rest]:
     position can still explain. ``start`` is the fitted base model.
     """
     scans = start.study.scans
-    # Selections that are repeated without a print seldom need it.
+    # The learner is made only when it is first needed. Loops that are repeated without a print seldom need
+    # it.
     learner = cache(lambda: Learner(start.study, start.maps_um(scans)))
     return cache(lambda state: learner().rest(state.maps_um(scans)))
 
@@ -257,8 +259,8 @@ def survives_on(cause: Cause, searches: Mapping[str, Found]) -> list[str]:
 def _simplest(searches: Mapping[str, Found]) -> str:
     """Choose the simplest base model among those with nearly the smallest error.
 
-    For each base model, the causes are counted that the search does not find with every other base model as
-    well. The model with the fewest such causes is the simplest. If several models have equally few, the one
+    For each base model, count the causes that the search found with this base model but not with all others.
+    The model with the fewest such causes is the simplest. If several models have the same number, the one
     with the fewest parameters, including those of its effects, is chosen.
     """
     best_nm2 = min(found.state.mse_nm2 for found in searches.values())

@@ -121,8 +121,8 @@ def error_rows(
 
 
 class HeldOut:
-    """Predictions of the scans of a study by models that are fitted again, together with a measurement model,
-    to other scans of the study.
+    """Predict each scan of a study by a model of the printer and a measurement model, both of which are
+    fitted again to other scans of the study.
 
     Args:
         study: the original scans with their folds.
@@ -168,7 +168,7 @@ class HeldOut:
         return self._by_fold(state)[0]
 
     def left_out_nm(self, model: State) -> dict[str, float]:
-        """Return by how much the headline error (see ``ErrorRow.is_headline``) grows, nm, when an effect is
+        """Return the increase of the headline error (see ``ErrorRow.is_headline``), nm, when an effect is
         removed from a model and the model is refitted. The result is keyed by the name of the effect.
 
         After this refit, the measurement model is fitted again, while the parameters of the printer model are
@@ -213,8 +213,8 @@ class HeldOut:
         return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, plain: State, maps: Maps) -> Maps:
-        """Add to each predicted map the smooth background that is learned from the scans outside the same
-        fold, as in the published protocol.
+        """Add to each predicted map the smooth background that is learned from the scans of the other folds,
+        as in the published protocol.
         """
         found = list(maps)
         for twin, (rest, own) in zip(plain.per_fold, self.study.folds, strict=True):
@@ -239,8 +239,8 @@ def errors_of_others(
     choosing nor for fitting these models.
 
     Args:
-        found: loops, each with the predictions of its models and the scans that it did not use.
-        scans: all these scans, in the order in which they are reported.
+        found: for each loop, its ``HeldOut`` object, its result, and the scans that it did not use.
+        scans: all scans that are predicted, in the order in which they are reported.
         held_out: a word that states what was held out; see ``ErrorRow.held_out``.
         seed: seed of the calibration blocks.
     """

@@ -25,8 +25,9 @@ EXCHANGED_P = 0.01
 # probability of 1/128, which is above this limit, so at least eight scans are needed.
 CONFIRM_P = 0.005
 FEWEST_SCANS = 8
-# Largest accepted p value of the sign-flip test if the strength differs by group. Such a strength has already
-# passed the test with permuted labels, so this limit is looser: up to half of the scans may gain nothing.
+# Largest accepted p value of the sign-flip test if the strength differs by group. This limit is looser,
+# because up to half of the scans may gain nothing, and because such a strength has already passed the test
+# with permuted labels.
 GROUPED_P = 0.05
 # Smallest fraction of the squared error that counts. Compared with a common strength, strengths that differ
 # by group must reduce the squared error further by at least this fraction. Any change of the model must

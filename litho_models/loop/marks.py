@@ -33,7 +33,7 @@ def with_marks(
 
     Args:
         findings: the findings about per-scan terms. The bends of the scans are added to the finding about the
-            registration, which has straightened them.
+            registration, because the registration has straightened the scans.
         scans: the original scans.
         maps_um: maps that the scans are expected to show, one per scan, µm, of shape (ny, nx).
         rounding_um: step, µm, to which the heights in the raw file of each scan are rounded; empty if there
@@ -89,8 +89,8 @@ def _scars(scans: Sequence[PreparedScan], maps_um: Sequence[np.ndarray]) -> Scan
 
 
 def _drawn_out(scan: PreparedScan, map_um: np.ndarray) -> tuple[int, int]:
-    """Return two numbers: that of the outliers that are elongated along the scan lines, and that of the
-    outliers that are elongated across them. An outlier is a connected patch of pixels with large residuals.
+    """Return the number of outliers that are elongated along the scan lines, and the number of outliers that
+    are elongated across the scan lines. An outlier is a connected patch of pixels with large residuals.
     """
     residual_um = freed_um(scan.stored.height_um, map_um, scan.usable, POLICIES["full"])
     seen = residual_um[scan.usable]

@@ -32,7 +32,7 @@ class FoldedBase(nn.Module):
     without the scans of its fold.
 
     Args:
-        models: one model per fold, in the order of the folds. It was trained without the scans of this fold.
+        models: one model per fold, in the order of the folds. Each was trained without the scans of its fold.
         fold_of: number of the fold of each scan, keyed by scan id.
         common: model that predicts scans that belong to no fold.
     """

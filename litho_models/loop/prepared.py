@@ -42,7 +42,8 @@ class ExposedScan(PrintedScan):
 
 def exposed(scan: PrintedScan) -> PrintedScan:
     """Return the scan with the layout that the loop predicts from. A smaller dose acts like a lower layout. A
-    scan without a dose, or with a dose of 1, is returned unchanged, so that other fits to it stay usable.
+    scan without a dose, or with a dose of 1, is returned unchanged, so that cached fits to this scan stay
+    valid.
     """
     return scan if scan.dose in (None, 1) else ExposedScan(**vars(scan), exposure=float(scan.dose))
 
@@ -93,7 +94,7 @@ class PreparedScan:
         otherwise the whole scan.
 
         Successive scans use different quadrants, so that together they cover the whole field. A quadrant with
-        few measured pixels is replaced by the one that has most.
+        few measured pixels is replaced by the quadrant that has the most measured pixels.
         """
         shape, context = self.stored.shape, self.context
         if min(shape) < LARGE_PX:

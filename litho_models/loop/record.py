@@ -48,13 +48,13 @@ class ErrorRow(Record):
             not scored.
         k: effective number of these terms.
         held_out: what was held out: folds of scans, whole prints, or the locked scans. ``nested`` means that
-            not only the fits but also all choices but that of the base model (such as which effects to add)
-            were made without the held-out scans.
+            the held-out scans were used neither for the fits nor for any choice, such as which effects to
+            add; only the base model was chosen with them.
         printer_numbers: number of fitted parameters of the printer model.
         measurement_numbers: number of fitted parameters of the measurement model, in the fold where this
             number is largest.
         mae_nm, rmse_nm: mean absolute error and root mean square error.
-        mae_ci95_nm: 95 % confidence interval of the mean absolute error over scans.
+        mae_ci95_nm: 95 % confidence interval of the mean absolute error, from resampling scans.
         by_scan_nm: mean absolute error of each scan, keyed by scan id.
         edge_by_scan_nm: for films, the mean distance between measured and predicted edges of each scan, keyed
             by scan id. It is empty for other prints.
@@ -121,15 +121,16 @@ class FoundEffect(Record):
         gain_nm2: decrease of the squared error of held-out scans when the effect is added to a model with all
             other effects. The error is computed on the pixels that fits use, after seven terms and an affine
             registration error have been subtracted from each scan.
-        before_nm2: the same squared error without the effect.
+        before_nm2: squared error of held-out scans without the effect, computed in the same way.
         scans_improved: number of held-out scans whose error falls, and total number of scans.
-        p_confirm: p value of the test that held-out scans confirm the effect.
+        p_confirm: p value of the sign-flip test of the effect on held-out scans.
         family_p: p value of the effect in the screening of all candidates, corrected for the number of
             candidates.
         group_p: p value of the grouping, computed by permuting the labels of the scans; None if the strength
             does not differ by group.
         left_out_nm: increase of the mean absolute error (k = 1) if the effect is removed from the model.
-        survives_on: names of the other base models with which the search also found the effect.
+        survives_on: names of the other base models with which the search also found the effect, or an effect
+            that looks the same.
     """
 
     FORMER: ClassVar[frozenset[str]] = frozenset({"stage", "reshaped_share"})
@@ -268,8 +269,7 @@ class CloseLoop(Result):
             scans.
         gain_nm: the headline error of the base model minus that of the corrected model (see
             ``ErrorRow.is_headline``). ``over_scans`` and ``over_prints`` contain its confidence intervals.
-        decisions: decisions on the open questions of this store. They are based on the prints of further
-            stores.
+        decisions: decisions on the open questions of this store, based on the prints of further stores.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/4"

@@ -161,7 +161,8 @@ def _strengths(closed: Closed, name: str) -> dict[str, list[Strength]]:
     for at, slot in enumerate(twin.slots, twin.own):
         if slot.effect == name:
             own = [twin.is_of(slot, scan) for scan in scans]
-            # A fit makes the scores of a strength add up to zero, so a single unit would show no scatter.
+            # At the optimum, the scores (gradients) of the units add up to zero, so the score of a single
+            # unit would be zero and would show no scatter.
             known = (
                 float(reach[at])
                 for reach, units in zip(reaches, kinds, strict=True)

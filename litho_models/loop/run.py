@@ -72,8 +72,9 @@ def close_loop(
         base_settings: settings of a small base model, such as ``{"spot.sigma_um": 0.3}``.
         folds: number of folds. Each scan is predicted by models that were fitted without the scans of its
             fold.
-        nested: ``folds`` (or ``prints``) to repeat all choices but that of the base model once without each
-            fold (or print), and to judge these choices on the fold (or print) that was left out.
+        nested: if ``folds`` or ``prints``, the loop is repeated once without each fold (or print), and the
+            result is scored on the fold (or print) that was left out. Only the choice of the base model is
+            not repeated.
         inject: effects in the form ``NAME=AMOUNT``. Each effect is planted in copies of the scans to test
             whether the loop finds it.
         open_lock_box: whether to score the corrected model also on the locked scans.
@@ -87,7 +88,7 @@ def close_loop(
             loop to record, which it may have changed, decisions on open questions, and further records.
         decided_by: hashes of the further stores that the function ``further`` uses. They are recorded in the
             settings.
-        left_out: texts that name the scans of these stores that are left out, with the reason.
+        left_out: texts that name the scans of the further stores that are left out, with the reason.
         report: function that receives the progress messages.
 
     Raises:
@@ -171,7 +172,7 @@ def measured_scans(store: Store) -> tuple[list[PrintedScan], list[str]]:
 def _nested(
     study: Study, nested: Nested, close_again: Callable[[Sequence[PrintedScan]], Closed]
 ) -> list[ErrorRow]:
-    """Repeat all choices but that of the base once without each fold (or print), and judge these choices on
+    """Repeat the loop with the chosen base model once without each fold (or print), and score the result on
     the fold (or print) that was left out. Return the errors on all scans.
     """
     scans = study.stored

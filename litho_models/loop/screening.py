@@ -41,8 +41,8 @@ PERMUTATIONS = 199
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameter sets of one effect that are tried together. The sets have the same values of the shapes and
-    differ only in which amplitudes are switched on. A regression fits a multiple of each set.
+    """Parameter sets of one effect that are tried together. The sets have the same values of the shape
+    parameters and differ only in which amplitudes are switched on. A regression fits a multiple of each set.
 
     ``columns`` contains the column numbers of these parameter sets in the inner products of all trials.
     """
@@ -92,7 +92,7 @@ class Trial:
 
     def start(self, multiples: np.ndarray) -> dict[str, float]:
         """Return the parameter values from which a fit starts. No amplitude is farther from its null value
-        than the largest value that screening tries for this amplitude.
+        than in the parameter sets that screening tries.
         """
         null, lower, upper, _ = self._facts
         largest = np.abs(_steps(self.effect, self.effect.trials)).max(axis=0)
@@ -113,9 +113,9 @@ def _steps(effect: Effect, sets: Sequence[Mapping[str, float]]) -> np.ndarray:
 def trials_of(effects: Sequence[Effect], first: int = 0) -> list[Trial]:
     """Combine the parameter sets of the effects into trials. The columns are numbered from ``first``.
 
-    The sets of a trial have the same values of the shapes. If the same amplitudes are tried at two sizes, the
-    two sizes belong to different trials. The reason is that the change that a large effect makes need not be
-    a multiple of the change that a small effect makes.
+    The sets of a trial have the same values of the shape parameters. If the same amplitudes are tried at two
+    sizes, the two sizes belong to different trials. The reason is that the change that a large effect makes
+    need not be a multiple of the change that a small effect makes.
     """
     found: list[Trial] = []
     for effect in effects:
@@ -224,8 +224,8 @@ class Screening:
     Args:
         state: the fitted model.
         effects: the candidate effects, none of which is in the model.
-        secants: changes that the candidates make to the predictions of a similar model, which saves computing
-            them. By default, they are computed for the fitted model.
+        secants: changes that the candidates make to the predictions of a similar model. If they are given,
+            they are used in place of those for the fitted model, which then need not be computed.
         beside_own: whether the changes that the model's own parameters can make are projected out of the
             columns of the candidates.
     """
@@ -356,7 +356,8 @@ class Screening:
                 strength that is not allowed gains nothing.
         """
         products, labels, fold_of = self._products(columns), np.array(groupings), self.study.fold_of
-        # For each scan, the scans with the same label in other folds. Without any, the scan gains nothing.
+        # The strengths for a scan are fitted to the scans with the same label in other folds. If there are no
+        # such scans, the scan gains nothing.
         fitted_to = _beside(labels) & ~_beside(fold_of)
         found = _solved(np.tensordot(fitted_to, products, 1))
         if trial:

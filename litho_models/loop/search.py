@@ -98,8 +98,8 @@ def search(
         start: the fitted model.
         candidates: effects that may be added.
         most: largest number of effects in the result.
-        secants: changes that the candidates make to the predictions of a similar model, which saves computing
-            them. By default, these changes are computed for the current model.
+        secants: changes that the candidates make to the predictions of a similar model. If they are given,
+            they are used in place of those for the current model, which then need not be computed.
         seed: result of the same search with another base model. If it is given, the search starts with those
             effects in this result that are confirmed with this base model, too.
     """

@@ -37,8 +37,8 @@ from litho_models.scoring.statistics import by_print, one_sided_flip_p
 
 
 class SingleScans:
-    """Test which per-scan terms the scans contain. To test a term, it is fitted to pixels that are not scored
-    and subtracted from the pixels that are scored.
+    """Test which per-scan terms the scans contain. To test a term, fit it to pixels that are not scored, and
+    subtract it from the pixels that are scored.
 
     Args:
         study: the original scans with their folds, and the seed.
