@@ -36,8 +36,8 @@ MOST_PRINTS = 12
 
 
 def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
-    """Return the power of an experiment to decide between two rivals with the given number of prints, which
-    are assumed to be like the prints of the contrast.
+    """Return the power of an experiment to decide between two rivals with the given number of prints. These
+    prints are assumed to be like the prints for which the contrast was computed.
 
     The decision compares the squared errors of the two rivals. If one rival is true, the expected difference
     of the squared errors is the squared distance between the two predictions. The actual difference varies

@@ -34,8 +34,9 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# The lowest and the highest levels that together cover less than this fraction of earlier prints count as
-# unknown to the models. Planned prints use only the levels between them.
+# The lowest levels that together cover less than this fraction of the area of earlier prints count as unknown
+# to the models, and so do the highest levels for which this holds. Planned prints use only the levels in
+# between.
 _RARE = 1e-3
 # The mean and the standard deviation of the levels may differ from those of earlier prints. There is no
 # penalty as long as the sum of these two differences, in levels, does not exceed this value.
@@ -78,9 +79,10 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Derive the limits from earlier prints. The lowest allowed level and all levels below it cover at
-        least a thousandth of the area of these prints, and so do the highest allowed level and all levels
-        above it. Structures must not be finer than those in these prints.
+        """Derive the limits from earlier prints. The lowest allowed level is the first one that, together
+        with all levels below it, covers at least a thousandth of the area of these prints. The highest
+        allowed level is found in the same way, counting from the top. Structures must not be finer than those
+        in these prints.
 
         Raises:
             InputError: every earlier layout has only one level, or nearly all of their area has the same one.
@@ -169,8 +171,8 @@ def score(
     known: dict[tuple[Way, Place, float], list[list[Linearised]]] | None = None,
 ) -> float:
     """Return the separation of the two most similar rivals, in standard deviations. It is computed for an
-    experiment in which the layout is printed once at each of the given doses. ``known`` is a cache of what
-    the scans of this layout have in common in several experiments.
+    experiment in which the layout is printed once at each of the given doses. ``known`` is a cache of
+    linearised scans of this layout, which several experiments share.
     """
     known = {} if known is None else known
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
@@ -232,7 +234,7 @@ def as_tensor(level: np.ndarray) -> Tensor:
 
 
 class Chosen(NamedTuple):
-    """The chosen ways to make and scan prints so that they decide one question, or all questions.
+    """The ways to make and scan prints that were chosen to decide one question, or all questions.
 
     ``ways`` lists the scans that are made of each print. Successive prints cycle through ``places``, the
     positions in the write field, and through ``doses``, the relative doses. ``tried`` contains the
@@ -259,8 +261,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     tried = {"one plain scan": reached}
     for _ in range(_MOST_EXTRAS):
         scores = {way: separation((*ways, way)) for way in WORDS if way not in ways}
-        # The report states the separation for the plain scan plus a single other scan. A later round does not
-        # overwrite the values that were found in the first round, which are of this kind.
+        # The report states the separation for the plain scan together with a single other scan. These values
+        # are computed in the first round, so later rounds do not overwrite them.
         tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):

@@ -53,8 +53,9 @@ _OF_PLACE = ("vignetting", "field-curvature")
 
 
 def open_questions(closed: Closed, dataset: DatasetId, single_scans: Sequence[ScanFinding]) -> OpenQuestions:
-    """Return all open questions with their fitted rivals, in this order: questions about causes and laws that
-    were found, about unconfirmed effects, about per-scan terms, and about missing facts.
+    """Return all open questions, each with its fitted rivals if it has any. Questions about causes and laws
+    that were found come first, followed by questions about unconfirmed effects, about per-scan terms, and
+    about missing facts.
 
     Args:
         closed: the loop that left these questions.
@@ -142,8 +143,9 @@ class _Asking:
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
         rivals = self._rivals(names, [_with(self.twin, one) for one in standing])
-        # The loop has estimated the error in the form of the model without these effects. Here this error is
-        # estimated for each model with one of these effects, and the smallest estimate is used.
+        # The loop has estimated the error in the form of the model only for the model without these effects.
+        # Here, this error is estimated for every model with one of the effects, and the smallest estimate is
+        # used.
         learner = Learner(self.study, self.maps)
         maps = ([*map(rival.twin(self.twin).height, self.study.scans)] for rival in rivals)
         form_nm = min(learner.rest(one).most_nm for one in maps)
@@ -174,14 +176,14 @@ class _Asking:
         return rivals
 
     def _spread(self, name: str) -> float:
-        """Return how much the evidence for an effect varies over scans, as the standard deviation relative to
-        the mean. The variation that noise causes has been subtracted from it.
+        """Return the relative standard deviation, over scans, of the evidence for an effect. The part that
+        noise causes is subtracted in quadrature, and the result is at most 1.
 
         Let d be the change that the effect makes to the prediction of a scan, and a the multiple of d that
         fits the scan best. The squared errors of the scan without and with the effect differ by |d|² (2 a -
-        1) plus noise, so the relative spread of this difference is twice the spread of a. If the strength
-        differs between groups of scans, d contains these differences, so they do not contribute to the
-        spread.
+        1) plus noise, where a is 1 on average. The relative spread of this difference is therefore twice the
+        spread of a. If the strength differs between groups of scans, d contains these differences, so they do
+        not contribute to the spread.
         """
         without = self.closed.final.without(name).maps_um(self.study.scans)
         multiples, own = [], []

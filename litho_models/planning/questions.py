@@ -3,9 +3,9 @@ planned.
 
 The possible answers to a question are called rivals (competing explanations). The fits of all rivals start
 from the same values of the base parameters, because the fit of the base model has more than one optimum. For
-example, an almost linear and a steep projection from dose to height are different optima. If the fits of two
-equivalent effects ended in different optima, the squared difference of their predictions on new layouts could
-be several nm² for this reason alone.
+example, one optimum may have an almost linear relation between dose and height, and another optimum a steep
+one. If the fits of two equivalent effects ended in different optima, the squared difference of their
+predictions on new layouts could be several nm² for this reason alone.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class NoiseSpectrum(Record):
     power_nm2: list[list[float]]
 
     def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Interpolate the power, nm², to the frequencies that ``np.fft.fft2`` uses for a map of the given
-        shape. The result has the given shape.
+        """Interpolate the power spectrum, nm², at the frequencies that ``np.fft.fft2`` uses for a map of the
+        given shape. The result has the given shape.
         """
         power = np.array(self.power_nm2)
         at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
@@ -102,7 +102,7 @@ Owner = Literal["printer", "microscope"]
 
 class Rival(Record):
     """One possible answer to a question (a competing explanation). It is a model that was fitted to earlier
-    prints and that consists of the base model and effects. The strengths of these effects are the same in all
+    prints and that consists of the base model and effects. The strength of each effect is the same in all
     scans.
 
     Attributes:
@@ -151,8 +151,8 @@ class Question(Record):
         text: the question in words.
         experiment: experiments that would answer the question, in words.
         rivals: the possible answers.
-        spread: how much the evidence for the effect varies between prints, as the standard deviation relative
-            to the mean. The variation that noise causes has been subtracted from it.
+        spread: relative standard deviation, over scans, of the evidence for the effect, without the part that
+            noise causes.
         form_nm: upper bound, nm, on the rms error that is due to a wrong form of the model; None if it is
             unknown. The bound is derived from the part of the residual of the best answer that could still be
             learned.

@@ -122,7 +122,7 @@ class Printing:
         base_key: object = None,
     ) -> Tensor:
         """Predict the height that a planned scan would show, µm, of shape (ny, nx). ``known`` and
-        ``base_key`` are those of ``EffectChain.forward``.
+        ``base_key`` are passed to ``EffectChain.forward``.
         """
         layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
         return chain(layout_um, self.context(layout_um, printed, way), known, base_key)[0, 0]
@@ -157,8 +157,8 @@ class Contrast:
 
     def separation(self, spread: float) -> Tensor:
         """Return the squared distance between the two predictions in units of its standard deviation. The
-        result is differentiable. ``spread`` is the relative standard deviation of the squared distance
-        between prints (the field ``spread`` of the question).
+        result is differentiable. ``spread`` is the relative standard deviation, over prints, of the squared
+        distance (the field ``spread`` of the question).
         """
         variance = (self.sd_um2**2 + (spread * self.squares_um2) ** 2).sum()
         return self.squares_um2.sum() / torch.sqrt(variance + _SMALLEST**2)
@@ -246,8 +246,8 @@ class Rivalry:
 
     def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
         """Return the contrast of every ordered pair of rivals on the given prints. The argument ``refitted``
-        is what the method of this name returns for these prints. The contrasts are differentiable with
-        respect to the levels of the prints.
+        contains the models that the method of this name returns for these prints. The contrasts are
+        differentiable with respect to the levels of the prints.
         """
         true = [self._predict(chain, prints) for chain in self.true]
         return [

@@ -67,7 +67,7 @@ def close_loop(
         settings: further arguments of ``loop.run.close_loop``.
 
     Raises:
-        InputError: as in ``loop.run.close_loop``. The error is also raised if a further store is of another
+        InputError: as in ``loop.run.close_loop``. The same error is raised if a further store is of another
             printer, or if the orientation of a scan differs from the one that its dataset card states.
     """
     first = open_store(store)
@@ -91,8 +91,8 @@ def close_loop(
 
 def new_scans(first: Store, store: Store) -> tuple[list[PrintedScan], list[str]]:
     """Return the scans of a further store that have enough measured pixels, and texts that name the other
-    scans. Before, check that the store is of the same printer as the first store, and that these scans have
-    the orientation that the dataset card states.
+    scans. The function first checks that the store is of the same printer as the first store, and that these
+    scans have the orientation that the dataset card states.
 
     Raises:
         InputError: the store is of another printer, its prints were planned for another dataset, none of its
@@ -229,9 +229,10 @@ class Judge:
 
 
 def with_decisions(closed: Closed, open_: OpenQuestions, decisions: Sequence[Decision]) -> Closed:
-    """Return the loop with the causes that the decisions leave. If new prints exclude a cause, an effect that
-    remains replaces it. If only one answer remains, its effect is named as the cause, and the role of this
-    effect becomes ``process`` if the printer causes it and ``measurement`` if the microscope causes it.
+    """Return the result of the loop with the causes that remain possible after the decisions. If new prints
+    exclude a cause, it is replaced by an effect that remains possible. If only one answer remains, its effect
+    is named as the cause, and the role of this effect becomes ``process`` if the printer causes it and
+    ``measurement`` if the microscope causes it.
     """
     questions = {one.name: one for one in open_.questions}
     for decision in decisions:
@@ -305,9 +306,9 @@ def _compare(
 ) -> Comparison:
     """Compare the squared errors of two rivals (competing explanations) on the new scans.
 
-    The squared errors are summed over blocks of pixels. Their difference is compared with its spread over the
-    blocks of a print and with its spread between prints. Blocks of scans of different sizes do not
-    correspond, so these scans are treated separately.
+    The squared errors are summed over blocks of pixels. The difference between the sums of the two rivals is
+    compared with its spread over the blocks of a print and with its spread between prints. If scans of a
+    print differ in size, their blocks do not correspond, so these scans are treated separately.
     """
     by_print: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
     pixels, difference = 0, 0.0

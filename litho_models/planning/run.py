@@ -106,7 +106,8 @@ def next_print(
         field_um: side length of each print, µm.
         seed: seed of the random layouts.
         steps: number of gradient-ascent steps by which each tile is optimised.
-        layouts: ``optimised``, or ``random`` to plan the same scans with random layouts, as a control.
+        layouts: ``optimised`` for optimised layouts, or ``random`` for the same scans with random layouts,
+            which serve as a control.
         report: function that receives the progress messages.
 
     Raises:
